@@ -1,4 +1,4 @@
-"""A Ray cluster of two nodes on this machine, of which all processes may fail."""
+"""A Ray cluster of several nodes on this machine, of which all processes may fail."""
 
 import ctypes
 import os
@@ -6,7 +6,7 @@ import secrets
 import socket
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,6 +19,7 @@ from benchmarks.runs import BIN
 from panolog.scene.errors import RunError
 
 HEAD, SECOND, DRIVER = GROUPS = "head", "second", "driver"  # of processes that have faults in common
+THIRD, FOURTH = "third", "fourth"
 _RECOVERY = Path(__file__).parents[2] / "deploy" / "recovery.env"  # how soon Ray notices a lost process
 _TMP = "/tmp"  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _NO_WORK = ("ray::IDLE", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
@@ -38,18 +39,24 @@ def environment(token: str) -> dict[str, str]:
 
 
 @contextmanager
-def two_nodes(hidden: Path) -> Iterator["TwoNodes"]:
+def two_nodes(hidden: Path) -> Iterator["LocalCluster"]:
     """The cluster for as long as the context lasts. Raises RunError if it does not start.
 
     Args: hidden, a folder that the second node does not see, if namespaces can be made.
     """
+    with laid(hidden) as cable, started(cable, {HEAD: 1, SECOND: 1}) as cluster:
+        yield cluster
+
+
+@contextmanager
+def started(
+    cable: Cable | None, cores: Mapping[str, int], variables: Mapping[str, Mapping[str, str]] | None = None
+) -> Iterator["LocalCluster"]:
+    """A cluster for as long as the context lasts. Args: as `LocalCluster`. Raises as `two_nodes`."""
     # The children of a killed node or driver become ours, so that we can wait for them and end them.
     ctypes.CDLL(None).prctl(_SUBREAPER, 1)
-    with (
-        laid(hidden) as cable,
-        TemporaryDirectory(prefix="chaos-", dir=_TMP, ignore_cleanup_errors=True) as folder,
-    ):
-        cluster = TwoNodes(Path(folder), cable)
+    with TemporaryDirectory(prefix="chaos-", dir=_TMP, ignore_cleanup_errors=True) as folder:
+        cluster = LocalCluster(Path(folder), cable, cores, variables or {})
         try:
             cluster.keep()
             cluster.wait()
@@ -58,12 +65,19 @@ def two_nodes(hidden: Path) -> Iterator["TwoNodes"]:
             end_children()
 
 
-class TwoNodes:
-    """A head and a second node with one core each, whose processes take faults, as do drivers."""
+class LocalCluster:
+    """A head and other nodes, whose processes take faults, as do drivers."""
 
-    def __init__(self, folder: Path, cable: Cable | None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        cable: Cable | None,
+        cores: Mapping[str, int],
+        variables: Mapping[str, Mapping[str, str]],
+    ) -> None:
         """The second node is at the end of the cable if there is one.
 
+        Args: cores of each node by its name, HEAD first; variables, environment of nodes besides.
         Raises RunError if the library of `shim` cannot be built.
         """
         self._folder = folder
@@ -71,7 +85,8 @@ class TwoNodes:
         (self._port,) = free_ports(1)
         self._environment = environment(secrets.token_hex(32))
         self._library = build(folder)
-        self.controls = {name: Control(folder / f"{name}.control") for name in GROUPS}
+        self._cores, self._variables = cores, variables
+        self.controls = {name: Control(folder / f"{name}.control") for name in (*cores, DRIVER)}
         self._nodes: dict[str, subprocess.Popen[bytes]] = {}
 
     @property
@@ -89,27 +104,36 @@ class TwoNodes:
         return self._folder / "panolog" if self.cable else None
 
     def environment(self, group: str) -> dict[str, str]:
-        """Of HEAD, SECOND or DRIVER."""
-        return {**self._environment, **self.controls[group].environment(self._library)}
+        """Of a node or of DRIVER."""
+        faults = self.controls[group].environment(self._library)
+        return {**self._environment, **faults, **self._variables.get(group, {})}
 
     def keep(self) -> None:
         """Starts the nodes that do not run, as a service manager would; returns before they have joined."""
-        for name in (HEAD, SECOND):
+        for name in self._cores:
             if name not in self._nodes or self._nodes[name].poll() is not None:
                 self._start(name)
 
     def wait(self) -> None:
-        """Until both nodes have joined. Raises RunError if one does not."""
+        """Until all nodes have joined. Raises RunError if one does not."""
         end = time.monotonic() + _TIMEOUT_S
-        while not (_answers(self._host, self._port) and all(self._raylet(name) for name in (HEAD, SECOND))):
+        while not (_answers(self._host, self._port) and all(map(self.raylet, self._cores))):
             if time.monotonic() > end:
                 raise RunError(f"the Ray cluster did not start; see {self._folder}")
             time.sleep(_POLL_S)
             self.keep()
 
-    def raylet(self) -> psutil.Process | None:
-        """That of the second node; without it, the node ends."""
-        return self._raylet(SECOND)
+    def raylet(self, node: str = SECOND) -> psutil.Process | None:
+        """That of a node; without it, the node ends."""
+        return self._process(node, "raylet")
+
+    def node_id(self, node: str) -> str:
+        """Node.id of a node; "" if it does not run now."""
+        raylet, option = self.raylet(node), "--node_id="
+        with suppress(psutil.Error):
+            words = raylet.cmdline() if raylet else ()
+            return next((word.removeprefix(option) for word in words if word.startswith(option)), "")
+        return ""
 
     def gcs(self) -> psutil.Process | None:
         """The head's record of the cluster; without it, the head ends."""
@@ -119,9 +143,6 @@ class TwoNodes:
         """A worker with a task or an actor, on any node. Args: choice in [0, 1), which of several."""
         workers = [process for process in psutil.Process().children(recursive=True) if _busy(process)]
         return workers[int(choice * len(workers))] if workers else None
-
-    def _raylet(self, node: str) -> psutil.Process | None:
-        return self._process(node, "raylet")
 
     def _process(self, node: str, name: str) -> psutil.Process | None:
         with suppress(psutil.NoSuchProcess):
@@ -135,12 +156,14 @@ class TwoNodes:
         options = ["--head", f"--port={self._port}", f"--temp-dir={self._folder}"]
         options.append("--include-dashboard=false")
         enter: Sequence[str] = ()
-        if name == SECOND:
+        if name != HEAD:
             options = [f"--address={self.address}"]
-            host, enter = (self.cable.far, self.cable.enter) if self.cable else (host, ())
+        if name == SECOND and self.cable:
+            host, enter = self.cable.far, self.cable.enter
         agent, metrics = free_ports(2)
-        command = [*enter, str(BIN / "ray"), "start", "--block", "--num-cpus=1", f"--node-ip-address={host}"]
-        command += ["--object-store-memory=100000000", "--min-worker-port=0", "--max-worker-port=0"]
+        command = [*enter, str(BIN / "ray"), "start", "--block", f"--node-ip-address={host}"]
+        command += [f"--num-cpus={self._cores[name]}", "--object-store-memory=100000000"]
+        command += ["--min-worker-port=0", "--max-worker-port=0"]
         command += [f"--dashboard-agent-listen-port={agent}", f"--metrics-export-port={metrics}", *options]
         with (self._folder / f"{name}.log").open("ab") as log:
             environment = self.environment(name)

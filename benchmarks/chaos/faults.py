@@ -14,7 +14,7 @@ import psutil
 from typing_extensions import assert_never
 
 from benchmarks.chaos.cable import Cable
-from benchmarks.chaos.cluster import GROUPS, HEAD, SECOND, TwoNodes
+from benchmarks.chaos.cluster import GROUPS, HEAD, SECOND, LocalCluster
 from benchmarks.chaos.shim import READ, WRITE, Rule
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.workers.tasks import StrEnum
@@ -128,7 +128,7 @@ _SIGNALS = {
 class Victim:
     """A run at work."""
 
-    cluster: TwoNodes
+    cluster: LocalCluster
     scene: Path
     root: Path
     driver: psutil.Process | None  # not its supervisor; None between two
@@ -192,7 +192,7 @@ def _signal(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
     return f"{what} {planned.lasts:g} s" if planned.lasts else what, undo
 
 
-def _fail(cluster: TwoNodes, groups: Sequence[str], *rules: Rule) -> Undo:
+def _fail(cluster: LocalCluster, groups: Sequence[str], *rules: Rule) -> Undo:
     controls = [cluster.controls[group] for group in groups]
     made = [(control, control.add(rule)) for control in controls for rule in rules]
 
@@ -221,7 +221,7 @@ def _disturb(what: str, cable: Cable | None) -> tuple[str, Undo] | None:
     return what, lambda: cable.disturb(0.0, 0.0)
 
 
-def _move_clocks(cluster: TwoNodes, seconds: int) -> Undo:
+def _move_clocks(cluster: LocalCluster, seconds: int) -> Undo:
     def move(offset: int) -> None:
         for control in cluster.controls.values():
             control.move_clock(offset)

@@ -11,7 +11,7 @@ from shutil import rmtree
 import psutil
 
 from benchmarks.chaos import faults
-from benchmarks.chaos.cluster import DRIVER, TwoNodes
+from benchmarks.chaos.cluster import DRIVER, LocalCluster
 from benchmarks.chaos.fault_costs import Fault, FaultCost, fault_costs, true_times
 from benchmarks.chaos.faults import HELLO_S, QUARANTINE, RETRY_S, SILENCE_S, Planned, Undo, Victim
 from benchmarks.runs import BIN, history
@@ -80,7 +80,7 @@ def _nothing() -> None:
 class ChaosRuns:
     """Runs of one scene on one cluster, in the folder `root`."""
 
-    def __init__(self, cluster: TwoNodes, root: Path) -> None:
+    def __init__(self, cluster: LocalCluster, root: Path) -> None:
         self._cluster = cluster
         self._root = root
         self._scene = make_town(root / "town", panoramas=12, width=128, points=1000)

@@ -1,4 +1,4 @@
-"""`panolog cluster`: submit, resume, status, stop. Runs on a Ray cluster, through its job server."""
+"""`panolog cluster`: submit, resume, status, stop, leave. Runs on a Ray cluster, through its job server."""
 
 import json
 from collections.abc import Sequence
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 app = typer.Typer(
     cls=Group,
     no_args_is_help=True,
-    help="Control runs on a Ray cluster, from any machine that reaches it: submit, resume, status, stop.",
+    help="Control runs on a Ray cluster, from any machine that reaches it: submit, resume, status, stop."
+    " `leave` is for the machines of the cluster themselves.",
 )
 
 HeadSourceArg = Annotated[
@@ -40,6 +41,15 @@ ServerOption = Annotated[
         metavar="http://HOST:8265",
         envvar="RAY_API_SERVER_ADDRESS",
         help="URL of the cluster's Ray dashboard, which is its job server.",
+    ),
+]
+SecondsArg = Annotated[
+    int, typer.Argument(min=0, max=86_400, metavar="[SECONDS]", help="Seconds until the machine ends.")
+]
+NodeOption = Annotated[
+    str,
+    typer.Option(
+        "--node", metavar="ID", help="How the id of the node begins, if this machine has several of Ray's."
     ),
 ]
 _LOCAL = "http://127.0.0.1:8265"
@@ -122,6 +132,20 @@ def stop(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption = 
     else:
         resume_it = command("cluster", "resume", run, "--address", address)
         say(f"job {job.id}: {job.label}; {resume_it} resumes it")
+
+
+@app.command(cls=Command)
+def leave(seconds: SecondsArg = 120, node: NodeOption = "") -> None:
+    """Announce that this machine leaves its cluster: tasks here save a checkpoint and move.
+
+    Returns once they have, at the latest after so many seconds: for the preStop hook of a pod, and for the
+    signal of a batch system. Machines of Amazon EC2, Google Compute Engine and Azure announce it themselves.
+    """
+    from panolog.orchestrator.cluster.leave import leave as leave_cluster
+
+    with progress_bar("waiting until the tasks of this machine have moved"):
+        gone = leave_cluster(seconds, node)
+    say("this machine has left the cluster" if gone else f"tasks of others still run here after {seconds} s")
 
 
 def _start(address: str, run: str, words: Sequence[str], *, as_json: bool) -> None:

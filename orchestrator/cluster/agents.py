@@ -8,6 +8,7 @@ on their node for a while, at once if it drains. On the driver's own machine a t
 
 import time
 from collections.abc import Mapping, Set
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -44,7 +45,7 @@ class _Known:
     """An agent as the driver sees it."""
 
     actor: Any  # ray.actor.ActorHandle
-    answer: Any  # ray.ObjectRef of the next notice; None = the agent is lost
+    answer: Any  # ray.ObjectRef of the next notice
     notice: LeaveNotice | None = None
     noted: float = 0.0  # time.monotonic() of `notice`
     used: float = field(default_factory=time.monotonic)  # when a task of the run was last on its node
@@ -69,7 +70,8 @@ class Agents:
             return
         here = NodeAffinitySchedulingStrategy(id, soft=False)
         remote: Any = ray.remote(Agent)
-        actor = remote.options(num_cpus=0, max_concurrency=4, scheduling_strategy=here).remote()
+        options = {"num_cpus": 0, "max_concurrency": 4, "max_restarts": -1, "scheduling_strategy": here}
+        actor = remote.options(**options).remote()
         self._known[id] = _Known(actor, actor.next_notice.remote(None))
 
     def stop(self, id: str, pid: int) -> None:
@@ -84,7 +86,7 @@ class Agents:
 
     def notices(self) -> dict[str, LeaveNotice]:
         """Those in force, by Node.id."""
-        waiting = {known.answer: known for known in self._known.values() if known.answer is not None}
+        waiting = {known.answer: known for known in self._known.values()}
         if waiting:
             ready, _ = ray.wait(list(waiting), num_returns=len(waiting), timeout=0)
             for answer in ready:
@@ -111,11 +113,8 @@ class Agents:
 
 
 def _read(known: _Known) -> None:
-    """Takes what an agent has answered. One that is lost leaves its last notice in force."""
-    try:
-        notice = ray.get(known.answer)
-    except RayError:
-        known.answer = None
-        return
-    known.notice, known.noted = notice, time.monotonic()
-    known.answer = known.actor.next_notice.remote(notice.kind if notice else None)
+    """Takes an answer. The last notice of an agent that was killed stays in force; Ray restarts the agent."""
+    with suppress(RayError):
+        known.notice = ray.get(known.answer)
+        known.noted = time.monotonic()
+    known.answer = known.actor.next_notice.remote(known.notice.kind if known.notice else None)

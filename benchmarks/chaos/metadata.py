@@ -1,4 +1,4 @@
-"""A metadata service of each provider, for tests: it answers as the real ones document it."""
+"""A metadata service of each provider, which answers as the real ones document it."""
 
 import json
 import time
@@ -39,8 +39,8 @@ class Metadata:
 
 
 @contextmanager
-def metadata(provider: str) -> Iterator[Metadata]:
-    """A service for as long as the context lasts."""
+def metadata(provider: str, host: str = "127.0.0.1") -> Iterator[Metadata]:
+    """A service for as long as the context lasts. Args: host, this machine's address."""
     known = Metadata(provider)
     if provider == "google":
         known.values |= {
@@ -51,8 +51,8 @@ def metadata(provider: str) -> Iterator[Metadata]:
     if provider == "azure":
         known.values["/metadata/instance/compute/name?api-version=2021-02-01&format=text"] = NAME
         known.values["/metadata/scheduledevents?api-version=2020-07-01"] = '{"Events": []}'
-    server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(known))
-    known.url = f"http://127.0.0.1:{server.server_port}"
+    server = ThreadingHTTPServer((host, 0), _handler(known))
+    known.url = f"http://{host}:{server.server_port}"
     thread = Thread(target=server.serve_forever, args=(0.05,))
     thread.start()
     try:
