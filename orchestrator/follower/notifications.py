@@ -10,13 +10,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from panolog.orchestrator.run.nodes import MACHINE_DIED, MACHINE_GONE
-from panolog.orchestrator.run.records import Failure, Outcome, RunBegan, Stored, TaskFailed, TaskStarted
+from panolog.orchestrator.run.nodes import MACHINE_DIED, MACHINE_GONE, leave_text
+from panolog.orchestrator.run.records import (
+    Failure,
+    Leaving,
+    NodeLeaving,
+    Outcome,
+    RunBegan,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+)
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.run.units import duration
 from panolog.workers.tasks import StrEnum, TaskId
 
 _LONGEST = 1000  # characters of a text
+# Of what is announced, that a machine is taken away; all others may end as their owner or Ray wants.
+_TAKEN = (Leaving.PREEMPTION, Leaving.TERMINATION, Leaving.MAINTENANCE)
 _TOGETHER_S = 60.0  # losses on one node within so many seconds are one notification
 
 
@@ -60,10 +71,11 @@ def run_id(records: Sequence[Stored]) -> str:
 
 @dataclass
 class Losses:
-    """Finds the tasks that were lost with their machine, in records that come piece by piece."""
+    """Finds the machines that leave or were lost, with their tasks, in records that come piece by piece."""
 
     hosts: dict[TaskId, str] = field(default_factory=dict)
     found: dict[int, tuple[float, str, list[str]]] = field(default_factory=dict)  # by the first record
+    announced: dict[str, tuple[int, float, NodeLeaving]] = field(default_factory=dict)  # by node
     _latest: dict[str, int] = field(default_factory=dict)  # by node: the first record of its latest group
 
     def add(self, records: Sequence[Stored]) -> None:
@@ -72,7 +84,10 @@ class Losses:
             record = item.record
             if isinstance(record, TaskStarted):
                 self.hosts[record.task] = record.node
-            elif isinstance(record, TaskFailed) and _left(record):
+            elif isinstance(record, NodeLeaving):
+                if record.kind in _TAKEN:
+                    self.announced.setdefault(record.node, (item.id, item.time, record))
+            elif isinstance(record, TaskFailed) and _left(record) and record.node not in self.announced:
                 self._note(item.id, item.time, record)
 
     def _note(self, id: int, time: float, record: TaskFailed) -> None:
@@ -92,6 +107,12 @@ class Losses:
                 node=node, tasks=tasks,
             )
             for id, (time, node, tasks) in self.found.items()
+        ] + [
+            _made(
+                run, name, Kind.PREEMPTED, id, time, leave_text(record),
+                node=record.host, seconds=record.seconds,
+            )
+            for id, time, record in self.announced.values()
         ]  # fmt: skip
 
 

@@ -267,11 +267,8 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
             changes = {"received": task.received + record.received, "sent": task.sent + record.sent}
         case ScoresSaved() | PlanSaved() | MeasuresSaved() | EvaluationSaved():
             changes = {"status": Status.DONE, "seconds": _attempt(task, time) or None}
-        case TaskFailed():
-            changes = _failure(task, record) | {"spent": task.spent + _attempt(task, time)}
-        case TaskYielded():
-            changes = {"status": task.at_rest, "spent": task.spent + _attempt(task, time)}
-            changes["moves"] = task.moves + bool(record.leaves)
+        case TaskFailed() | TaskYielded():
+            changes = _end(task, record) | {"spent": task.spent + _attempt(task, time)}
         case PauseRequested() | UnpauseRequested() | RetryRequested():
             changes = _request(task, record)
         case (
@@ -298,7 +295,9 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
     return changes
 
 
-def _failure(task: TaskState, record: TaskFailed) -> dict[str, Any]:
+def _end(task: TaskState, record: TaskFailed | TaskYielded) -> dict[str, Any]:
+    if isinstance(record, TaskYielded):
+        return {"status": task.at_rest, "moves": task.moves + bool(record.leaves)}
     changes: dict[str, Any] = {
         "status": Status.FAILED if record.final else task.at_rest,
         "attempts": record.attempt,

@@ -13,7 +13,15 @@ from panolog.orchestrator.run.config import RunConfig, keys
 from panolog.orchestrator.run.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.views.history import History, Span
 from panolog.orchestrator.views.preparation import PreparationView, prepared_share
-from panolog.orchestrator.views.summary import STAGES, QuarantineView, Summary, Text, ViewModel, summarize
+from panolog.orchestrator.views.summary import (
+    STAGES,
+    LeavingView,
+    QuarantineView,
+    Summary,
+    Text,
+    ViewModel,
+    summarize,
+)
 from panolog.orchestrator.views.timing import progress_of, setting, share_of, tasks_of
 from panolog.workers.tasks import Stage
 from panolog.workers.training.recipes import RECIPES
@@ -70,6 +78,7 @@ class NodeView(ViewModel):
     rate: float
     usage: UsageView | None
     quarantine: QuarantineView | None = None
+    leaving: LeavingView | None = None
 
 
 class SettingView(ViewModel):
@@ -130,7 +139,7 @@ def view_run(
         eta=summary.eta,
         paused=summary.paused,
         stages=tuple(_with_share(stage, preparation) for stage in stages),
-        nodes=_nodes(history, usages, {node.host: node for node in summary.quarantined}, running=running),
+        nodes=_nodes(history, usages, summary, running=running),
         preparation=preparation,
         info=info,
         summary=summary,
@@ -224,13 +233,16 @@ def _stage_status(
 def _nodes(
     history: History,
     usages: Mapping[str, Mapping[str, Any]],
-    quarantined: Mapping[str, QuarantineView],
+    summary: Summary,
     *,
     running: bool,
 ) -> tuple[NodeView, ...]:
-    """The machines that tasks have run on, by name, and those in quarantine. Args: quarantined, by host."""
+    """The machines that tasks have run on, by name, and those in quarantine or that leave."""
     views = []
-    for node in sorted({start.node for start in history.starts.values()} | quarantined.keys()):
+    quarantined = {node.host: node for node in summary.quarantined}
+    leaving = {node.host: node for node in summary.leaving}
+    known = {start.node for start in history.starts.values()}
+    for node in sorted(known | quarantined.keys() | leaving.keys()):
         starts = {
             id: history.starts[id]
             for id in sorted(history.starts, key=str)
@@ -249,6 +261,7 @@ def _nodes(
                 rate=sum(p.rate for p in progress),
                 usage=UsageView.model_validate(usages[node]) if running and node in usages else None,
                 quarantine=quarantined.get(node),
+                leaving=leaving.get(node),
             )
         )
     return tuple(views)

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, SkipValidation
 
 from panolog.orchestrator.run.folder import command_line
-from panolog.orchestrator.run.records import task_name
+from panolog.orchestrator.run.nodes import Leave, NodeState, why_leaving
+from panolog.orchestrator.run.records import Leaving, task_name
 from panolog.orchestrator.run.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.views.timing import eta_of, run_eta, seconds_of, share_of, tasks_of
 from panolog.workers.tasks import COARSE, Stage, TaskId
@@ -69,6 +70,7 @@ class TaskView(ViewModel):
     received: int
     sent: int
     retries: int
+    moves: int = 0  # attempts that have ended with a checkpoint because their machine left
     reasons: tuple[Text, ...]
 
 
@@ -113,6 +115,16 @@ class QuarantineView(ViewModel):
     until: float
 
 
+class LeavingView(ViewModel):
+    """A machine that has announced that it leaves; `until` in epoch seconds, None if it is not known when."""
+
+    node: Text  # its id
+    host: Text
+    kind: Leaving
+    reason: Text
+    until: float | None
+
+
 class SummaryHead(ViewModel):
     """The state of a run but for its tasks and blocks.
 
@@ -137,6 +149,7 @@ class SummaryHead(ViewModel):
     moved: MovedView
     notices: tuple[NoticeView, ...]
     quarantined: tuple[QuarantineView, ...]  # machines
+    leaving: tuple[LeavingView, ...] = ()  # machines
 
 
 class Summary(SummaryHead):
@@ -192,11 +205,19 @@ def summarize(
             for node in state.quarantined()
             if running or (node.until or 0.0) > end
         ),
+        leaving=tuple(_leaving(node) for node in state.leaving() if running),
         tasks=tuple(_task_view(task, end) for task in tasks_of(state)),
         blocks=tuple(
             BlockView(block=b.block, cameras=b.cameras, gaussians=b.gaussians, train=b.train)
             for b in state.plan or ()
         ),
+    )
+
+
+def _leaving(node: NodeState) -> LeavingView:
+    leave = node.leave or Leave(Leaving.DRAIN)
+    return LeavingView(
+        node=node.id, host=node.host, kind=leave.kind, reason=why_leaving(leave.kind), until=leave.until
     )
 
 
@@ -231,6 +252,7 @@ def _task_view(task: TaskState, now: float) -> TaskView:
         received=task.received,
         sent=task.sent,
         retries=task.retries,
+        moves=task.moves,
         reasons=task.reasons,
         **{name: getattr(task.progress, name, None) for name in _PROGRESS},
     )

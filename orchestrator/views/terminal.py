@@ -13,13 +13,17 @@ from rich.table import Table
 from rich.text import Text
 
 from panolog.orchestrator.run.folder import RunFolder, command_line, read_json
+from panolog.orchestrator.run.nodes import leave_text
 from panolog.orchestrator.run.records import (
     Delivered,
     EvaluationSaved,
     Merged,
     ModelSaved,
+    NodeLeaving,
+    NodeLeft,
     NodeQuarantined,
     NodeReleased,
+    NodeStaying,
     Noticed,
     PauseRequested,
     PlanSaved,
@@ -97,6 +101,7 @@ def table(
             rows.add_row(*_task_row(task, now, wide=wide))
     shown = [rows] if stages else []
     waits = [Text(summary.waiting, style="yellow")] if summary.waiting else []
+    waits += _leaving(summary, now)
     waits += _quarantined(summary, now, root)
     return Group(head, *waits, *_gaussians(summary), *shown, *_failures(state))
 
@@ -131,6 +136,13 @@ def _failures(state: RunState) -> Iterator[Text]:
             f"{task_label(str(task.id))}: {task.reasons[-1]}",
             style="red" if task.status == Status.FAILED else "yellow",
         )
+
+
+def _leaving(summary: Summary, now: float) -> Iterator[Text]:
+    """The machines that leave. Args: now, epoch seconds."""
+    for node in summary.leaving[:_MOST]:
+        when = "" if node.until is None else f" in {duration(max(0.0, node.until - now))}"
+        yield Text(f"{node.host} ({node.node[:8]}): leaves{when}: {node.reason}", style="yellow")
 
 
 def _quarantined(summary: Summary, now: float, root: Path) -> Iterator[Text]:
@@ -177,6 +189,8 @@ def headline(state: RunState, summary: Summary, progress: float, root: Path) -> 
     if held := summary.paused:
         unpause = command_line("unpause", root, held[0])
         text.append(f" · {len(held)} paused: `{unpause}` resumes block {held[0]}", style="yellow")
+    if moves := sum(task.moves for task in state.tasks.values()):
+        text.append(f" · {moves} moved from machines that left", style="dim")
     moved = summary.moved.received + summary.moved.sent
     if moved:
         text.append(f" · {gib(moved)} moved between machines", style="dim")
@@ -295,6 +309,14 @@ def _urgent(record: Record) -> str:
             return f"{record.host} ({record.node[:8]}): in quarantine: {record.reason}"
         case NodeReleased():
             return f"{record.host} ({record.node[:8]}): out of quarantine: {record.reason}"
+        case NodeLeaving():
+            return leave_text(record)
+        case NodeStaying():
+            return f"{record.host} ({record.node[:8]}): stays after all, and is used again"
+        case NodeLeft():
+            return f"{record.host} ({record.node[:8]}): has left"
+        case TaskYielded() if record.leaves:
+            return f"{task}: has stopped with a checkpoint, and moves: {record.leaves} leaves"
         case PauseRequested() | UnpauseRequested() | RetryRequested() | TaskYielded():
             return f"{task}: {_REQUESTS[type(record)]}"
     return ""

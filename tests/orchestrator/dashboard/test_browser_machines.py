@@ -10,7 +10,14 @@ from playwright.sync_api import Browser, expect
 
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.control import Action, ControlRequest
-from panolog.orchestrator.run.records import NodeQuarantined, NodeReleased, RunBegan
+from panolog.orchestrator.run.records import (
+    Leaving,
+    NodeLeaving,
+    NodeLeft,
+    NodeQuarantined,
+    NodeReleased,
+    RunBegan,
+)
 from panolog.orchestrator.run.store import Database
 from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium, opened
 from tests.orchestrator.dashboard.served import append, serving, write_whole_run
@@ -42,6 +49,30 @@ def test_machines_show_what_is_used(browser: Browser, tmp_path: Path) -> None:
 QUARANTINED = NodeQuarantined(
     "3f2a81c4d5e6", "gpu-07", "3 tasks have failed there in a row, the last one, block/001: CUDA error", 2e9
 )
+
+
+LEAVES = NodeLeaving("3f2a81c4d5e6", "gpu-07", Leaving.PREEMPTION, 120.0)
+
+
+@pytest.mark.parametrize("width", [DESK, PHONE])
+def test_a_machine_that_leaves_is_shown_until_it_has_left(
+    browser: Browser, tmp_path: Path, width: int
+) -> None:
+    folder = write_whole_run(tmp_path / "run")
+    append(folder, RunBegan(socket.gethostname(), 1, resumed=True), LEAVES)
+    with (
+        lock.hold(folder.lock),
+        serving(tmp_path) as server,
+        opened(browser, server.url, width=width) as page,
+    ):
+        page.goto(f"{server.url}/runs/{server.id('run')}")
+        machine = page.locator("#nodes li", has_text="gpu-07")
+        expect(machine).to_contain_text("leaves")
+        expect(machine).to_contain_text("left")
+        expect(machine).to_contain_text("its provider takes it away: its tasks save a checkpoint and move")
+        assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+        append(folder, NodeLeft(LEAVES.node, LEAVES.host))
+        expect(machine).to_have_count(0)
 
 
 @pytest.mark.parametrize("width", [DESK, PHONE])

@@ -18,6 +18,9 @@ from panolog.orchestrator.run.records import (
     CheckpointSaved,
     EvaluationSaved,
     Failure,
+    Leaving,
+    NodeLeaving,
+    NodeLeft,
     Outcome,
     PauseRequested,
     Progressed,
@@ -113,6 +116,20 @@ def test_a_machine_that_leaves_is_one_notification_with_all_its_tasks(run: Run) 
     (gone,) = run.news().notifications
     assert gone.text == "gpu1 (n1) has left; it worked on coarse, block/003"
     run.add(lost(block), after=100)
+    assert run.kinds() == ["preempted", "preempted"]
+
+
+def test_a_machine_that_announces_its_end_is_one_notification(run: Run) -> None:
+    run.add(BEGAN, STARTED, NodeLeaving("n1", "gpu1", Leaving.PREEMPTION, 120.0))
+    (taken,) = run.news().notifications
+    assert taken.kind == Kind.PREEMPTED
+    assert taken.text.startswith("gpu1 (n1) leaves in 2:00: its provider takes it away")
+    assert (taken.facts["node"], taken.facts["seconds"]) == ("gpu1", 120.0)
+    run.add(lost(COARSE), NodeLeft("n1", "gpu1"))  # the task could not save in time
+    assert run.kinds() == ["preempted"]
+    run.add(NodeLeaving("n2", "gpu2", Leaving.REBALANCE), NodeLeaving("n3", "gpu3", Leaving.DRAIN))
+    assert run.kinds() == ["preempted"]
+    run.add(NodeLeaving("n2", "gpu2", Leaving.PREEMPTION))
     assert run.kinds() == ["preempted", "preempted"]
 
 

@@ -29,11 +29,14 @@ const TYPES = {
   PauseRequested: ["Pause requested", () => "saves a checkpoint, then waits"],
   UnpauseRequested: ["Resume requested", () => "resumes when a worker is free"],
   RetryRequested: ["Retry requested", () => "gets all its attempts again"],
-  TaskYielded: ["Yielded", () => "saved a checkpoint and freed its worker"],
+  TaskYielded: ["Yielded", (e) => `saved a checkpoint and freed its worker${e.leaves ? `, and moves: ${e.leaves} leaves` : ""}`],
   RunWaiting: ["Waiting", (e) => e.reason],
   RunContinued: ["Continued", (e) => `after ${duration(e.seconds)}`],
   NodeQuarantined: ["Quarantine", (e) => `${e.host} gets no tasks until ${clock(e.until)}: ${e.reason}`],
   NodeReleased: ["Released", (e) => `${e.host} is used again: ${e.reason}`],
+  NodeLeaving: ["Leaves", (e) => `${e.host} announces that it leaves${e.seconds === null ? "" : ` in ${duration(e.seconds)}`} (${e.kind}): its tasks save a checkpoint and move`],
+  NodeStaying: ["Stays", (e) => `${e.host} stays after all, and is used again`],
+  NodeLeft: ["Left", (e) => `${e.host} has left`],
   RunEnded: ["Ended", (e) => [e.outcome === "interrupted" ? "stopped" : e.outcome, e.reason].filter(Boolean).join(": ")],
 };
 

@@ -131,9 +131,22 @@ function fillQuarantine(node, { quarantine }, now, acts) {
   ] : []));
 }
 
+/** That a machine leaves, and when. @param {HTMLElement} node @param {NodeView} host @param {number} now */
+function fillLeaving(node, { leaving }, now) {
+  const mark = pill("paused");
+  setPill(mark, "paused", "leaves");
+  node.hidden = !leaving;
+  const left = leaving && leaving.until !== null ? `${duration(Math.max(leaving.until - now, 0))} left` : "";
+  replaceIfChanged(node, [leaving, left], () => (leaving ? [
+    el("p", {}, mark, ` ${left}`),
+    el("p", { class: "small" }, `${leaving.reason}: its tasks save a checkpoint and move`),
+  ] : []));
+}
+
 /** @param {HTMLElement} node @param {NodeView} host @param {number} now by the server's clock @param {ActionButtons} acts */
 function fillMachine(node, host, now, acts) {
-  const [title, device, quarantine, work, numbers, usage, measured] = childrenOf(node);
+  const [title, device, leaving, quarantine, work, numbers, usage, measured] = childrenOf(node);
+  fillLeaving(leaving, host, now);
   fillQuarantine(quarantine, host, now, acts);
   const rest = host.tasks.length - MOST;
   setText(title, host.node);
@@ -156,7 +169,7 @@ export function machines(acts) {
   return {
     /** @param {RunPage} run */
     update({ nodes, now }) {
-      const make = () => el("li", {}, el("h3"), el("span", { class: "muted small" }), el("div", { class: "quarantine" }), el("p"), el("p", { class: "muted small" }), el("ul", { class: "meters" }), el("p", { class: "muted small" }));
+      const make = () => el("li", {}, el("h3"), el("span", { class: "muted small" }), el("div", { class: "quarantine" }), el("div", { class: "quarantine" }), el("p"), el("p", { class: "muted small" }), el("ul", { class: "meters" }), el("p", { class: "muted small" }));
       reconcile(byId("nodes"), nodes, (host) => host.node, make, (node, host) => fillMachine(node, host, now, acts));
       if (!nodes.length) byId("nodes").replaceChildren(el("li", { class: "empty", "data-key": "" }, "No machine is in use yet."));
     },

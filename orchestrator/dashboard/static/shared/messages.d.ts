@@ -144,6 +144,18 @@ export interface HeldOutViews {
   views: Array<HeldOutView>;
 }
 
+/** Why a node leaves. */
+export type Leaving = "preemption" | "termination" | "maintenance" | "rebalance" | "drain";
+
+/** A machine that has announced that it leaves; `until` in epoch seconds, None if it is not known when. */
+export interface LeavingView {
+  node: string;
+  host: string;
+  kind: Leaving;
+  reason: string;
+  until: number | null;
+}
+
 /** The points of a curve. */
 export interface Line {
   x: Array<number>;
@@ -192,6 +204,7 @@ export interface NodeView {
   rate: number;
   usage: UsageView | null;
   quarantine: QuarantineView | null;
+  leaving: LeavingView | null;
 }
 
 /** What a user should read. */
@@ -432,6 +445,7 @@ export interface Summary {
   moved: MovedView;
   notices: Array<NoticeView>;
   quarantined: Array<QuarantineView>;
+  leaving: Array<LeavingView>;
   tasks: Array<TaskView>;
   blocks: Array<BlockView>;
 }
@@ -455,6 +469,7 @@ export interface SummaryHead {
   moved: MovedView;
   notices: Array<NoticeView>;
   quarantined: Array<QuarantineView>;
+  leaving: Array<LeavingView>;
 }
 
 /** A task: its progress, where it runs, and what went wrong; `seconds` of all its attempts. */
@@ -477,6 +492,7 @@ export interface TaskView {
   received: number;
   sent: number;
   retries: number;
+  moves: number;
   reasons: Array<string>;
 }
 
