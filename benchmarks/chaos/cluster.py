@@ -22,7 +22,7 @@ HEAD, SECOND, DRIVER = GROUPS = "head", "second", "driver"  # of processes that 
 THIRD, FOURTH = "third", "fourth"
 _RECOVERY = Path(__file__).parents[2] / "deploy" / "recovery.env"  # how soon Ray notices a lost process
 _TMP = "/tmp"  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
-_NO_WORK = ("ray::IDLE", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
+_NO_WORK = ("ray::IDLE", "ray::Agent", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
 _SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER of prctl(2)
 _TIMEOUT_S = 120.0  # for a node to start, and for processes to end
 _POLL_S = 0.05  # between two checks of a process table or a port

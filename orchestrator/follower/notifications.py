@@ -20,13 +20,14 @@ from panolog.orchestrator.run.records import (
     Stored,
     TaskFailed,
     TaskStarted,
+    TaskYielded,
 )
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.run.units import duration
 from panolog.workers.tasks import StrEnum, TaskId
 
 _LONGEST = 1000  # characters of a text
-# Of what is announced, that a machine is taken away; all others may end as their owner or Ray wants.
+# Of these people are notified at once, of others once a task has to move: a node that drains may be idle.
 _TAKEN = (Leaving.PREEMPTION, Leaving.TERMINATION, Leaving.MAINTENANCE)
 _TOGETHER_S = 60.0  # losses on one node within so many seconds are one notification
 
@@ -76,6 +77,8 @@ class Losses:
     hosts: dict[TaskId, str] = field(default_factory=dict)
     found: dict[int, tuple[float, str, list[str]]] = field(default_factory=dict)  # by the first record
     announced: dict[str, tuple[int, float, NodeLeaving]] = field(default_factory=dict)  # by node
+    _nodes: dict[TaskId, str] = field(default_factory=dict)  # Node.id of the latest attempt
+    _leaving: dict[str, NodeLeaving] = field(default_factory=dict)  # by node
     _latest: dict[str, int] = field(default_factory=dict)  # by node: the first record of its latest group
 
     def add(self, records: Sequence[Stored]) -> None:
@@ -84,11 +87,19 @@ class Losses:
             record = item.record
             if isinstance(record, TaskStarted):
                 self.hosts[record.task] = record.node
+                self._nodes[record.task] = record.node_id
             elif isinstance(record, NodeLeaving):
+                self._leaving[record.node] = record
                 if record.kind in _TAKEN:
-                    self.announced.setdefault(record.node, (item.id, item.time, record))
+                    self._announce(item, record.node)
+            elif isinstance(record, TaskYielded) and record.leaves:
+                self._announce(item, self._nodes.get(record.task, ""))
             elif isinstance(record, TaskFailed) and _left(record) and record.node not in self.announced:
                 self._note(item.id, item.time, record)
+
+    def _announce(self, item: Stored, node: str) -> None:
+        if node in self._leaving:
+            self.announced.setdefault(node, (item.id, item.time, self._leaving[node]))
 
     def _note(self, id: int, time: float, record: TaskFailed) -> None:
         before = self._latest.get(record.node)

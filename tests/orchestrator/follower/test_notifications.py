@@ -130,7 +130,11 @@ def test_a_machine_that_announces_its_end_is_one_notification(run: Run) -> None:
     run.add(NodeLeaving("n2", "gpu2", Leaving.REBALANCE), NodeLeaving("n3", "gpu3", Leaving.DRAIN))
     assert run.kinds() == ["preempted"]
     run.add(NodeLeaving("n2", "gpu2", Leaving.PREEMPTION))
-    assert run.kinds() == ["preempted", "preempted"]
+    assert run.kinds() == ["preempted"] * 2
+    run.add(TaskStarted(COARSE, 2, 0, "gpu3", 3, "cpu", 2, node_id="n3"), TaskYielded(COARSE, "gpu3"))
+    assert run.kinds() == ["preempted"] * 3  # a node that drains is announced once it had a task
+    run.add(TaskYielded(COARSE))
+    assert run.kinds() == ["preempted"] * 3
 
 
 def test_a_silent_run_is_stalled_once_for_each_silence(run: Run) -> None:
