@@ -11,7 +11,8 @@ from panolog.orchestrator.resources.metadata import NoAnswerError, Provider, det
 from panolog.orchestrator.run.records import Leaving
 
 _LOOK_S = 2.0  # between two looks; the shortest notice of a provider is of 30 seconds
-_RETRY_S = 30.0  # the same while the service does not answer
+_RETRY_S = 30.0  # the same until the service answers for the first time
+_SURVIVED_S = 300.0  # after its end from which on a machine whose notice is gone is there after all
 _LOG = logging.getLogger(__name__)
 
 
@@ -25,6 +26,7 @@ class Watch:
         self._change = Condition()
         self._notice: LeaveNotice | None = None
         self._noted = -math.inf  # time.monotonic() of `_notice`
+        self._answered = False  # the service, once
         self._closed = False
         Thread(target=self._run, name="leave notices", daemon=True).start()
 
@@ -49,6 +51,13 @@ class Watch:
     def _kind(self) -> Leaving | None:
         return self._notice.kind if self._notice else None
 
+    @property
+    def _survived(self) -> bool:
+        """Whether the machine works long after its announced end, as after a hibernation."""
+        if self._notice is None or self._notice.seconds is None:
+            return False
+        return time.monotonic() - self._noted > self._notice.seconds + _SURVIVED_S
+
     def _now(self) -> LeaveNotice | None:
         return self._notice and self._notice.after(time.monotonic() - self._noted)
 
@@ -70,9 +79,11 @@ class Watch:
             found = provider.notice()
         except NoAnswerError as error:
             _LOG.debug("leave notices: %s", error)
-            return self._look_s if self._notice else _RETRY_S
+            return self._look_s if self._answered else _RETRY_S
+        self._answered = True
         with self._change:
-            if found is None and self._notice and not provider.withdraws(self._notice.kind):
+            holds = self._kind is not None and not provider.withdraws(self._kind) and not self._survived
+            if found is None and holds:
                 return self._look_s
             if found is None or self._notice is None or found.kind != self._notice.kind:
                 self._notice, self._noted = found, time.monotonic()

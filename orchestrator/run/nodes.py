@@ -82,15 +82,15 @@ _WHY = {
 
 
 def why_leaving(kind: Leaving) -> str:
-    """Why a node leaves, for people."""
-    return _WHY[kind]
+    """Why a node leaves, and what follows from it, for people."""
+    sole = " if another machine stays" if kind == Leaving.REBALANCE else ""
+    return f"{_WHY[kind]}; tasks there save a checkpoint and move{sole}"
 
 
 def leave_text(record: NodeLeaving) -> str:
     """For people, that a node leaves."""
     when = "" if record.seconds is None else f" in {duration(record.seconds)}"
-    what = "tasks there save a checkpoint and move"
-    return f"{record.host} ({record.node[:8]}) leaves{when}: {why_leaving(record.kind)}; {what}"
+    return f"{record.host} ({record.node[:8]}) leaves{when}: {why_leaving(record.kind)}"
 
 
 def follow(nodes: Nodes, record: Record, where: str, time: float) -> Nodes:

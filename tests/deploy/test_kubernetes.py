@@ -10,7 +10,9 @@ import kubernetes_validate
 import pytest
 import ray
 import yaml
+from typer.main import get_command
 
+from panolog.orchestrator.cli import app
 from panolog.orchestrator.cluster.jobs import RUN_KEY
 from tests.deploy.files import DEPLOY, load_all
 
@@ -59,6 +61,15 @@ def test_it_would_refuse_what_is_wrong(job: Any) -> None:
     template["spec"]["containers"][0]["volumeMount"] = []
     with pytest.raises(kubernetes_validate.ValidationError):
         check_pod(template)
+
+
+def test_a_worker_that_ends_has_time_to_let_its_tasks_move(job: Any) -> None:
+    worker = pods(job)[1]["spec"]
+    program, *words = worker["containers"][0]["lifecycle"]["preStop"]["exec"]["command"]
+    assert (program, words[:2]) == ("panolog", ["cluster", "leave"])
+    assert int(words[2]) < worker["terminationGracePeriodSeconds"]
+    leave = get_command(app.app).commands["cluster"].commands["leave"]  # type: ignore[attr-defined]
+    assert leave.make_context("leave", words[2:]).params["seconds"] == int(words[2])
 
 
 def test_versions_volumes_and_names_fit_together(job: Any) -> None:

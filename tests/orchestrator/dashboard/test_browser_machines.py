@@ -69,7 +69,7 @@ def test_a_machine_that_leaves_is_shown_until_it_has_left(
         machine = page.locator("#nodes li", has_text="gpu-07")
         expect(machine).to_contain_text("leaves")
         expect(machine).to_contain_text("left")
-        expect(machine).to_contain_text("its provider takes it away: its tasks save a checkpoint and move")
+        expect(machine).to_contain_text("its provider takes it away; tasks there save a checkpoint and move")
         assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
         append(folder, NodeLeft(LEAVES.node, LEAVES.host))
         expect(machine).to_have_count(0)

@@ -190,7 +190,7 @@ def test_a_watch_reports_a_notice_and_that_it_is_withdrawn(served: Metadata) -> 
 
 
 @amazon
-def test_a_service_that_fails_withdraws_nothing(served: Metadata) -> None:
+def test_a_service_that_fails_withdraws_nothing(served: Metadata, monkeypatch: pytest.MonkeyPatch) -> None:
     watch = Watch(look_s=0.01)
     try:
         served.values[REBALANCE] = "{}"
@@ -217,6 +217,8 @@ def test_a_service_that_fails_withdraws_nothing(served: Metadata) -> None:
         later = watch.notice()
         assert later is not None and later.seconds is not None and found.seconds is not None
         assert later.seconds < found.seconds
+        monkeypatch.setattr("panolog.orchestrator.resources.watch._SURVIVED_S", -1000.0)
+        assert wait_for(watch, Leaving.PREEMPTION) is None  # the machine was hibernated, and works again
     finally:
         watch.close()
 

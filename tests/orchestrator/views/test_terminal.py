@@ -1,5 +1,8 @@
 """What the terminal shows of a run, at the usual widths."""
 
+import json
+import re
+import time
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -8,13 +11,20 @@ import pytest
 from rich.console import Console
 
 from panolog.orchestrator.run.records import (
+    Leaving,
+    NodeLeaving,
+    NodeLeft,
+    NodeStaying,
     PauseRequested,
     Progressed,
+    Record,
     RunContinued,
     RunWaiting,
+    Stored,
     TaskYielded,
 )
 from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.views.summary import summarize
 from panolog.orchestrator.views.terminal import WIDE, page, progress
 from tests.orchestrator.views.test_timing import (
     INFO,
@@ -85,6 +95,58 @@ def test_a_run_that_waits_for_its_disk_says_so_and_what_to_do() -> None:
     continued = shown([*waiting, (20_900, RunContinued(899.0))], 120, running=True)
     assert continued.startswith("running · Stage II · ")
     assert reason not in continued + shown(waiting, 120, running=False)
+
+
+LEAVES = NodeLeaving("3f2a81c4d5e6", "gpu-07", Leaving.PREEMPTION, 120.0)
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_machines_that_leave_are_shown_with_the_time_left_until_they_have_left(width: int) -> None:
+    now = time.time()
+    recent: list[Timed] = [*LARGE, (now, LEAVES), (now + 1, TaskYielded(ONE, "gpu-07"))]
+    text = " ".join(shown(recent, width, running=True).split())
+    assert re.search(
+        r"gpu-07 \(3f2a81c4\): leaves in (2:00|1:5\d): its provider takes it away; tasks there", text
+    )
+    assert "1 moved from machines that left" in text
+    later = shown([*recent, (now + 2, NodeLeft("3f2a81c4d5e6", "gpu-07"))], width, running=True)
+    assert "gpu-07" not in later
+    assert "gpu-07" not in shown(recent, width, running=False).splitlines()[1]
+
+
+def test_plain_lines_say_what_leaves_and_what_moves() -> None:
+    console = Console(file=StringIO(), width=80)
+    records: list[Record] = [
+        LEAVES,
+        TaskYielded(ONE, "gpu-07"),
+        NodeLeft("3f2a81c4d5e6", "gpu-07"),
+        NodeStaying("7f2a81c4d5e6", "gpu-08"),
+    ]
+    with progress(console, Path("run")) as show:
+        show(RunState(), [Stored(number, 0.0, record) for number, record in enumerate(records, 1)])
+    assert isinstance(console.file, StringIO)
+    assert console.file.getvalue().splitlines() == [
+        "gpu-07 (3f2a81c4) leaves in 2:00: its provider takes it away; tasks there save a checkpoint and move",
+        "block 1: has stopped with a checkpoint, and moves: gpu-07 leaves",
+        "gpu-07 (3f2a81c4): has left",
+        "gpu-08 (7f2a81c4): stays after all, and is used again",
+    ]
+
+
+def test_status_says_which_machines_leave_and_how_often_a_task_moved() -> None:
+    summary = summarize(state([*LARGE, (20_001, LEAVES), (20_002, TaskYielded(ONE, "gpu-07"))]), running=True)
+    (leaving,) = json.loads(summary.model_dump_json())["leaving"]
+    assert leaving == {
+        "node": "3f2a81c4d5e6",
+        "host": "gpu-07",
+        "kind": "preemption",
+        "reason": "its provider takes it away; tasks there save a checkpoint and move",
+        "until": 20_121.0,
+    }
+    task = summary.task(str(ONE))
+    assert task is not None
+    assert task.moves == 1
+    assert [notice.message for notice in summary.notices if "gpu-07" in notice.message]
 
 
 def test_plain_lines_say_it_also_where_no_record_can_be_stored() -> None:

@@ -139,7 +139,7 @@ function fillLeaving(node, { leaving }, now) {
   const left = leaving && leaving.until !== null ? `${duration(Math.max(leaving.until - now, 0))} left` : "";
   replaceIfChanged(node, [leaving, left], () => (leaving ? [
     el("p", {}, mark, ` ${left}`),
-    el("p", { class: "small" }, `${leaving.reason}: its tasks save a checkpoint and move`),
+    el("p", { class: "small" }, leaving.reason),
   ] : []));
 }
 
@@ -151,7 +151,7 @@ function fillMachine(node, host, now, acts) {
   const rest = host.tasks.length - MOST;
   setText(title, host.node);
   setText(device, host.gpus.join(", ") || host.device);
-  setText(work, host.tasks.length ? host.tasks.slice(0, MOST).map(taskLabel).join(", ") + (rest > 0 ? ` and ${rest} more` : "") : host.quarantine ? "" : "idle");
+  setText(work, host.tasks.length ? host.tasks.slice(0, MOST).map(taskLabel).join(", ") + (rest > 0 ? ` and ${rest} more` : "") : host.quarantine || host.leaving ? "" : "idle");
   setText(numbers, host.tasks.length ? `${bytes(host.memory)} used by tasks${host.rate ? ` · ${fixed(host.rate, 1)} it/s` : ""}` : "");
   const makeMeter = () => el("li", {}, el("span"), bar(0, ""), el("span", { class: "number" }));
   reconcile(usage, host.usage ? meters(host.usage) : [], ([label]) => label, makeMeter, (item, [label, text, share]) => {
