@@ -197,5 +197,6 @@ def end_children() -> None:
     """Ends all processes below this one, also those that their parents have left behind."""
     while processes := psutil.Process().children(recursive=True):
         for process in processes:
-            process.kill()
+            with suppress(psutil.NoSuchProcess):  # its parent has waited for it meanwhile
+                process.kill()
         psutil.wait_procs(processes, timeout=_TIMEOUT_S)

@@ -1,6 +1,6 @@
 """Nodes that announce that they leave: does every run end with the same bytes, and what does it lose?
 
-    python -m benchmarks.chaos.notices [--runs 20] [--seconds 120,30,0] [--seed 0] [--folder FOLDER] [--json]
+    python -m benchmarks.chaos.notices [--runs 20] [--seconds 120,30,0] [--nodes 2,3] [--seed 0]
     python -m benchmarks.chaos.notices --quick
 
 A small town with two blocks is reconstructed on Ray clusters of two and of three nodes on this machine, whose
@@ -219,6 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0, help="of the times")
     parser.add_argument("--seconds", type=seconds_of, default=(120.0, 30.0, 0.0), help="of notice: S,S,...")
+    parser.add_argument("--nodes", type=sizes_of, default=(2, 3), help="of the clusters: 2, 3 or 2,3")
     parser.add_argument("--folder", type=Path, help="an empty one, which keeps the runs")
     options = parser.parse_args(arguments)
     if options.quick:
@@ -227,7 +228,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def work() -> report.Report:
         with tempfile.TemporaryDirectory(prefix="chaos-notices-") as folder:
             plan = list(plans(options.runs, options.seed, options.seconds))
-            outcome = notices(options.folder or Path(folder), plan)
+            outcome = notices(options.folder or Path(folder), plan, options.nodes)
         failures = outcome.failures()
         last = "\n".join(failures) or f"all runs passed; the limit is a checkpoint and {LIMIT_S:g} s"
         text = f"{report.markdown(HEADER, list(outcome.rows()))}\n\n{last}"
@@ -242,6 +243,14 @@ def seconds_of(text: str) -> tuple[float, ...]:
         return tuple(map(float, text.split(",")))
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text}: write seconds, such as 120,30,0") from error
+
+
+def sizes_of(text: str) -> tuple[int, ...]:
+    """The value of --nodes. Raises ArgumentTypeError."""
+    sizes = tuple(size for size in _HIT if str(size) in text.split(","))
+    if len(sizes) != len(text.split(",")):
+        raise argparse.ArgumentTypeError(f"{text}: write 2, 3 or 2,3")
+    return sizes
 
 
 if __name__ == "__main__":

@@ -119,7 +119,8 @@ def after_failure(
     node had announced that it leaves.
     """
     if preemptions is not None:
-        return Consequence(final=0 <= preemptions <= task.preemptions, then="continues elsewhere")
+        final = 0 <= preemptions <= task.preemptions
+        return Consequence(final, "" if final else "its machine has left: it continues on another")
     if failure == Failure.LOST:
         return Consequence(final=task.losses >= LOSSES)
     if task.errors >= retries:

@@ -169,7 +169,9 @@ def test_losses_by_preemption_have_a_budget_of_their_own(tmp_path: Path) -> None
     run = Harness(tmp_path, (A,), preemptions=2)
     with pytest.raises(RunError, match="died"):
         run.drive(lost_with_node(run, 3))
-    assert [record.final for record in run.records(TaskFailed)] == [False, False, True]
+    failed = run.records(TaskFailed)
+    assert [record.final for record in failed] == [False, False, True]
+    assert [bool(record.then) for record in failed] == [True, True, False]
 
 
 def test_without_announcement_a_lost_machine_counts_as_before(tmp_path: Path) -> None:

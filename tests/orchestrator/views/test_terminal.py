@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from panolog.orchestrator.run.nodes import why_leaving
 from panolog.orchestrator.run.records import (
     Leaving,
     NodeLeaving,
@@ -126,7 +127,7 @@ def test_plain_lines_say_what_leaves_and_what_moves() -> None:
         show(RunState(), [Stored(number, 0.0, record) for number, record in enumerate(records, 1)])
     assert isinstance(console.file, StringIO)
     assert console.file.getvalue().splitlines() == [
-        "gpu-07 (3f2a81c4) leaves in 2:00: its provider takes it away; tasks there save a checkpoint and move",
+        f"gpu-07 (3f2a81c4) leaves in 2:00: {why_leaving(Leaving.PREEMPTION)}",
         "block 1: has stopped with a checkpoint, and moves: gpu-07 leaves",
         "gpu-07 (3f2a81c4): has left",
         "gpu-08 (7f2a81c4): stays after all, and is used again",
