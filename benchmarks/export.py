@@ -122,7 +122,7 @@ def measure(options: argparse.Namespace) -> report.Report:
     if unknown := [*(set(wanted) - set(FORMATS)), *(set(only) - set(PARTS))]:
         raise InputError(f"{unknown[0]}: write some of {', '.join([*FORMATS, *PARTS])}")
     folder = RunFolder(options.run)
-    scene = scene_of(read_info(folder))
+    scene = scene_of(read_info(folder), folder)
     content, texts = dict[str, object](), list[str]()
     with TemporaryDirectory(dir=options.folder, prefix="panolog-export-") as name:
         scratch = Path(name)

@@ -124,7 +124,7 @@ def _plain(run: RunFolder, folder: Path) -> Turn:
     """The blocks of a finished run again, each in a process, without driver, Ray or checkpoints."""
     folder.mkdir()
     info = read_info(run)
-    job = Job(run, scene_of(info), change(info.config, {"checkpoint.every": _NEVER}))
+    job = Job(run, scene_of(info, run), change(info.config, {"checkpoint.every": _NEVER}))
     specs = Specs(job, InProcess())
     started = [stored.record for stored in history(run.root) if isinstance(stored.record, TaskStarted)]
     threads = {record.task: record.threads for record in started if record.task.stage is Stage.BLOCK}

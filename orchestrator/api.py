@@ -139,8 +139,8 @@ def run(
         RunError: the run failed. `resume` tries again.
         KeyboardInterrupt: it was interrupted. `resume` resumes it.
     """
-    path = scene.root if isinstance(scene, Scene) else Path(scene)
-    return session.start(path, Path(output), config or RunConfig(), address, on_change, pool)
+    source = scene.root if isinstance(scene, Scene) else scene if isinstance(scene, str) else Path(scene)
+    return session.start(source, Path(output), config or RunConfig(), address, on_change, pool)
 
 
 def resume(

@@ -28,6 +28,10 @@ class FormatError(InputError):
     """A file of Gaussians that is no PLY is missing or damaged, or a model does not fit into one."""
 
 
+class StoreError(InputError):
+    """An object store, or what is to be in it, is missing, refuses access or has changed."""
+
+
 class ConfigError(InputError):
     """A setting or an option has an unknown name or a value that is not allowed."""
 
@@ -58,3 +62,7 @@ class RunError(PanologError):
 
 class ClusterLostError(RunError):
     """A Ray cluster has failed while a run was at work on it."""
+
+
+class StoreLostError(RunError):
+    """An object store has failed for too long."""

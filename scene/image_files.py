@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import ImageError, SceneError
+from panolog.scene.stores.outline import whole
 
 _TAIL = 65_536  # bytes searched for the end of a JPEG before the whole file is: cameras append little
+_HEAD = 262_144  # bytes in which the pixels of a PNG must begin, if not all of it is there
 _PNG = b"\x89PNG\r\n\x1a\n"
 _IEND = b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _JPEG_END, _JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", 0xDA
@@ -78,9 +80,27 @@ def decode(path: Path, flags: int) -> NDArray[Any]:
     return _decoded(path, _read(path), flags)
 
 
+def shows_ends(path: Path) -> bool:
+    """Whether a file has the header and the end of a JPEG or PNG, whatever is between them.
+
+    Raises OSError if it cannot be read.
+    """
+    with path.open("rb") as file:
+        magic = file.read(8)
+        try:
+            if magic == _PNG:
+                pixels_begin = b"IDAT" in file.read(_HEAD)
+                file.seek(8)
+                return pixels_begin and bool(_png(path, file))
+            return magic.startswith(_JPEG) and bool(_jpeg(path, file))
+        except ImageError:
+            return False
+
+
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        data = whole(path)
+        return path.read_bytes() if data is None else data
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
 

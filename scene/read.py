@@ -28,9 +28,11 @@ from numpy.typing import NDArray
 from panolog.scene.colmap import ColmapImage, ColmapModel, read_panoramas
 from panolog.scene.errors import SceneError
 from panolog.scene.files import StrPath, stem_of
-from panolog.scene.image_files import check_layer, layer_record, read_infos
+from panolog.scene.image_files import check_layer, layer_record, read_infos, shows_ends
 from panolog.scene.model import NO_OFFSET, Panorama, Scene, Vector
 from panolog.scene.ply_table import read_table, read_vertices
+from panolog.scene.stores.outline import outline
+from panolog.scene.stores.url import is_url
 
 DEPTHS, SKY_MASKS, MASKS = "depths", "skymasks", "masks"
 MIN_CAMERAS = 2  # one panorama has no parallax
@@ -45,17 +47,28 @@ def read_scene(path: StrPath) -> Scene:
     Every image file is opened and found complete, but none is decoded.
 
     Args:
-        path: the scene's folder.
+        path: the scene's folder, or its URL in an object store: `Scene.root` is then its outline here.
 
     Raises:
         SceneError: what is wrong with it, in one line.
         PlyError: its points3D.ply is damaged.
+        StoreError, StoreLostError: the store has no such scene, refuses access or fails.
     """
+    if isinstance(path, str) and is_url(path):
+        return _read_stored(path)
     root = Path(path).resolve()
     try:
         return _read_checked(root)
     except OSError as error:  # a file or folder that may not be read, or is gone meanwhile
         raise SceneError(f"{error.filename or root}: cannot be read ({error.strerror})") from error
+
+
+def _read_stored(url: str) -> Scene:
+    root = outline(url, shows_ends).resolve()
+    try:
+        return _read_checked(root)
+    except SceneError as error:
+        raise SceneError(str(error).replace(str(root), url.rstrip("/"))) from error
 
 
 def model_folder(root: Path) -> Path:

@@ -43,7 +43,7 @@ def request_status(root: Path) -> Times:
 
 def _call(root: Path) -> None:
     with redirect_stdout(io.StringIO()):
-        status(root, as_json=True)
+        status(str(root), as_json=True)
 
 
 def _command(root: Path) -> None:

@@ -39,7 +39,7 @@ class Gallery:
     def of(root: Path, device: str) -> "Gallery":
         """Of a run's scene, with the settings of the run. Raises InputError if the scene has changed."""
         info = read_info(RunFolder(root))
-        job = Job(RunFolder(root), scene_of(info), info.config)
+        job = Job(RunFolder(root), scene_of(info, RunFolder(root)), info.config)
         crop = info.config.eval.crop_bottom
         return Gallery(job.scene, job.width, job.near, crop, choose_device(device))
 

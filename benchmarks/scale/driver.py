@@ -147,7 +147,7 @@ def _drive(folder: Path, load: Load, *, halt: bool) -> Phase:
         journal = Journal(database, watch.show)
         journal.record([RunBegan(socket.gethostname(), os.getpid(), resumed=not halt)])
         try:
-            Driver(Job(root, scene_of(info), info.config), journal, pool).run()
+            Driver(Job(root, scene_of(info, root), info.config), journal, pool).run()
         except _HaltedError:
             if not halt:
                 raise

@@ -108,7 +108,9 @@ def live(paths: Paths, load: Load, epoch: float, now: float, number: int) -> Non
         world.sample(disk=True)
         clock.on_tick = world.on_tick
         try:
-            Driver(Job(folder, scene_of(info), info.config), journal, cluster, stop=Stop(), clock=clock).run()
+            Driver(
+                Job(folder, scene_of(info, folder), info.config), journal, cluster, stop=Stop(), clock=clock
+            ).run()
         except KeyboardInterrupt:
             raise SystemExit(STOPPED) from None
         finally:

@@ -7,7 +7,18 @@ from typing import Annotated, Any
 
 import typer
 
-from panolog.orchestrator.cli import clean, cluster, dashboard, export, notify, queue, results, run, scene
+from panolog.orchestrator.cli import (
+    clean,
+    cluster,
+    control,
+    dashboard,
+    export,
+    notify,
+    queue,
+    results,
+    run,
+    scene,
+)
 from panolog.orchestrator.cli.console import say
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.orchestrator.run import log
@@ -50,11 +61,11 @@ _PANELS: dict[str, dict[str, Any]] = {
         "events": run.events,
     },
     "Control of a live run": {
-        "stop": run.stop,
-        "pause": run.pause,
-        "unpause": run.unpause,
-        "retry": run.retry,
-        "release": run.release,
+        "stop": control.stop,
+        "pause": control.pause,
+        "unpause": control.unpause,
+        "retry": control.retry,
+        "release": control.release,
     },
     "Results": {
         "view": results.view,

@@ -6,8 +6,10 @@ from typing import Annotated, Any
 import typer
 
 from panolog.orchestrator.cli.console import print_result, progress_bar
-from panolog.orchestrator.cli.options import JsonOption, ModelArg
+from panolog.orchestrator.cli.options import AnyModelArg, JsonOption
+from panolog.orchestrator.cli.stores import opened
 from panolog.scene.errors import InputError
+from panolog.scene.stores.url import is_url
 
 _CHOICE = "What of the model"
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -59,7 +61,7 @@ Metres = Annotated[float | None, _place("M", "Metres of a unit. Default: as the 
 
 
 def export(
-    source: ModelArg,
+    source: AnyModelArg,
     output: Output,
     sog: Sog = False,
     web: Web = False,
@@ -80,12 +82,12 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write a model as small files for viewers, browsers, engines and globes."""
-    if not source.exists():
+    if not is_url(source) and not Path(source).exists():
         raise InputError(f"{source}: there is neither a run nor a PLY")
     wanted = {"sog": sog, "web": web, "spz": spz, "compressed-ply": compressed_ply, "glb": glb}
     wanted |= {"3dtiles": tiles, "sky-image": sky_image}
     box, direction = crop and _box(crop), up and _direction(up)
-    with progress_bar("reading the model") as show:
+    with opened(source, "export") as (root, _), progress_bar("reading the model") as show:
         from panolog.export.splats import Selection
         from panolog.orchestrator.commands.export import ExportSpec, export_model
         from panolog.orchestrator.commands.models import size_of
@@ -100,7 +102,7 @@ def export(
             epsg=epsg,
             metres=metres,
         )
-        sizes = {str(path): size_of(path) for path in export_model(source, output, spec, show)}
+        sizes = {str(path): size_of(path) for path in export_model(root, output, spec, show)}
     lines = (f"{path}  {size / 1e6:,.1f} MB" for path, size in sizes.items())
     files = [{"path": path, "bytes": size} for path, size in sizes.items()]
     print_result({"files": files}, lines, as_json=as_json)

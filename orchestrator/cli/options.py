@@ -15,18 +15,34 @@ if TYPE_CHECKING:
     from panolog.orchestrator.run.config import RunConfig
 
 SceneArg = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Pano360 scene.")]
+AnySceneArg = Annotated[
+    str, typer.Argument(metavar="SCENE", help="Folder or URL of a COLMAP or Pano360 scene.")
+]
 SourceArg = Annotated[
-    Path,
+    str,
     typer.Argument(
         metavar="SCENE|IMAGES|VIDEO",
-        help="Folder of a COLMAP or Pano360 scene; of panoramas to make one of, or a 360° video.",
+        help="Folder or URL (s3://, gs://, az://) of a COLMAP or Pano360 scene; of panoramas to make one of,"
+        " or a 360° video.",
     ),
 ]
+AnyRunArg = Annotated[str, typer.Argument(metavar="RUN", help="Folder or URL of a run.")]
 RunArg = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
 RunsArg = Annotated[list[Path], typer.Argument(metavar="RUN", help="Folders of two runs or more.")]
 ModelArg = Annotated[Path, typer.Argument(metavar="RUN|PLY", help="Folder of a run, or a PLY file.")]
+AnyModelArg = Annotated[str, typer.Argument(metavar="RUN|PLY", help="Folder or URL of a run, or a PLY file.")]
 BlockArg = Annotated[int, typer.Argument(metavar="BLOCK", min=0, help="Number of a block.")]
-NewRunOption = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the new run.")]
+NewRunOption = Annotated[
+    str, typer.Option("--output", "-o", metavar="RUN", help="Folder or URL of the new run.")
+]
+LocalOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--local",
+        metavar="DIR",
+        help="Folder on this machine of a run with a URL. Default: in the cache.",
+    ),
+]
 NewSceneOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="SCENE", help="Folder of the new scene.")
 ]

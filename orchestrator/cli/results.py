@@ -20,7 +20,9 @@ from panolog.orchestrator.cli.options import (
     RunsArg,
     axes_of,
 )
+from panolog.orchestrator.cli.stores import opened
 from panolog.scene.errors import InputError
+from panolog.scene.stores.url import is_url
 
 if TYPE_CHECKING:
     from panolog.export.site.page import Page
@@ -252,7 +254,9 @@ def _open(url: str) -> bool:
 
 
 def report(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Folder of a run; several are compared.")],
+    runs: Annotated[
+        list[str], typer.Argument(metavar="RUN", help="Folder or URL of a run; several folders are compared.")
+    ],
     output: PageOption = None,
 ) -> None:
     """Write a run as one page to share: RUN/report.html, or FILE.html; several, compared, as FILE.html."""
@@ -261,12 +265,16 @@ def report(
     if len(runs) > 1:
         if output is None:
             raise InputError("a report of several runs belongs to none of them: give -o FILE.html")
-        _write_comparison(runs, output)
+        if any(map(is_url, runs)):
+            raise InputError("a report of several runs reads folders only; fetch them first")
+        _write_comparison([Path(run) for run in runs], output)
         return
-    with progress_bar("writing the report"):
+    if is_url(runs[0]) and output is None:
+        raise InputError("a report of a run in a store: give -o FILE.html")
+    with opened(runs[0], "report") as (root, _), progress_bar("writing the report"):
         from panolog.orchestrator.views.report import write_report
 
-        page = write_report(RunFolder(runs[0]), output)
+        page = write_report(RunFolder(root), output)
     print(page)
 
 

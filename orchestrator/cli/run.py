@@ -1,4 +1,4 @@
-"""A run from its start to its end: run, resume, demo, doctor, status, events, and requests to its driver."""
+"""A run from its start to its end: run, resume, demo, doctor, status, events."""
 
 import json
 import os
@@ -6,27 +6,28 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from panolog.orchestrator.cli.console import command, err, print_json, print_result, progress_bar, say
 from panolog.orchestrator.cli.options import (
     AddressOption,
-    BlockArg,
+    AnyRunArg,
     DashboardOption,
     JsonOption,
+    LocalOption,
     LogOption,
     NewRunOption,
     NiceOption,
     NotifyOption,
     ResumesOption,
-    RunArg,
     SourceArg,
     SuperviseOption,
     with_preparation,
     with_run_config,
 )
+from panolog.orchestrator.cli.stores import mirrored, opened
 
 if TYPE_CHECKING:
     from panolog.orchestrator.preparation.settings import Options
@@ -50,34 +51,29 @@ def run(
     max_resumes: ResumesOption = None,
     notify: NotifyOption = None,
     log: LogOption = None,
+    local: LocalOption = None,
 ) -> None:
     """Reconstruct a scene, a folder of panoramas or a 360° video: one model of the place."""
     from panolog.orchestrator.preparation.settings import as_arguments
     from panolog.orchestrator.run.config import as_settings
 
     driver = _driver_options(address, nice, dashboard=dashboard)
-    with _followed(output, notify, log):
+    code, state = 0, None
+    with mirrored(output, local) as root, _followed(root, notify, log):
         if _supervised(max_resumes, supervise=supervise):
-            first = [
-                "run",
-                str(source),
-                "-o",
-                str(output),
-                *as_settings(config),
-                *as_arguments(options),
-                *driver,
-            ]
-            _supervise(output, first, driver, address, max_resumes)
-        with progress_bar("starting"):
-            from panolog.orchestrator.commands import session
+            first = ["run", source, "-o", str(root), *as_settings(config), *as_arguments(options), *driver]
+            code = _supervise(root, first, driver, address, max_resumes)
+        else:
+            with progress_bar("starting"):
+                from panolog.orchestrator.commands import session
 
-        with _display(output, dashboard=dashboard) as show:
-            state = session.start(source, output, config, address, show, None, nice, options)
-    _say_results(output, state)
+            with _display(root, output, dashboard=dashboard) as show:
+                state = session.start(source, root, config, address, show, None, nice, options)
+    _end(root, code, state)
 
 
 def resume(
-    run: RunArg,
+    run: AnyRunArg,
     address: AddressOption = None,
     nice: NiceOption = None,
     dashboard: DashboardOption = False,
@@ -85,23 +81,32 @@ def resume(
     max_resumes: ResumesOption = None,
     notify: NotifyOption = None,
     log: LogOption = None,
+    local: LocalOption = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Take a run with a URL from a driver that may still be at work.")
+    ] = False,
     after: Annotated[str, typer.Option("--resumed-after", hidden=True)] = "",
+    has_mirror: Annotated[bool, typer.Option("--has-mirror", hidden=True)] = False,
 ) -> None:
     """Resume a run from its last checkpoints."""
     from panolog.orchestrator.run.folder import RunFolder
     from panolog.orchestrator.run.info import read_info
 
-    read_info(RunFolder(run))  # fails before torch is imported
     options = _driver_options(address, nice, dashboard=dashboard)
-    with _followed(run, notify, log):
-        if _supervised(max_resumes, supervise=supervise):
-            _supervise(run, ["resume", str(run), *options], options, address, max_resumes)
-        with progress_bar("starting"):
-            from panolog.orchestrator.commands import session
+    code, state = 0, None
+    with mirrored(run, local, resumes=True, force=force, mirror=not has_mirror) as root:
+        read_info(RunFolder(root))  # fails before torch is imported
+        with _followed(root, notify, log):
+            if _supervised(max_resumes, supervise=supervise):
+                first = ["resume", str(root), *options, "--has-mirror"]
+                code = _supervise(root, first, options, address, max_resumes)
+            else:
+                with progress_bar("starting"):
+                    from panolog.orchestrator.commands import session
 
-        with _display(run, dashboard=dashboard) as show:
-            state = session.resume(run, address, show, None, nice, after)
-    _say_results(run, state)
+                with _display(root, run, dashboard=dashboard) as show:
+                    state = session.resume(root, address, show, None, nice, after)
+    _end(root, code, state)
 
 
 def demo(
@@ -137,7 +142,7 @@ def demo(
 
         place = demo_of(flight=flight, city=city)
         scene = make_place(root, place, lambda done, total: count(f"rendering {place.title}", done, total))
-    with _display(root) as show:
+    with _display(root, str(root)) as show:
         state = run_demo(scene, root, place, address, show)
     _say_results(root, state)
 
@@ -167,20 +172,28 @@ def doctor(
         raise typer.Exit(2)
 
 
-def status(run: RunArg, as_json: JsonOption = False) -> None:
+def status(run: AnyRunArg, as_json: JsonOption = False) -> None:
     """Show how far a run is, live or ended."""
+    with opened(run, "status") as (root, live):
+        _status(root, run, live=live, as_json=as_json)
+
+
+def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
+    """Prints the state of a run. Args: run, its name in commands; live, whether a driver elsewhere has it."""
     from dataclasses import replace
 
     from panolog.orchestrator.run import lock, presence
     from panolog.orchestrator.run.folder import RunFolder, head_of, read_json
     from panolog.orchestrator.run.state import replay
     from panolog.orchestrator.run.store import read_milestones
+    from panolog.orchestrator.storage.state import read_state
     from panolog.orchestrator.views.preparation import prepared_share, view_preparation, with_step
 
-    folder = RunFolder(run)
+    folder = RunFolder(root)
     info = read_json(folder)
     scene, width = head_of(folder, info)
-    running = lock.held(folder.lock)
+    running = live or lock.held(folder.lock)
+    mirror = read_state(folder.mirror, running=running)
     state = replay(read_milestones(folder.database) if folder.database.exists() else ())
     if running and not state.waiting:  # a full disk takes no record of it
         state = replace(state, waiting=presence.waiting(folder.presence))
@@ -191,8 +204,9 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
         from panolog.orchestrator.views.timing import progress_of
 
         progress = progress_of(state, info, prepared_share(prepared) if prepared else None)
-        head = {"run": str(run), "scene": scene, "width": width, "progress": progress}
+        head = {"run": run, "scene": scene, "width": width, "progress": progress}
         head |= {"preparation": prepared.model_dump(mode="json")} if prepared else {}
+        head |= {"store": vars(mirror) | {"lag": mirror.lag}} if mirror else {}
         print_json(head | summarize(state, running=running, root=run).model_dump(mode="json"))
         return
     from rich import get_console
@@ -200,20 +214,27 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     from panolog.orchestrator.views.terminal import WIDE, page
 
     console = get_console()
-    shown = page(state, root=run, info=info, running=running, wide=console.width >= WIDE)
+    shown = page(state, root=root, name=run, info=info, running=running, wide=console.width >= WIDE)
     console.print(shown, crop=False)  # a command longer than a line is whole
+    if mirror:
+        console.print(mirror.line, style="yellow" if mirror.late else "dim", markup=False, highlight=False)
     for step in prepared.steps if prepared and not state.prepared else ():
         for line in step.lines:
             console.print(f"{step.label}: {line}", style="dim", markup=False, highlight=False)
 
 
 def events(
-    run: RunArg,
+    run: AnyRunArg,
     follow: Annotated[
         bool, typer.Option("--follow", help="Print new events as long as the run is live.")
     ] = False,
 ) -> None:
     """Print the history of a run as JSON lines."""
+    with opened(run, "events") as (root, _):
+        _print_events(root, follow=follow)
+
+
+def _print_events(run: Path, *, follow: bool) -> None:
     from panolog.orchestrator.run import lock
     from panolog.orchestrator.run.folder import RunFolder, read_head
     from panolog.orchestrator.run.store import as_event, read_records
@@ -230,64 +251,6 @@ def events(
         if not (follow and live):
             return
         time.sleep(_POLL)
-
-
-def stop(run: RunArg) -> None:
-    """Stop a run as Ctrl-C does; returns when its checkpoints are written."""
-    from panolog.orchestrator.run import lock
-    from panolog.orchestrator.run.folder import RunFolder
-
-    _request(run, "stop")
-    with progress_bar("waiting until the checkpoints are written"):
-        while lock.held(RunFolder(run).lock):
-            time.sleep(_POLL)
-    say(f"stopped; {command('resume', run)} resumes it")
-
-
-def pause(run: RunArg, block: BlockArg) -> None:
-    """Pause a block after its next checkpoint."""
-    _request(run, "pause", block)
-    say(f"requested; {command('unpause', run, block)} resumes the block")
-
-
-def unpause(run: RunArg, block: BlockArg) -> None:
-    """Resume a paused block."""
-    _request(run, "unpause", block)
-    say("requested; the block resumes when a worker is free")
-
-
-def retry(run: RunArg, block: BlockArg) -> None:
-    """Try a failed block again, with a full number of attempts."""
-    _request(run, "retry", block)
-    say("requested; the block starts when a worker is free")
-
-
-def release(
-    run: RunArg,
-    node: Annotated[
-        str, typer.Argument(metavar="NODE", help="Host of the machine, or the begin of its id; see status.")
-    ],
-) -> None:
-    """Use a machine in quarantine again."""
-    _request(run, "release", node=node)
-    say("requested; the machine gets the next task that waits")
-
-
-def _request(run: Path, action: str, block: int | None = None, node: str | None = None) -> None:
-    """Sends a request to the driver. Raises InputError if no driver runs or the state does not allow it."""
-    from panolog.orchestrator.run import control
-    from panolog.orchestrator.run.folder import RunFolder, read_head
-    from panolog.orchestrator.run.state import replay
-    from panolog.orchestrator.run.store import read_milestones
-    from panolog.scene.errors import InputError
-
-    folder, wanted = RunFolder(run), control.request(action, block, node)
-    read_head(folder)
-    if (why := control.allowed(folder)) is not None:
-        raise InputError(f"{run}: {why}")
-    if (why := control.refusal(replay(read_milestones(folder.database)), wanted)) is not None:
-        raise InputError(f"{run}: {wanted}: {why}")
-    control.send(folder, action, block, node)
 
 
 def _driver_options(address: str | None, nice: int | None, *, dashboard: bool) -> list[str]:
@@ -308,15 +271,16 @@ def _supervised(limit: int | None, *, supervise: bool) -> bool:
 
 def _supervise(
     root: Path, first: list[str], options: list[str], address: str | None, limit: int | None
-) -> NoReturn:
-    """Runs drivers as children of this process, and exits as the last one."""
+) -> int:
+    """Runs drivers as children of this process. Returns the exit code of the last one."""
     from panolog.orchestrator.commands.supervise import Supervised, supervise
 
     def show(line: str) -> None:
         err().show_cursor()  # a driver that was killed in its display has hidden it
         say(f"panolog: {line}", style="red")
 
-    raise typer.Exit(supervise(Supervised(root, first, options, address, limit or _RESUMES, show)))
+    options = [*options, "--has-mirror"]
+    return supervise(Supervised(root, first, options, address, limit or _RESUMES, show))
 
 
 @contextmanager
@@ -333,11 +297,11 @@ def _followed(root: Path, notify: list[str] | None, log: list[str] | None) -> It
 
 
 @contextmanager
-def _display(root: Path, *, dashboard: bool = False) -> Iterator[Any]:
+def _display(root: Path, name: str, *, dashboard: bool = False) -> Iterator[Any]:
     """Shows a run on stderr while the context lasts. Yields what to call with every change of its state.
 
-    If the run is interrupted, says how to resume it and exits with 130. Raises RunError for an error that
-    nothing foresees, once the run's history has it.
+    Args: name, of the run in commands. If the run is interrupted, says how to resume it and exits with 130.
+    Raises RunError for an error that nothing foresees, once the run's history has it.
     """
     from panolog.orchestrator.commands.companion import companion_dashboard
     from panolog.orchestrator.driver.ending import internal
@@ -351,7 +315,7 @@ def _display(root: Path, *, dashboard: bool = False) -> Iterator[Any]:
     except KeyboardInterrupt as error:
         if not RunFolder(root).info.exists():
             raise
-        say(f"panolog: stopped; {command('resume', root)} resumes the run", style="red")
+        say(f"panolog: stopped; {command('resume', name)} resumes the run", style="red")
         raise typer.Exit(130) from error
     except (PanologError, OSError):
         raise
@@ -360,8 +324,16 @@ def _display(root: Path, *, dashboard: bool = False) -> Iterator[Any]:
             raise
         raise RunError(
             f"{internal(error)}; its traceback is in the last line of {command('events', root)};"
-            f" {command('resume', root)} tries again"
+            f" {command('resume', name)} tries again"
         ) from error
+
+
+def _end(root: Path, code: int, state: Any) -> None:
+    """Ends `run` or `resume`. Args: code, of the last supervised driver; state, where there is no supervisor."""
+    if state is not None:
+        _say_results(root, state)
+    if code:
+        raise typer.Exit(code)
 
 
 def _say_results(root: Path, state: Any) -> None:

@@ -8,6 +8,7 @@ import typer
 
 from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
 from panolog.orchestrator.cli.options import (
+    AnySceneArg,
     DistanceOption,
     FramesOption,
     GpsOption,
@@ -38,7 +39,7 @@ BatchOption = Annotated[
 
 
 @app.command(cls=Command)
-def info(scene: SceneArg, as_json: JsonOption = False) -> None:
+def info(scene: AnySceneArg, as_json: JsonOption = False) -> None:
     """Show what a scene contains."""
     with progress_bar("reading the scene"):
         from panolog.orchestrator.commands.scene import describe, lines
@@ -49,7 +50,7 @@ def info(scene: SceneArg, as_json: JsonOption = False) -> None:
 
 
 @app.command(cls=Command)
-def check(scene: SceneArg, as_json: JsonOption = False) -> None:
+def check(scene: AnySceneArg, as_json: JsonOption = False) -> None:
     """Check that poses, points and panoramas fit together."""
     with progress_bar("checking the scene"):
         from panolog.prepare.check.scene_check import check_scene

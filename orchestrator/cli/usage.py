@@ -4,6 +4,14 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
+from panolog.scene.errors import StoreError
+from panolog.scene.stores.url import PROTOCOLS, is_url
+
+# What takes URLs of object stores.
+_RUNS = ("run", "resume", "status", "events", "report", "export", "scene info", "scene check")
+_JOBS = ("submit", "resume", "status", "stop")
+_STORES = (*(f"panolog {name}" for name in _RUNS), *(f"panolog cluster {name}" for name in _JOBS))
+
 
 class _PlainUsage:
     """Usage as in a manual: `RUN [FOLDER]` for arguments, and flags without the type of a value."""
@@ -24,6 +32,19 @@ class _PlainUsage:
 
 class Command(_PlainUsage, TyperCommand):
     """A command."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parses the words. Raises StoreError for the URL of a store where the command reads folders only."""
+        if ctx.command_path not in _STORES:
+            for word in args:
+                value = word.partition("=")[2] if word.startswith("--") and "=" in word else word
+                protocol = value.partition("://")[0].lower()
+                if is_url(value) and protocol in PROTOCOLS:
+                    raise StoreError(
+                        f"{protocol}://…: `{ctx.command_path}` takes files and folders of this machine only;"
+                        " docs/storage.md has the commands that take URLs"
+                    )
+        return super().parse_args(ctx, args)
 
 
 class Group(_PlainUsage, TyperGroup):

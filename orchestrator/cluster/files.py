@@ -31,6 +31,8 @@ from panolog.orchestrator.resources.delivery import payload
 from panolog.orchestrator.resources.usage import Usage, measure
 from panolog.scene.errors import RunError
 from panolog.scene.files import atomic, write_bytes
+from panolog.scene.stores.cache import Stored
+from panolog.scene.stores.outline import remember, stored_of
 from panolog.workers.events import Calibration, Event, Progress, Transfer
 from panolog.workers.specs import TaskSpec
 
@@ -106,6 +108,7 @@ class NodeFiles:
     home: str  # Ray's id of the driver's machine
     cache: str  # name of the folder that has this machine's copies
     stamps: dict[Path, Stamp]
+    stored: dict[Path, Stored]  # files of a scene in an object store, which every machine reads itself
 
     def __call__(self, path: Path) -> Path:
         """Where the file is on this machine; fetches it if it is not. Decoding threads may call it at once.
@@ -115,6 +118,9 @@ class NodeFiles:
             RunError: it has changed where the run is, or is gone.
             OSError: this machine cannot keep it.
         """
+        if path in self.stored:
+            remember(path, self.stored[path])
+            return path
         stamp = self.stamps[path]
         if stamp.fits(path):
             return path
@@ -184,9 +190,11 @@ class FileSharing:
                 .remote(self._process)
             )
         # A run's own files are replaced by others of the same size; a copy of a scene has times of its own.
-        stamps = {path: Stamp.of(path, dated=False) for path in scene}
+        found = {path: stored_of(path) for path in scene}
+        stored = {path: it for path, it in found.items() if it is not None}
+        stamps = {path: Stamp.of(path, dated=False) for path, it in found.items() if it is None}
         stamps |= {path: Stamp.of(path, dated=True) for path in run}
-        return NodeFiles(self._server, self._home, self._cache, stamps)
+        return NodeFiles(self._server, self._home, self._cache, stamps, stored)
 
     def check(self) -> None:
         """Ends the file server if it hangs: Ray starts it again, and repeats what was requested of it."""

@@ -22,6 +22,7 @@ from urllib.parse import urlsplit
 from panolog.orchestrator.run import log
 from panolog.orchestrator.run.folder import command_line
 from panolog.scene.errors import ClusterError, RunError
+from panolog.scene.stores.url import is_url, parse_url
 
 RUN_KEY = "panolog_run"  # in a job's metadata: the run folder that it writes
 _TIMEOUT_S = 10.0  # for a job server to identify itself
@@ -157,7 +158,12 @@ def _asks_for_token(address: str) -> bool:
 
 
 def on_head(path: str, what: str) -> str:
-    """A path of the head node, which may not depend on where a command is typed. Raises InputError."""
+    """A path of the head node, which may not depend on where a command is typed, or a URL of a store.
+
+    Raises InputError.
+    """
+    if is_url(path):
+        return str(parse_url(path))
     if not PurePosixPath(path).is_absolute():
         raise ClusterError(f"{what} {path}: is on the cluster's head node; write it from / on")
     return str(PurePosixPath(path))

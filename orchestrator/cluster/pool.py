@@ -35,6 +35,7 @@ from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Failure
 from panolog.renderer.process import prepare
 from panolog.scene.files import Locate, here
+from panolog.scene.stores.cache import variables
 from panolog.workers import stopping
 from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import TaskSpec
@@ -195,8 +196,11 @@ class RayPool:
 
 
 def _environment(placement: Placement) -> dict[str, Any] | None:
-    """The log level, and which GPU CUDA uses where the node has unequal ones: Ray would take any."""
-    names = log.environment()
+    """The log level, the cache of object stores, and the GPU for CUDA where a node has unequal ones.
+
+    Ray would take any.
+    """
+    names = log.environment() | variables(os.environ)
     if placement.uuid:
         names |= {"RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES": "1", "CUDA_VISIBLE_DEVICES": placement.uuid}
     return {"env_vars": names} if names else None

@@ -58,7 +58,7 @@ def evaluate_run(
         raise InputError(f"{ply}: does not exist{hint}")
     if model is None and (known := _known(folder, crop)) is not None and (folder.seams.exists() or not seams):
         return known | (_read_seams(folder) if seams else {})
-    job = Job(folder, scene_of(info), info.config.model_copy(update={"device": device})).learnt
+    job = Job(folder, scene_of(info, folder), info.config.model_copy(update={"device": device})).learnt
     specs = Specs(job, InProcess())
     if model is not None or crop != info.config.eval.crop_bottom:
         exact = folder.point_cloud.is_file() and ply_exact(folder.point_cloud)

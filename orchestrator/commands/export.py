@@ -121,7 +121,7 @@ def _model(source: Path, spec: ExportSpec) -> _Model:
 def _place_of(folder: RunFolder) -> Georeference:
     """By its scene, or where that is not here by the run's georef.json."""
     try:
-        return georeference_of(scene_of(read_info(folder)))
+        return georeference_of(scene_of(read_info(folder), folder))
     except InputError as error:
         if not folder.georeference.is_file():
             raise InputError(f"{error}; without it nothing says where the model is") from error

@@ -181,7 +181,7 @@ def _job(root: Path) -> Job:
     info = read_info(folder)
     if not folder.point_cloud.exists():
         raise InputError(f"{root}: has no merged model yet; render its coarse/model.ply, or resume the run")
-    return Job(folder, scene_of(info), info.config).learnt
+    return Job(folder, scene_of(info, folder), info.config).learnt
 
 
 def _poses(job: Job | None, file: Path | None, frames: int | None, offset: Vector) -> list[Pose]:

@@ -79,7 +79,7 @@ def repartition(
         raise InputError(f"{output}: is a run, which has its own plan; choose another folder")
     if not folder.model(COARSE).exists():
         raise InputError(f"{root}: Stage I has not ended, so there is nothing to partition yet")
-    scene = learnt_scene(folder, scene_of(info))
+    scene = learnt_scene(folder, scene_of(info, folder))
     here = Node("", "", cores(), memory())
     estimator = estimator_of(scene, config, basis_of(folder, scene, config), (here,))
     config = estimator.config  # its blocks chosen

@@ -53,13 +53,15 @@ from panolog.scene.errors import ClusterError, ConfigError, RunFolderError, RunL
 from panolog.scene.files import remove_partial
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
+from panolog.scene.stores.outline import url_of
+from panolog.scene.stores.url import is_url
 
 _LOG = logging.getLogger(__name__)
 
 
 @interruptible()
 def start(
-    source: Path,
+    source: Path | str,
     root: Path,
     config: RunConfig,
     address: str | None,
@@ -69,6 +71,8 @@ def start(
     options: Options | None = None,
 ) -> RunState:
     """Runs a scene, or the panoramas of a folder or of a video, into the new run folder `root`, to the end.
+
+    The scene may be given by its URL in an object store.
 
     Args: address of a Ray cluster, None for Ray on this machine; pool, where tasks run instead, without Ray;
     nice, as `cluster.connection.connect`; options, how a scene is made if `source` is none.
@@ -123,7 +127,7 @@ def resume(
         if journal.state.outcome == Outcome.DONE:
             return _retained(folder, journal, info.config)
         settings = read_settings(folder) if info.scene.fingerprint == run_info.PENDING else None
-        scene = None if settings else scene_of(info)
+        scene = None if settings else scene_of(info, folder)
         remove_partial(root)
         prepared = journal.state.prepared
         begin = _Beginning(folder, journal, address, pool, nice, scene)
@@ -182,9 +186,14 @@ class _New:
         return _reference(self.scene)
 
 
-def _found(source: Path, config: RunConfig, options: Options) -> _New:
+def _found(source: Path | str, config: RunConfig, options: Options) -> _New:
     """What is at `source`. Raises InputError if nothing of that can be run."""
-    settings = preparing.settings_of(source, options)
+    if isinstance(source, str) and is_url(source):
+        if options.given:
+            raise ConfigError("a URL is that of a scene; leave out the options for panoramas and videos")
+        scene = read_scene(source)
+        return _New(with_width(scene.width, config), scene, None)
+    settings = preparing.settings_of(Path(source), options)
     if settings is not None:
         return _New(with_width(settings.width, config), None, settings)
     scene = read_scene(source)
@@ -192,7 +201,8 @@ def _found(source: Path, config: RunConfig, options: Options) -> _New:
 
 
 def _reference(scene: Scene) -> SceneRef:
-    return SceneRef(path=str(scene.root), fingerprint=scene.fingerprint, offset=scene.offset)
+    path = url_of(scene.root) or str(scene.root)
+    return SceneRef(path=path, fingerprint=scene.fingerprint, offset=scene.offset)
 
 
 @dataclass

@@ -25,6 +25,7 @@ from panolog.orchestrator.views.site.build import (
 )
 from panolog.orchestrator.views.site.photographs import photograph
 from panolog.scene.errors import InputError
+from panolog.scene.stores.outline import local_folder
 from panolog.scene.write import StageProgress, no_progress
 
 _CACHED = 32  # photographs, of some hundred kilobytes each
@@ -104,7 +105,7 @@ def _current(source: Path, wanted: Wanted) -> Site | None:
     if wanted.camera is not None and wanted.camera not in names:
         return None  # a panorama that the plan does not have
     start = "" if wanted.camera is None else f"#camera={quote(wanted.camera, safe='')}"
-    scene = Path(read_head(folder)[0])
+    scene = local_folder(read_head(folder)[0])
     return Site(folder.web, scene if scene.is_dir() else None, start)
 
 

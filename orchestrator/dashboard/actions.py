@@ -14,6 +14,7 @@ from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.views.history import History
 from panolog.scene.errors import InputError
+from panolog.scene.stores.url import is_url
 
 RESUME = "resume"
 _LOG = "resume.log"
@@ -89,7 +90,7 @@ def _resume(entry: RunEntry) -> ResumedDriver:
     """Starts `panolog resume` as a process of its own. Raises InputError if the scene is gone."""
     info, root = read_info(entry.folder), entry.folder.root
     # whatever the string is; the run may also have still to make it
-    if not os.path.isdir(info.scene.path) and not _makes_its_scene(entry):  # noqa: PTH112
+    if not (is_url(info.scene.path) or os.path.isdir(info.scene.path)) and not _makes_its_scene(entry):  # noqa: PTH112
         raise InputError(f"resume: the scene {info.scene.path} does not exist")
     flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
     log = os.open(root / _LOG, flags, 0o644)

@@ -72,6 +72,11 @@ class RunFolder:
         return self.root / "retention.json"
 
     @property
+    def mirror(self) -> Path:
+        """How far the run has been copied to its object store; absent if it has none."""
+        return self.root / "store" / "state.json"
+
+    @property
     def report(self) -> Path:
         """The finished run as one page."""
         return self.root / "report.html"

@@ -22,7 +22,7 @@ from panolog.scene.model import NO_OFFSET, Vector
 
 _PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
 PENDING = ""  # fingerprint of a scene that the run has still to make
-_FORERUNNERS = ("lock", "prepare")  # what a driver makes before run.json
+_FORERUNNERS = ("lock", "prepare", "store")  # what a driver or its mirror makes before run.json
 
 
 class SceneRef(BaseModel):
@@ -101,7 +101,7 @@ def clear(folder: RunFolder, *, keep_info: bool = False) -> None:
         path.unlink(missing_ok=True)
     for path in () if keep_info else (folder.info,):
         path.unlink(missing_ok=True)
-    for path in (folder.control, folder.sparse, folder.follower):
+    for path in (folder.control, folder.sparse, folder.follower, folder.mirror.parent):
         shutil.rmtree(path, ignore_errors=True)
 
 

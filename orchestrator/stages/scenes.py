@@ -17,16 +17,23 @@ from panolog.orchestrator.stages.poses import save_poses
 from panolog.scene.errors import SceneError
 from panolog.scene.model import Panorama, Scene
 from panolog.scene.read import read_scene
+from panolog.scene.stores.url import is_url
 from panolog.workers.capture.captured import Captured
 from panolog.workers.tasks import COARSE
 
 
-def scene_of(info: RunInfo) -> Scene:
-    """The scene of a run. Raises InputError if it is gone or no longer what the run began with."""
-    scene = read_scene(Path(info.scene.path))
+def scene_of(info: RunInfo, folder: RunFolder) -> Scene:
+    """The scene of a run. Raises InputError if it is gone or no longer what the run began with.
+
+    One that the run has made is looked for in its folder, which may have been brought to another place.
+    """
+    path = info.scene.path
+    if not (is_url(path) or Path(path).exists()) and folder.scene.is_dir():
+        path = str(folder.scene)
+    scene = read_scene(path)
     if scene.fingerprint != info.scene.fingerprint:
         raise SceneError(
-            f"{scene.root}: the scene has changed since the run began{_newest(scene, info)}; put back what it"
+            f"{path}: the scene has changed since the run began{_newest(scene, info)}; put back what it"
             " was and resume, or start a new run"
         )
     return scene

@@ -164,7 +164,7 @@ class Summary(SummaryHead):
 
 
 def summarize(
-    state: RunState, *, running: bool, now: float | None = None, root: Path | None = None
+    state: RunState, *, running: bool, now: float | None = None, root: Path | str | None = None
 ) -> Summary:
     """The summary of a state.
 

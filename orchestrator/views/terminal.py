@@ -71,17 +71,18 @@ _REQUESTS: dict[type[Record], str] = {
 
 
 def table(
-    state: RunState, *, root: Path, info: Mapping[str, Any], running: bool, wide: bool
+    state: RunState, *, root: Path, info: Mapping[str, Any], running: bool, wide: bool, name: str = ""
 ) -> RenderableType:
     """The whole run for a terminal; `wide` also shows memory and PSNR.
 
-    Args: root, the run folder in commands; info, run.json; running, whether a driver works on it.
+    Args: root, the run folder; info, run.json; running, whether a driver works on it; name, of the run in
+    commands, if that is not its folder.
     """
     now = time.time()
     summary = summarize(state, running=running, now=now, root=root)
     preparation = view_preparation(RunFolder(root), state, running=running)
     prepared = None if preparation is None else prepared_share(preparation)
-    head = headline(state, summary, progress_of(state, info, prepared), root)
+    head = headline(state, summary, progress_of(state, info, prepared), name or root)
     rows = _rows(wide=wide)
     if not running:
         state = at_rest(state)
@@ -102,7 +103,7 @@ def table(
     shown = [rows] if stages else []
     waits = [Text(summary.waiting, style="yellow")] if summary.waiting else []
     waits += _leaving(summary, now)
-    waits += _quarantined(summary, now, root)
+    waits += _quarantined(summary, now, name or root)
     return Group(head, *waits, *_gaussians(summary), *shown, *_failures(state))
 
 
@@ -145,7 +146,7 @@ def _leaving(summary: Summary, now: float) -> Iterator[Text]:
         yield Text(f"{node.host} ({node.node[:8]}): leaves{when}: {node.reason}", style="yellow")
 
 
-def _quarantined(summary: Summary, now: float, root: Path) -> Iterator[Text]:
+def _quarantined(summary: Summary, now: float, root: Path | str) -> Iterator[Text]:
     """The machines in quarantine, and how to release the first. Args: now, epoch seconds; root, as `page`."""
     for node in summary.quarantined[:_MOST]:
         name = f"{node.host} ({node.node[:8]})"
@@ -161,18 +162,18 @@ def _to_copy(line: str) -> Text:
 
 
 def page(
-    state: RunState, *, root: Path, info: Mapping[str, Any], running: bool, wide: bool
+    state: RunState, *, root: Path, info: Mapping[str, Any], running: bool, wide: bool, name: str = ""
 ) -> RenderableType:
     """`table`, and of a run that does not proceed why, and what resumes it."""
     lines = []
     if reason := reason_of(state, running=running):
         lines.append(Text(reason, style="red"))
     if not running and state.outcome != "done":
-        lines.append(_to_copy(f"`{command_line('resume', root)}` resumes it"))
-    return Group(table(state, root=root, info=info, running=running, wide=wide), *lines)
+        lines.append(_to_copy(f"`{command_line('resume', name or root)}` resumes it"))
+    return Group(table(state, root=root, info=info, running=running, wide=wide, name=name), *lines)
 
 
-def headline(state: RunState, summary: Summary, progress: float, root: Path) -> Text:
+def headline(state: RunState, summary: Summary, progress: float, root: Path | str) -> Text:
     """The state of the run in one line. Args: progress, 0 to 1; root, the run folder in commands."""
     stage = "" if summary.label == "preparing" else STAGES.get(summary.stage)
     text = Text(summary.label + (f" · {stage}" if stage else ""), style="bold")

@@ -35,6 +35,7 @@ from panolog.orchestrator.views.site.viewpoints import Viewpoint, Viewpoints, re
 from panolog.scene.errors import InputError
 from panolog.scene.files import Locate, here, write_bytes
 from panolog.scene.gaussians import Gaussians
+from panolog.scene.stores.outline import local_folder
 from panolog.scene.write import StageProgress, no_progress
 from panolog.workers.tasks import TaskId
 
@@ -80,7 +81,7 @@ def site_of_run(folder: RunFolder, wanted: Wanted, locate: Locate = here) -> Sho
     page = _page(f"{wanted.task or 'model'} of {folder.root.absolute().name}", model, place, wanted)
     scene = None
     if viewpoints is not None:
-        cameras, scene = _cameras(viewpoints, place.frame, Path(read_head(folder)[0]))
+        cameras, scene = _cameras(viewpoints, place.frame, local_folder(read_head(folder)[0]))
         start = _pose(viewpoints.start, place.frame)
         page = replace(page, cameras=cameras, start=start, step=_spacing(cameras) or page.step)
     return Shown(*_reduced(page, model, place, wanted), scene)

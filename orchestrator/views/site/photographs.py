@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from panolog.scene.colmap_files import read_image_records
 from panolog.scene.errors import InputError
 from panolog.scene.read import check_names, image_folder, model_folder
+from panolog.scene.stores.outline import whole
 
 WIDE = 2048  # pixels of a copy in 3D
 _BYTES = 300_000_000  # of a panorama's file at most
@@ -29,7 +30,9 @@ def small_copy(file: BinaryIO, name: str, width: int) -> bytes:
 
     Raises InputError if the file is too large or no image.
     """
-    if os.fstat(file.fileno()).st_size > _BYTES:
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    if size > _BYTES:
         raise InputError(f"{name} has more than {_BYTES:,} bytes")
     try:
         with Image.open(file, formats=_FORMATS) as picture:  # reads the header alone
@@ -53,7 +56,8 @@ def photograph(scene: Path, name: str, width: int = WIDE) -> bytes:
     path = (image_folder(scene) / name).resolve()
     if not (path.is_file() and path.is_relative_to(scene.resolve())):
         raise InputError(f"{name} is missing in {image_folder(scene)}, or a link that leads out of the scene")
-    with path.open("rb") as file:
+    data = whole(path)  # of a scene in an object store
+    with path.open("rb") if data is None else BytesIO(data) as file:
         return small_copy(file, name, width)
 
 

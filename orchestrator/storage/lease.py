@@ -1,0 +1,124 @@
+"""Who writes a run in a store: one driver at a time, by a lease with an owner and a time.
+
+Leases are numbered; a new one is an object that must not exist yet, so of two that want the same number one
+gets it. That of the highest number counts. A lease is written again while its owner works, and expires when
+it has not been for `EXPIRES_S`, by the clocks of the machines: these must agree to some seconds.
+"""
+
+import json
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from panolog.orchestrator.storage.layout import LEASES, newest, number_of, numbered
+from panolog.scene.errors import RunLockedError, StoreError, StoreLostError
+from panolog.scene.stores.store import Store
+
+EXPIRES_S = 90.0
+_REFRESH_S = 20.0
+_POLL_S = 1.0  # between two looks at the lease of a mirror on this machine that is about to end
+
+
+class Lease:
+    """A lease that this process holds; a thread refreshes it. Made by `take`."""
+
+    def __init__(self, store: Store, number: int, owner: str) -> None:
+        self.number = number
+        self._store, self._owner = store, owner
+        self._lost, self._ended = "", threading.Event()
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._keep, name="lease", daemon=True)
+        self._thread.start()
+
+    @property
+    def lost(self) -> str:
+        """Who has taken the run over; "" while it is this process's."""
+        return self._lost
+
+    def require(self) -> None:
+        """Raises RunLockedError if another driver has taken the run over; as `Store` if that is unknown."""
+        with self._lock:
+            if not self._lost:
+                found = newest(self._store, LEASES)
+                if found is not None and number_of(found) > self.number:
+                    self._lost = _described(_read(self._store, found))
+                elif not self._ended.is_set():
+                    self._store.write(numbered(LEASES, self.number), _content(self._owner))
+        if self._lost:
+            raise RunLockedError(f"{self._store.url}: {self._lost} has taken the run over; this driver ends")
+
+    def release(self) -> None:
+        """Ends the lease; another driver may have the run at once. Raises as `Store`."""
+        self._ended.set()
+        self._thread.join()
+        if not self._lost:
+            self._store.write(numbered(LEASES, self.number), _content(self._owner, released=True))
+
+    def _keep(self) -> None:
+        while not self._ended.wait(_REFRESH_S) and not self._lost:
+            with suppress(RunLockedError, StoreError, StoreLostError):  # the mirror says what is wrong
+                self.require()
+
+
+def take(store: Store, *, force: bool, waits: Callable[[], bool]) -> Lease:
+    """Takes the lease of a run.
+
+    Args: force, also from a driver that may still be at work; waits, whether to wait for a lease of this
+    machine, because no driver is at work here and only its mirror is left.
+    Raises RunLockedError if another driver has it; StoreError, StoreLostError as `Store`.
+    """
+    owner = secrets.token_hex(8)
+    while True:
+        found = newest(store, LEASES)
+        held = _read(store, found) if found else {}
+        if _live(held) and not force:
+            if held.get("host") == socket.gethostname() and waits():
+                time.sleep(_POLL_S)
+                continue
+            left = float(held["time"]) + EXPIRES_S - time.time()
+            raise RunLockedError(
+                f"{store.url}: {_described(held)} is at work on it; stop that one first. If it is gone,"
+                f" this works in {left:.0f} s, or at once with `panolog resume --force`"
+            )
+        number = (number_of(found) if found else 0) + 1
+        name = numbered(LEASES, number)
+        # A request that was repeated may have been served the first time.
+        if store.write(name, _content(owner), new=True) or _read(store, name).get("owner") == owner:
+            if found:
+                store.remove(found)
+            return Lease(store, number, owner)
+
+
+def holder(store: Store) -> str:
+    """Who writes the run now; "" if no driver does. Raises as `Store`."""
+    found = newest(store, LEASES)
+    held = _read(store, found) if found else {}
+    return _described(held) if _live(held) else ""
+
+
+def _content(owner: str, *, released: bool = False) -> bytes:
+    held = {"owner": owner, "host": socket.gethostname(), "pid": os.getpid(), "time": time.time()}
+    return json.dumps(held | {"released": released}).encode()
+
+
+def _read(store: Store, name: str) -> dict[str, Any]:
+    """A lease; nothing if it is gone or damaged."""
+    content = store.read(name)
+    with suppress(ValueError, TypeError):
+        found = json.loads(content or b"{}")
+        if isinstance(found, dict) and isinstance(found.get("time"), int | float):
+            return found
+    return {}
+
+
+def _live(held: dict[str, Any]) -> bool:
+    return bool(held) and not held.get("released") and time.time() < float(held["time"]) + EXPIRES_S
+
+
+def _described(held: dict[str, Any]) -> str:
+    return f"a driver on {held.get('host', 'another machine')}"

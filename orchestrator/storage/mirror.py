@@ -1,0 +1,285 @@
+"""The mirror of a run: copies what the driver makes into a store, so that the store is whole at any moment.
+
+A round first stores the files that have changed, then takes a snapshot of run.db, stores the files that have
+changed meanwhile, and the snapshot; then the manifest, and at last the pointer. The driver writes a file
+before the record that names it, so whatever the snapshot names is in the store before the snapshot counts.
+What the round has replaced is removed one round later.
+"""
+
+import os
+import secrets
+import shutil
+import sqlite3
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing, suppress
+from dataclasses import replace
+from pathlib import Path
+
+from panolog.orchestrator.run import lock
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.reading import reading
+from panolog.orchestrator.run.records import Outcome
+from panolog.orchestrator.run.state import replay
+from panolog.orchestrator.run.store import read_milestones
+from panolog.orchestrator.storage.layout import (
+    DATABASE,
+    INFO,
+    MANIFESTS,
+    OBJECTS,
+    POINTERS,
+    Entry,
+    Manifest,
+    digest_of,
+    is_result,
+    mirrored,
+    number_of,
+    put_pointer,
+)
+from panolog.orchestrator.storage.lease import Lease
+from panolog.orchestrator.storage.state import MirrorState, write_state
+from panolog.scene.errors import RunFolderError, RunLockedError, StoreError, StoreLostError
+from panolog.scene.stores.store import Store
+
+_THREADS = 4  # files stored at a time
+_SHARE = 10  # a pause is at least so many times as long as writing run.db and the manifest took
+_LONGEST_S = 120.0  # between two tries while a store fails
+_PASSING = (StoreError, StoreLostError, RunFolderError, sqlite3.Error, OSError)
+Stamp = tuple[int, int, int]  # size, time of change in ns, inode
+
+
+class Mirror:
+    """The mirror of one run, at work. Args: known, what the store has already; lease, which it holds."""
+
+    def __init__(self, folder: RunFolder, store: Store, lease: Lease, known: Manifest | None) -> None:
+        self._folder, self._store, self._lease = folder, store, lease
+        self._files: dict[str, Entry] = dict(known.files) if known else {}  # that the pointer names
+        self._stored: dict[str, tuple[Stamp, Entry]] = {}  # what is in the store of the files as they are now
+        self._replaced: list[str] = []  # keys that only the manifest before the current one names
+        self._state = MirrorState(str(store.url), published=known.name if known else "")
+        self._lock = threading.Lock()  # of `_state`
+        self._cost = 0.0  # seconds that the last snapshot and manifest took
+        self._swept = False
+
+    @property
+    def state(self) -> MirrorState:
+        """How far it is."""
+        return self._state
+
+    def follow(self, ended: threading.Event, stop: threading.Event, period: float, patience: float) -> None:
+        """Works until the driver has ended and all is out, or nothing has got out for so long after that.
+
+        Args: ended, set when the run's command has ended; stop, set to end at once; period and patience in
+        seconds.
+        """
+        pause, moved = period, time.monotonic()
+        while True:
+            # Before the round: what an ended driver has written is then copied by it.
+            over = ended.is_set() and not lock.held(self._folder.lock)
+            before = self._state.pending_files, self._state.published, len(self._stored)
+            if self._try(last=over):
+                pause = max(period, _SHARE * self._cost)
+                if over:
+                    return
+            elif self._lease.lost or stop.is_set():
+                return
+            else:
+                pause = min(2 * pause, _LONGEST_S)
+            if before != (self._state.pending_files, self._state.published, len(self._stored)) or not over:
+                moved = time.monotonic()
+            if over and time.monotonic() - moved > patience:
+                return
+            (stop if ended.is_set() else ended).wait(min(pause, period) if over else pause)
+
+    def _try(self, *, last: bool) -> bool:
+        """One round. Returns whether all is out that there was at its begin."""
+        try:
+            if not self._folder.info.exists() or not self._folder.database.exists():
+                if last:
+                    self._withdraw()
+                return True
+            self._round(last=last)
+        except RunLockedError as error:
+            self._say(problem=str(error))
+            return False
+        except _PASSING as error:
+            self._say(problem=_line(error))
+            return False
+        return True
+
+    def _round(self, *, last: bool) -> None:
+        self._lease.require()
+        first = self._send(self._present())
+        began, moment = time.monotonic(), time.time()
+        snapshot = self._snapshot()
+        try:
+            taken = time.monotonic()
+            files = first | self._send(self._present())
+            began += time.monotonic() - taken
+            entry = self._put(snapshot, DATABASE)
+        finally:
+            snapshot.unlink(missing_ok=True)
+        if last and self._done():
+            files = self._publish_results(files)
+        self._publish(files | {DATABASE: entry}, moment)
+        self._cost = time.monotonic() - began
+        self._say(problem="", pending_files=0, pending_bytes=0, since=moment, complete=last)
+
+    def _present(self) -> dict[str, Stamp]:
+        """The files of the run that are copied out, as they are now; run.json last."""
+        root, found = str(self._folder.root), dict[str, Stamp]()
+        for place, folders, names in os.walk(root):
+            inner = os.path.relpath(place, root)
+            folders[:] = [it for it in folders if mirrored(_joined(inner, it) + "/_")]
+            for name in names:
+                relative = _joined(inner, name)
+                with suppress(FileNotFoundError):  # it was replaced
+                    if mirrored(relative) and (path := Path(place, name)).is_file():
+                        status = path.stat()
+                        found[relative] = (status.st_size, status.st_mtime_ns, status.st_ino)
+        if info := found.pop(INFO, None):
+            found[INFO] = info
+        return found
+
+    def _send(self, present: dict[str, Stamp]) -> dict[str, Entry]:
+        """Stores those of the files that have changed. Returns what is in the store of all of them.
+
+        Raises the first error after what could be stored is.
+        """
+        changed = {it: stamp for it, stamp in present.items() if self._stored.get(it, (None,))[0] != stamp}
+        left, total = len(changed), sum(size for size, *_ in changed.values())
+        failed: Exception | None = None
+        with ThreadPoolExecutor(_THREADS, "mirror") as threads:
+            works = {threads.submit(self._send_one, it, stamp): stamp for it, stamp in changed.items()}
+            for work in as_completed(works):
+                try:
+                    work.result()
+                    left, total = left - 1, total - works[work][0]
+                except _PASSING as error:
+                    failed = failed or error
+                self._say(pending_files=left, pending_bytes=total)
+        if failed is not None:
+            raise failed
+        for gone in self._stored.keys() - present.keys():
+            self._forget(gone)
+        return {name: self._stored[name][1] for name in present if name in self._stored}
+
+    def _send_one(self, name: str, stamp: Stamp) -> None:
+        """Stores one file, unless the store has the same bytes."""
+        held = self._folder.mirror.with_name(f"{secrets.token_hex(4)}.part")
+        try:
+            if not self._hold(self._folder.root / name, held):
+                return  # it is gone: the next look does not find it either
+            known = self._stored[name][1] if name in self._stored else self._files.get(name)
+            if known is None or (known.size, known.sha256) != (held.stat().st_size, digest_of(held)):
+                entry = self._put(held, name)
+                self._forget(name)
+            else:
+                entry = known
+            self._stored[name] = (stamp, entry)
+        finally:
+            held.unlink(missing_ok=True)
+
+    @staticmethod
+    def _hold(path: Path, held: Path) -> bool:
+        """A name for the bytes that a file has now: what replaces it is another file. False if it is gone."""
+        held.parent.mkdir(exist_ok=True)
+        try:
+            if path.is_symlink():
+                shutil.copy2(path, held)
+            else:
+                os.link(path, held)
+        except FileNotFoundError:
+            return False
+        except OSError:  # a file system without hard links
+            shutil.copy2(path, held)
+        return True
+
+    def _put(self, path: Path, name: str) -> Entry:
+        """Stores a file that does not change, as a new object."""
+        status = path.stat()
+        key = f"{OBJECTS}/{name}/{time.time_ns():x}-{secrets.token_hex(4)}"
+        entry = Entry(key, status.st_size, digest_of(path), status.st_mtime_ns)
+        self._store.put(path, key)
+        return entry
+
+    def _forget(self, name: str) -> None:
+        """Removes an object that no manifest has named yet."""
+        _, entry = self._stored.pop(name, (None, None))
+        if entry is not None and entry not in self._files.values():
+            self._store.remove(entry.key)
+
+    def _snapshot(self) -> Path:
+        """A copy of run.db as it is after some commit."""
+        copy = self._folder.mirror.with_name(f"{secrets.token_hex(4)}.db.part")
+        copy.parent.mkdir(exist_ok=True)
+        with reading(self._folder.database) as source, closing(sqlite3.connect(copy)) as target:
+            source.backup(target)
+        return copy
+
+    def _publish(self, files: dict[str, Entry], moment: float) -> None:
+        """Makes these files the run, for all who read the store."""
+        self._lease.require()
+        manifest = Manifest(f"{MANIFESTS}/{time.time_ns():x}-{secrets.token_hex(4)}", files)
+        packed = manifest.pack()
+        self._store.write(manifest.name, packed)
+        put_pointer(self._store, self._lease.number, manifest, packed)
+        for key in self._replaced:
+            self._store.remove(key)
+        kept = {entry.key for entry in files.values()}
+        self._replaced = [it.key for it in self._files.values() if it.key not in kept]
+        self._replaced += [self._state.published] if self._state.published else []
+        self._files = files
+        self._say(published=manifest.name, since=moment)
+        if not self._swept:
+            self._sweep(manifest)
+
+    def _sweep(self, manifest: Manifest) -> None:
+        """Removes what earlier drivers have left: pointers, and objects that were never named."""
+        kept = {manifest.name, *(entry.key for entry in manifest.files.values()), *self._replaced}
+        for folder in (OBJECTS, MANIFESTS):
+            for name in self._store.list(folder).keys() - kept:
+                self._store.remove(name)
+        for name in self._store.list(POINTERS):
+            if number_of(name) < self._lease.number:
+                self._store.remove(name)
+        self._swept = True
+
+    def _publish_results(self, files: dict[str, Entry]) -> dict[str, Entry]:
+        """Gives the results of a run that is done their own names in the store."""
+        named = dict(files)
+        for name, entry in files.items():
+            if is_result(name) and entry.key != name:
+                self._store.copy(entry.key, name)
+                named[name] = replace(entry, key=name)
+        for name, entry in named.items():
+            self._stored[name] = (self._stored[name][0], entry)
+        # What has been copied only from objects that no manifest names yet goes with the next round.
+        unnamed = {it.key for it in files.values()} - {it.key for it in self._files.values()}
+        self._replaced += sorted(unnamed - {it.key for it in named.values()})
+        return named
+
+    def _done(self) -> bool:
+        return replay(read_milestones(self._folder.database)).outcome == Outcome.DONE
+
+    def _withdraw(self) -> None:
+        """Removes a run that has been refused, from the store as from the disk."""
+        if self._state.published:
+            for name in [it for folder in (POINTERS, MANIFESTS, OBJECTS) for it in self._store.list(folder)]:
+                self._store.remove(name)
+        self._say(complete=True)
+
+    def _say(self, **changes: object) -> None:
+        with self._lock:
+            self._state = replace(self._state, **changes)  # type: ignore[arg-type]
+            if self._folder.info.exists():
+                write_state(self._folder.mirror, self._state)
+
+
+def _joined(folder: str, name: str) -> str:
+    return name if folder == "." else f"{folder}/{name}"
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

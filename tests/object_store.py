@@ -1,0 +1,189 @@
+"""An object store for tests: moto's server, which speaks S3's protocol, behind a proxy that injects faults."""
+
+import http.client
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, Literal
+
+BUCKET = "places"
+KEY, SECRET = "AKIAT0PSECRETKEY0000", "T0PSECRETaws/accesskey"
+Fault = Literal["throttled", "error", "reset", "lost answer", "truncated", "slow"]
+_CODES: dict[str, tuple[int, bytes]] = {
+    "throttled": (503, b"<Error><Code>SlowDown</Code><Message>Reduce your request rate.</Message></Error>"),
+    "error": (500, b"<Error><Code>InternalError</Code><Message>We had an error.</Message></Error>"),
+}
+_SLOW_S = 0.3
+
+
+@dataclass
+class ObjectStore:
+    """A server. `faults` are used up in order, each by the next request; `down` makes all fail."""
+
+    port: int
+    server: int  # the port of moto's server
+    faults: list[Fault] = field(default_factory=list)
+    injected: Counter[str] = field(default_factory=Counter)
+    requests: Counter[str] = field(default_factory=Counter)  # by method
+    keys: list[tuple[str, str]] = field(default_factory=list)  # (method, path) in order
+    down: bool = False
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Variables of the provider's own chain that lead here, with a secret that may appear nowhere."""
+        return {
+            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{self.port}",
+            "AWS_ACCESS_KEY_ID": KEY,
+            "AWS_SECRET_ACCESS_KEY": SECRET,
+            "AWS_DEFAULT_REGION": "us-east-1",
+            "AWS_EC2_METADATA_DISABLED": "true",
+        }
+
+    def url(self, name: str) -> str:
+        """The URL of a place in its bucket."""
+        return f"s3://{BUCKET}/{name}"
+
+    def next_fault(self) -> Fault | None:
+        with self.lock:
+            fault = "error" if self.down else self.faults.pop(0) if self.faults else None
+            if fault:
+                self.injected[fault] += 1
+            return fault
+
+
+@contextmanager
+def object_store() -> Iterator[ObjectStore]:
+    """A store with an empty bucket while the context lasts; faults concern only requests through the proxy."""
+    with _moto() as server:
+        store = ObjectStore(0, server)
+        _call(server, "PUT", f"/{BUCKET}", b"", {})
+        proxy = ThreadingHTTPServer(("127.0.0.1", 0), _handler(store))
+        proxy.daemon_threads = True
+        store.port = proxy.server_port
+        thread = threading.Thread(target=proxy.serve_forever, args=(0.05,))
+        thread.start()
+        try:
+            yield store
+        finally:
+            proxy.shutdown()
+            thread.join()
+            proxy.server_close()
+
+
+@contextmanager
+def _moto() -> Iterator[int]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port: int = free.getsockname()[1]
+    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | {"AWS_ACCESS_KEY_ID": "x"},
+    )
+    try:
+        end = time.monotonic() + 60
+        while time.monotonic() < end and process.poll() is None:
+            with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+                break
+            time.sleep(0.05)
+        yield port
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _call(
+    port: int, method: str, path: str, body: bytes, headers: dict[str, str]
+) -> tuple[int, list[tuple[str, str]], bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
+    for name, value in ({"Host": f"127.0.0.1:{port}"} | headers | {"Content-Length": str(len(body))}).items():
+        connection.putheader(name, value)
+    connection.endheaders(body)
+    answer = connection.getresponse()
+    data = answer.read()
+    connection.close()
+    return answer.status, answer.getheaders(), data
+
+
+def _handler(store: ObjectStore) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def handle_any(self) -> None:
+            body = self._body()
+            fault = store.next_fault()
+            with store.lock:
+                store.requests[self.command] += 1
+                store.keys.append((self.command, self.path))
+            if fault in _CODES:
+                code, content = _CODES[str(fault)]
+                self._answer(code, [("Content-Type", "application/xml")], content)
+                return
+            if fault == "reset":
+                self._reset()
+                return
+            headers = {name: self.headers[name] for name in self.headers if name.lower() not in _HOP}
+            status, given, data = _call(store.server, self.command, self.path, body, headers)
+            if fault == "lost answer":
+                self._reset()
+                return
+            if fault == "slow":
+                time.sleep(_SLOW_S)
+            if fault == "truncated" and len(data) > 1:
+                self._answer(status, given, data[: len(data) // 2], size=len(data))
+                self._reset()
+                return
+            self._answer(status, given, data)
+
+        do_GET = do_PUT = do_POST = do_DELETE = do_HEAD = handle_any
+
+        def _body(self) -> bytes:
+            if "chunked" in self.headers.get("Transfer-Encoding", ""):
+                pieces = []
+                while size := int(self.rfile.readline().split(b";")[0], 16):
+                    pieces.append(self.rfile.read(size))
+                    self.rfile.readline()
+                while self.rfile.readline().strip():
+                    pass
+                return b"".join(pieces)
+            return self.rfile.read(int(self.headers.get("Content-Length", 0)))
+
+        def _answer(
+            self, status: int, headers: list[tuple[str, str]], data: bytes, size: int | None = None
+        ) -> None:
+            self.send_response(status)
+            given = dict(headers)
+            length = given.get("Content-Length") if self.command == "HEAD" else None
+            for name, value in headers:
+                if name.lower() not in _HOP:
+                    self.send_header(name, value)
+            self.send_header("Content-Length", length or str(len(data) if size is None else size))
+            self.end_headers()
+            if self.command != "HEAD":
+                self.wfile.write(data)
+
+        def _reset(self) -> None:
+            self.close_connection = True
+            with suppress(OSError):
+                self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+                self.connection.close()
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    return Handler
+
+
+_HOP = ("host", "content-length", "connection", "transfer-encoding", "server", "date", "expect")
