@@ -1,4 +1,4 @@
-"""An object store for tests: moto's server, which speaks S3's protocol, behind a proxy that injects faults."""
+"""An object store for tests: moto's server, which speaks S3's protocol, behind a proxy with faults."""
 
 import http.client
 import os
@@ -13,6 +13,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Literal
+
+from s3fs import S3FileSystem
 
 BUCKET = "places"
 KEY, SECRET = "AKIAT0PSECRETKEY0000", "T0PSECRETaws/accesskey"
@@ -62,7 +64,8 @@ class ObjectStore:
 
 @contextmanager
 def object_store() -> Iterator[ObjectStore]:
-    """A store with an empty bucket while the context lasts; faults concern only requests through the proxy."""
+    """A store with an empty bucket while the context lasts."""
+    S3FileSystem.clear_instance_cache()  # a server of before had another address
     with _moto() as server:
         store = ObjectStore(0, server)
         _call(server, "PUT", f"/{BUCKET}", b"", {})
@@ -135,7 +138,10 @@ def _handler(store: ObjectStore) -> type[BaseHTTPRequestHandler]:
                 self._reset()
                 return
             headers = {name: self.headers[name] for name in self.headers if name.lower() not in _HOP}
-            status, given, data = _call(store.server, self.command, self.path, body, headers)
+            try:
+                status, given, data = _call(store.server, self.command, self.path, body, headers)
+            except OSError:  # the test has ended
+                return
             if fault == "lost answer":
                 self._reset()
                 return
@@ -147,7 +153,7 @@ def _handler(store: ObjectStore) -> type[BaseHTTPRequestHandler]:
                 return
             self._answer(status, given, data)
 
-        do_GET = do_PUT = do_POST = do_DELETE = do_HEAD = handle_any
+        do_GET = do_PUT = do_POST = do_DELETE = do_HEAD = handle_any  # noqa: N815
 
         def _body(self) -> bytes:
             if "chunked" in self.headers.get("Transfer-Encoding", ""):

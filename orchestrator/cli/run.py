@@ -329,7 +329,7 @@ def _display(root: Path, name: str, *, dashboard: bool = False) -> Iterator[Any]
 
 
 def _end(root: Path, code: int, state: Any) -> None:
-    """Ends `run` or `resume`. Args: code, of the last supervised driver; state, where there is no supervisor."""
+    """Ends `run` or `resume`. Args: code, of the last supervised driver; state, if there is no supervisor."""
     if state is not None:
         _say_results(root, state)
     if code:

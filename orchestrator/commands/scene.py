@@ -14,6 +14,7 @@ from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.panorama_files import list_panoramas, list_posed_panoramas
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
+from panolog.scene.stores.outline import url_of
 from panolog.scene.write import StageProgress
 
 
@@ -23,7 +24,7 @@ def describe(scene: Scene) -> dict[str, Any]:
     box = aabb(centers, PartitionConfig().rho_tri)
     panoramas = scene.panoramas
     return {
-        "path": str(scene.root),
+        "path": url_of(scene.root) or str(scene.root),
         "fingerprint": scene.fingerprint,
         "panoramas": len(panoramas),
         "width": scene.width,

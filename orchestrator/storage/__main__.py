@@ -10,7 +10,6 @@ import sys
 import threading
 from contextlib import suppress
 
-from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.units import gib
 from panolog.orchestrator.storage.fetch import bring
@@ -52,7 +51,7 @@ def main() -> None:
 def _begun(plan: Plan) -> tuple[Store, Lease, Manifest | None]:
     """Takes the lease, and brings the run if it is to be resumed. Raises PanologError."""
     folder, store = RunFolder(plan.root), open_store(plan.url, _PATIENCE_S)
-    lease = take(store, force=plan.force, waits=lambda: not lock.held(folder.lock))
+    lease = take(store, plan.root, force=plan.force)
     try:
         manifest = current(store)
         if plan.resumes:

@@ -30,7 +30,7 @@ def mirrored(plan: Plan | None, say: Say) -> Iterator[None]:
     if plan is None:
         yield
         return
-    say(f"{plan.url} is copied from {plan.root} while it runs")
+    say(f"the run is in {plan.root} on this machine, and is copied to {plan.url} as it proceeds")
     mirror = _Keeper(plan, say)
     try:
         yield

@@ -99,9 +99,10 @@ def for_status(name: str) -> bool:
 
 
 def for_report(name: str) -> bool:
-    """Which files the report needs: neither models nor checkpoints, nor what is in folders of pictures."""
+    """Which files the report needs: of the models that of Stage I alone, and no checkpoints."""
     path = PurePosixPath(name)
-    return path.suffix not in (".safetensors", ".ply") and path.parts[0] not in ("web", "scene")
+    large = path.suffix in (".safetensors", ".ply") and name != "coarse/model.ply"
+    return not large and path.parts[0] not in ("web", "scene")
 
 
 def for_export(name: str) -> bool:

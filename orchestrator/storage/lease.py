@@ -11,10 +11,13 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
+from panolog.orchestrator.run import lock
 from panolog.orchestrator.storage.layout import LEASES, newest, number_of, numbered
 from panolog.scene.errors import RunLockedError, StoreError, StoreLostError
 from panolog.scene.stores.store import Store
@@ -27,7 +30,7 @@ _POLL_S = 1.0  # between two looks at the lease of a mirror on this machine that
 class Lease:
     """A lease that this process holds; a thread refreshes it. Made by `take`."""
 
-    def __init__(self, store: Store, number: int, owner: str) -> None:
+    def __init__(self, store: Store, number: int, owner: "_Owner") -> None:
         self.number = number
         self._store, self._owner = store, owner
         self._lost, self._ended = "", threading.Event()
@@ -48,7 +51,7 @@ class Lease:
                 if found is not None and number_of(found) > self.number:
                     self._lost = _described(_read(self._store, found))
                 elif not self._ended.is_set():
-                    self._store.write(numbered(LEASES, self.number), _content(self._owner))
+                    self._store.write(numbered(LEASES, self.number), self._owner.content())
         if self._lost:
             raise RunLockedError(f"{self._store.url}: {self._lost} has taken the run over; this driver ends")
 
@@ -57,7 +60,7 @@ class Lease:
         self._ended.set()
         self._thread.join()
         if not self._lost:
-            self._store.write(numbered(LEASES, self.number), _content(self._owner, released=True))
+            self._store.write(numbered(LEASES, self.number), self._owner.content(released=True))
 
     def _keep(self) -> None:
         while not self._ended.wait(_REFRESH_S) and not self._lost:
@@ -65,19 +68,33 @@ class Lease:
                 self.require()
 
 
-def take(store: Store, *, force: bool, waits: Callable[[], bool]) -> Lease:
+@dataclass(frozen=True)
+class _Owner:
+    """Who holds a lease."""
+
+    folder: str  # stands for the run's folder on its machine
+    token: str = field(default_factory=lambda: secrets.token_hex(8))
+
+    def content(self, *, released: bool = False) -> bytes:
+        """The lease as it is written now."""
+        held = {"owner": self.token, "folder": self.folder, "time": time.time(), "released": released}
+        return json.dumps(held | {"host": socket.gethostname(), "pid": os.getpid()}).encode()
+
+
+def take(store: Store, root: Path, *, force: bool) -> Lease:
     """Takes the lease of a run.
 
-    Args: force, also from a driver that may still be at work; waits, whether to wait for a lease of this
-    machine, because no driver is at work here and only its mirror is left.
+    Where only the mirror of this machine's last driver is left, it waits for its end.
+    Args: root, the run's folder on this machine; force, also from a driver that may still be at work.
     Raises RunLockedError if another driver has it; StoreError, StoreLostError as `Store`.
     """
-    owner = secrets.token_hex(8)
+    owner = _Owner(sha256(str(root.resolve()).encode()).hexdigest()[:16])
     while True:
         found = newest(store, LEASES)
         held = _read(store, found) if found else {}
         if _live(held) and not force:
-            if held.get("host") == socket.gethostname() and waits():
+            own = (held.get("host"), held.get("folder")) == (socket.gethostname(), owner.folder)
+            if own and not lock.held(root / "lock"):
                 time.sleep(_POLL_S)
                 continue
             left = float(held["time"]) + EXPIRES_S - time.time()
@@ -88,7 +105,7 @@ def take(store: Store, *, force: bool, waits: Callable[[], bool]) -> Lease:
         number = (number_of(found) if found else 0) + 1
         name = numbered(LEASES, number)
         # A request that was repeated may have been served the first time.
-        if store.write(name, _content(owner), new=True) or _read(store, name).get("owner") == owner:
+        if store.write(name, owner.content(), new=True) or _read(store, name).get("owner") == owner.token:
             if found:
                 store.remove(found)
             return Lease(store, number, owner)
@@ -99,11 +116,6 @@ def holder(store: Store) -> str:
     found = newest(store, LEASES)
     held = _read(store, found) if found else {}
     return _described(held) if _live(held) else ""
-
-
-def _content(owner: str, *, released: bool = False) -> bytes:
-    held = {"owner": owner, "host": socket.gethostname(), "pid": os.getpid(), "time": time.time()}
-    return json.dumps(held | {"released": released}).encode()
 
 
 def _read(store: Store, name: str) -> dict[str, Any]:

@@ -45,7 +45,7 @@ from panolog.scene.stores.store import Store
 _THREADS = 4  # files stored at a time
 _SHARE = 10  # a pause is at least so many times as long as writing run.db and the manifest took
 _LONGEST_S = 120.0  # between two tries while a store fails
-_PASSING = (StoreError, StoreLostError, RunFolderError, sqlite3.Error, OSError)
+_PASSING = (StoreError, StoreLostError, RunFolderError, sqlite3.OperationalError, OSError)
 Stamp = tuple[int, int, int]  # size, time of change in ns, inode
 
 
@@ -117,7 +117,7 @@ class Mirror:
             taken = time.monotonic()
             files = first | self._send(self._present())
             began += time.monotonic() - taken
-            entry = self._put(snapshot, DATABASE)
+            entry = self._put(snapshot, DATABASE, self._files.get(DATABASE))
         finally:
             snapshot.unlink(missing_ok=True)
         if last and self._done():
@@ -172,11 +172,9 @@ class Mirror:
             if not self._hold(self._folder.root / name, held):
                 return  # it is gone: the next look does not find it either
             known = self._stored[name][1] if name in self._stored else self._files.get(name)
-            if known is None or (known.size, known.sha256) != (held.stat().st_size, digest_of(held)):
-                entry = self._put(held, name)
+            entry = self._put(held, name, known)
+            if entry != known:
                 self._forget(name)
-            else:
-                entry = known
             self._stored[name] = (stamp, entry)
         finally:
             held.unlink(missing_ok=True)
@@ -196,11 +194,13 @@ class Mirror:
             shutil.copy2(path, held)
         return True
 
-    def _put(self, path: Path, name: str) -> Entry:
-        """Stores a file that does not change, as a new object."""
+    def _put(self, path: Path, name: str, known: Entry | None) -> Entry:
+        """Stores a file that does not change as a new object, unless a known one has the same bytes."""
         status = path.stat()
         key = f"{OBJECTS}/{name}/{time.time_ns():x}-{secrets.token_hex(4)}"
         entry = Entry(key, status.st_size, digest_of(path), status.st_mtime_ns)
+        if known is not None and (known.size, known.sha256) == (entry.size, entry.sha256):
+            return known
         self._store.put(path, key)
         return entry
 
@@ -220,6 +220,8 @@ class Mirror:
 
     def _publish(self, files: dict[str, Entry], moment: float) -> None:
         """Makes these files the run, for all who read the store."""
+        if files == self._files:
+            return
         self._lease.require()
         manifest = Manifest(f"{MANIFESTS}/{time.time_ns():x}-{secrets.token_hex(4)}", files)
         packed = manifest.pack()

@@ -69,7 +69,7 @@ def waiting(kind):
         def run(self):
             for event in kind.run(self):
                 yield event
-                while type(event).__name__ == self.awaited and not stopping.requested():
+                while type(event).__name__.startswith(self.awaited) and not stopping.requested():
                     time.sleep(0.01)
 
     return Waiting

@@ -1,0 +1,377 @@
+"""The mirror of a run: the store is whole after every request, whatever fails, and has each file once."""
+
+import json
+import sqlite3
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import CheckpointSaved, Outcome, Record, RunBegan, RunEnded
+from panolog.orchestrator.run.state import replay
+from panolog.orchestrator.run.store import Database, read_milestones
+from panolog.orchestrator.storage import lease as leases
+from panolog.orchestrator.storage.fetch import bring, for_status, viewed
+from panolog.orchestrator.storage.layout import MANIFESTS, OBJECTS, POINTERS, current, mirrored
+from panolog.orchestrator.storage.lease import Lease, holder, take
+from panolog.orchestrator.storage.mirror import Mirror
+from panolog.orchestrator.storage.state import MirrorState, read_state, write_state
+from panolog.scene.errors import RunFolderError, RunLockedError, StoreError, StoreLostError
+from panolog.scene.files import write_bytes
+from panolog.scene.stores.store import Store, open_store
+from panolog.workers.tasks import COARSE
+from tests.object_store import ObjectStore, object_store
+
+
+class Driver:
+    """Writes a run as the driver does: each file before the record that names it."""
+
+    def __init__(self, root: Path) -> None:
+        self.folder = RunFolder(root)
+        root.mkdir()
+        write_bytes(self.folder.info, b'{"format": 1}')
+        self._lock = threading.Lock()
+        self._append(RunBegan("here", 1, False))
+        self.folder.checkpoint(COARSE).parent.mkdir()
+        self.iteration = 0
+
+    def save(self) -> None:
+        """One checkpoint, whose content is its iteration."""
+        with self._lock:
+            self.iteration += 1
+            path = self.folder.checkpoint(COARSE)
+            write_bytes(path, str(self.iteration).encode().zfill(3000))
+            self._append(CheckpointSaved(COARSE, self.iteration, self.folder.relative(path), 3000))
+
+    def end(self, outcome: Outcome = Outcome.DONE) -> None:
+        if outcome is Outcome.DONE:
+            write_bytes(self.folder.point_cloud, b"ply" * 1000)
+        self._append(RunEnded(outcome))
+
+    def _append(self, record: Record) -> None:
+        """With a connection of its own: the mirror stores files in several threads."""
+        with closing(Database(self.folder.database)) as database:
+            database.append([record])
+
+
+def mirror_of(driver: Driver, store: Store, *, force: bool = False) -> tuple[Mirror, Lease]:
+    lease = take(store, driver.folder.root, force=force)
+    return Mirror(driver.folder, store, lease, current(store)), lease
+
+
+def rounds(mirror: Mirror, *, ended: bool = True) -> None:
+    """One round, as when the driver has ended; or as many as it takes until it has."""
+    over = threading.Event()
+    over.set()
+    mirror.follow(over, threading.Event(), 0.01, 5.0)
+
+
+def fetched(store: Store, root: Path) -> RunFolder:
+    """The run as a fresh machine finds it; checks that what its database names is there."""
+    folder = RunFolder(root)
+    bring(store, folder, current(store), lambda _: None)
+    checkpoint = replay(read_milestones(folder.database)).task(COARSE).checkpoint
+    if checkpoint is not None:
+        assert int(folder.checkpoint(COARSE).read_bytes()) >= checkpoint
+    with closing(sqlite3.connect(folder.database)) as database:
+        assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    return folder
+
+
+class Watched(Store):
+    """A store that calls a function after each change."""
+
+    after: Callable[[], None] = staticmethod(lambda: None)
+
+    def put(self, path: Path, name: str) -> None:
+        super().put(path, name)
+        self.after()
+
+    def write(self, name: str, data: bytes, *, new: bool = False) -> bool:
+        made = super().write(name, data, new=new)
+        self.after()
+        return made
+
+    def remove(self, name: str) -> None:
+        super().remove(name)
+        self.after()
+
+    def copy(self, name: str, other: str) -> None:
+        super().copy(name, other)
+        self.after()
+
+
+def test_the_store_is_whole_after_every_change(tmp_path: Path) -> None:
+    store = Watched(open_store(f"file://{tmp_path}/store").url)
+    driver, seen = Driver(tmp_path / "run"), [0]
+
+    def look() -> None:
+        driver.save()  # the driver proceeds within every round
+        if current(store) is not None:
+            seen[0] += 1
+            fetched(store, tmp_path / f"fresh{seen[0]}")
+
+    mirror, _ = mirror_of(driver, store)
+    store.after = look
+    for _ in range(3):
+        mirror._round(last=False)
+    store.after = lambda: None
+    driver.end()
+    rounds(mirror)
+    assert seen[0] > 10
+    assert mirror.state.complete
+    fresh = fetched(store, tmp_path / "last")
+    assert files(fresh.root) == files(driver.folder.root)
+    assert len(files(fresh.root)) == 3
+
+
+def files(root: Path) -> dict[str, bytes]:
+    """All that a mirror copies, but for run.db, whose pages a copy may have in another order."""
+    found = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
+    return {name: path.read_bytes() for name, path in found.items() if mirrored(name)}
+
+
+def test_what_was_replaced_is_removed_and_results_have_their_names(tmp_path: Path) -> None:
+    store = open_store(f"file://{tmp_path}/store")
+    driver = Driver(tmp_path / "run")
+    mirror, lease = mirror_of(driver, store)
+    for _ in range(5):
+        driver.save()
+        mirror._round(last=False)
+    assert len(store.list(f"{OBJECTS}/coarse/checkpoint.safetensors")) <= 2
+    driver.end()
+    rounds(mirror)
+    lease.release()
+    assert holder(store) == ""
+    assert store.read("point_cloud.ply") == b"ply" * 1000
+    assert store.read("run.json") == driver.folder.info.read_bytes()
+    second, lease = mirror_of(driver, store)  # as by `resume` of a run that is done: nothing is stored again
+    before = store.list()
+    rounds(second)
+    lease.release()
+    assert {it for it in store.list().keys() - before.keys() if "/leases/" not in it} == set()
+    driver.save()  # as by `retry`
+    third, _ = mirror_of(driver, store)
+    third._round(last=False)
+    named = current(store)
+    assert named is not None
+    kept = {entry.key for entry in named.files.values()}
+    left = {it.split("/")[2] for it in store.list(OBJECTS) if it not in kept}
+    assert left <= {"run.db", "coarse"}  # what the last round has replaced
+    assert len(store.list(POINTERS)) == 1
+
+
+def test_a_run_that_was_refused_leaves_nothing(tmp_path: Path) -> None:
+    store = open_store(f"file://{tmp_path}/store")
+    driver = Driver(tmp_path / "run")
+    mirror, _ = mirror_of(driver, store)
+    mirror._round(last=False)
+    assert current(store) is not None
+    driver.folder.info.unlink()
+    rounds(mirror)
+    assert current(store) is None
+    assert store.list(OBJECTS) == {}
+
+
+def test_a_store_that_fails_delays_only_the_mirror_and_says_so(tmp_path: Path) -> None:
+    store = Watched(open_store(f"file://{tmp_path}/store").url)
+    driver = Driver(tmp_path / "run")
+    mirror, _ = mirror_of(driver, store)
+    driver.save()
+    failing = iter([True] * 3)
+
+    def fail() -> None:
+        if next(failing, False):
+            raise StoreLostError("the store fails (503)")
+
+    store.after = fail
+    assert not mirror._try(last=False)
+    state = read_state(driver.folder.mirror)
+    assert state is not None
+    assert state.problem == "the store fails (503)"
+    assert state.late
+    assert "nothing is in" in state.line
+    driver.end()
+    rounds(mirror)
+    state = read_state(driver.folder.mirror)
+    assert state is not None
+    assert (state.complete, state.problem, state.lag) == (True, "", 0.0)
+    fetched(store, tmp_path / "fresh")
+
+
+def test_a_mirror_without_a_store_gives_up_and_keeps_what_is_left_in_mind(tmp_path: Path) -> None:
+    store = Watched(open_store(f"file://{tmp_path}/store").url)
+    driver = Driver(tmp_path / "run")
+    mirror, _ = mirror_of(driver, store)
+    driver.end()
+
+    def fail() -> None:
+        raise StoreLostError("the store fails (503)")
+
+    store.after = fail
+    ended = threading.Event()
+    ended.set()
+    mirror.follow(ended, threading.Event(), 0.01, 0.05)
+    assert not mirror.state.complete
+    assert mirror.state.problem
+
+
+def test_one_driver_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = open_store(f"file://{tmp_path}/store")
+    driver = Driver(tmp_path / "run")
+    mirror, lease = mirror_of(driver, store)
+    driver.save()
+    mirror._round(last=False)
+    assert holder(store).startswith("a driver on ")
+    with pytest.raises(RunLockedError, match=r"is at work on it; stop that one first.*--force") as found:
+        take(store, tmp_path / "elsewhere", force=False)
+    assert "\n" not in str(found.value)
+    newer = take(store, tmp_path / "elsewhere", force=True)
+    driver.save()
+    with pytest.raises(RunLockedError, match="has taken the run over"):
+        mirror._round(last=False)
+    assert lease.lost
+    named = current(store)
+    assert named is not None
+    assert named.name == mirror.state.published  # what the newer one continues from
+    Mirror(driver.folder, store, newer, named)._round(last=False)
+    newer.release()
+    assert holder(store) == ""
+    take(store, tmp_path / "elsewhere", force=False)
+
+
+def test_a_lease_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = open_store(f"file://{tmp_path}/store")
+    take(store, tmp_path / "elsewhere", force=False)
+    monkeypatch.setattr(leases, "EXPIRES_S", 0.0)
+    take(store, tmp_path / "elsewhere", force=False)
+
+
+def test_a_damaged_store_is_one_line(tmp_path: Path) -> None:
+    store = open_store(f"file://{tmp_path}/store")
+    driver = Driver(tmp_path / "run")
+    mirror, _ = mirror_of(driver, store)
+    driver.save()
+    mirror._round(last=False)
+    (checkpoint,) = store.list(f"{OBJECTS}/coarse/checkpoint.safetensors")
+    store.write(checkpoint, b"other")
+    with pytest.raises(StoreError, match="its digest differs"):
+        fetched(store, tmp_path / "fresh")
+    assert not RunFolder(tmp_path / "fresh").info.exists()
+    store.write(mirror.state.published, b"other")
+    with pytest.raises(StoreError, match="missing or damaged"):
+        current(store)
+
+
+@pytest.mark.parametrize("name", ["../x", "/x", "control/stop", "lock"])
+def test_a_manifest_that_names_what_is_no_file_of_a_run_is_refused(tmp_path: Path, name: str) -> None:
+    from panolog.orchestrator.storage.layout import Entry, Manifest, put_pointer  # noqa: PLC0415
+
+    store = open_store(f"file://{tmp_path}/store")
+    manifest = Manifest(f"{MANIFESTS}/x", {name: Entry("k", 1, "0", 0)})
+    store.write(manifest.name, manifest.pack())
+    put_pointer(store, 1, manifest, manifest.pack())
+    with pytest.raises(StoreError, match="no file of a run"):
+        current(store)
+
+
+def test_which_folder_is_brought_up_to_date_and_which_is_kept(tmp_path: Path) -> None:
+    store = open_store(f"file://{tmp_path}/store")
+    driver = Driver(tmp_path / "run")
+    mirror, lease = mirror_of(driver, store)
+    driver.save()
+    mirror._round(last=False)
+    lines: list[str] = []
+    driver.save()  # newer than the store: this machine has gone on
+    bring(store, driver.folder, current(store), lines.append)
+    assert int(driver.folder.checkpoint(COARSE).read_bytes()) == 2
+    assert lines == []
+    other = fetched(store, tmp_path / "other")
+    lease.release()
+    second = Mirror(other, store, take(store, other.root, force=False), current(store))
+    write_bytes(other.report, b"continued")
+    second._round(last=False)
+    bring(store, driver.folder, current(store), lines.append)
+    assert int(driver.folder.checkpoint(COARSE).read_bytes()) == 1
+    assert "another machine has continued this run" in lines[0]
+    (aside,) = tmp_path.glob("run.before-*")
+    assert int(RunFolder(aside).checkpoint(COARSE).read_bytes()) == 2
+    with pytest.raises(RunFolderError, match="choose another folder"):
+        bring(open_store(f"file://{tmp_path}/elsewhere"), other, None, lines.append)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "x").touch()
+    with pytest.raises(RunFolderError, match="is not empty"):
+        bring(store, RunFolder(tmp_path / "full"), current(store), lines.append)
+
+
+def test_a_reader_gets_what_it_needs(tmp_path: Path) -> None:
+    store = open_store(f"file://{tmp_path}/store")
+    driver = Driver(tmp_path / "run")
+    mirror, _ = mirror_of(driver, store)
+    driver.save()
+    mirror._round(last=False)
+    with viewed(store.url, for_status) as found:
+        names = {path.name for path in found.root.rglob("*") if path.is_file()}
+        assert names == {"run.json", "run.db"}
+        assert found.driver
+    with (
+        pytest.raises(StoreError, match="there is no run"),
+        viewed(open_store(f"file://{tmp_path}/x").url, for_status),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b'{"url": 3}', b'{"url": "s3://x", "since": "y"}', b"\xff"])
+def test_a_damaged_state_is_none(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "state.json").write_bytes(content)
+    assert read_state(tmp_path / "state.json") is None
+
+
+def test_a_mirror_that_is_silent_is_a_problem(tmp_path: Path) -> None:
+    path = tmp_path / "store" / "state.json"
+    write_state(path, MirrorState("s3://x/y", since=1.0))
+    assert read_state(path, running=True) == read_state(path)
+    content: dict[str, Any] = json.loads(path.read_text())
+    path.write_text(json.dumps(content | {"time": 1.0}))
+    state = read_state(path, running=True)
+    assert state is not None
+    assert "the mirror has ended" in state.line
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[ObjectStore]:
+    with object_store() as found:
+        yield found
+
+
+@pytest.mark.system
+def test_through_s3_with_faults_nothing_is_lost_and_nothing_doubled(
+    tmp_path: Path, server: ObjectStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in server.environment.items():
+        monkeypatch.setenv(name, value)
+    store = open_store(server.url("run"))
+    driver = Driver(tmp_path / "run")
+    mirror, lease = mirror_of(driver, store)
+    for _ in range(4):
+        driver.save()
+        server.faults += ["lost answer", "throttled", "reset", "error", "truncated"]
+        with suppress(StoreLostError):
+            mirror._round(last=False)
+    driver.end()
+    rounds(mirror)
+    lease.release()
+    assert mirror.state.complete
+    assert not server.faults
+    assert all(server.injected[kind] for kind in ("lost answer", "throttled", "reset", "error", "truncated"))
+    fresh = fetched(store, tmp_path / "fresh")
+    assert files(fresh.root) == files(driver.folder.root)
+    named = current(store)
+    assert named is not None
+    kept = {entry.key for entry in named.files.values()}
+    doubled = [name for name in store.list(OBJECTS) if name not in kept]
+    assert len(doubled) <= 5, doubled  # at most what the last round has replaced
