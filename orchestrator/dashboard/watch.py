@@ -17,6 +17,7 @@ from panolog.orchestrator.preparation.settings import MOST_BYTES
 from panolog.orchestrator.run import lock, presence, reading
 from panolog.orchestrator.run.records import Progressed, RunBegan, RunEnded, Stored
 from panolog.orchestrator.run.store import as_event, read_milestones, read_news
+from panolog.orchestrator.storage.state import read_state
 from panolog.orchestrator.views import queries
 from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.preparation import stamp_of, version_of, view_preparation, with_step
@@ -187,7 +188,9 @@ class Watch:
             exposure=version_of(folder.exposure),
         )
         waiting = presence.waiting(folder.presence) if running else ""
-        page_stamp = (running, raw, stamp, available, result, waiting, stamp_of(folder))
+        mirror = read_state(folder.mirror, running=running)
+        store = mirror.brief if mirror else ""
+        page_stamp = (running, raw, stamp, available, result, waiting, stamp_of(folder), store)
         if page_stamp == self._page_stamp:
             return
         try:
@@ -196,7 +199,7 @@ class Watch:
             raise InputError(f"run.json is not JSON: {error}") from error
         if not isinstance(info, dict):
             raise InputError("run.json holds no object")
-        page = self._page(info, available, result, waiting, running=running)
+        page = self._page(info, available, result, waiting, store, running=running)
         self._publish(page, tasks, fresh=not self._page_stamp or self._page_stamp[:2] != page_stamp[:2])
         self._page_stamp = page_stamp
 
@@ -222,7 +225,14 @@ class Watch:
         return changed
 
     def _page(
-        self, info: dict[str, Any], available: Actions, result: Results, waiting: str, *, running: bool
+        self,
+        info: dict[str, Any],
+        available: Actions,
+        result: Results,
+        waiting: str,
+        store: str,
+        *,
+        running: bool,
     ) -> RunPage:
         entry, folder = self.entry, self.entry.folder
         usages = queries.usages(folder.database) if running and folder.database.exists() else {}
@@ -234,7 +244,14 @@ class Watch:
         prepared = view_preparation(folder, self.history.state, running=running, read=read)
         history = replace(self.history, state=with_step(self.history.state, prepared))
         view = view_run(
-            history, info, running=running, root=root, usages=usages, waiting=waiting, preparation=prepared
+            history,
+            info,
+            running=running,
+            root=root,
+            usages=usages,
+            waiting=waiting,
+            preparation=prepared,
+            store=store,
         )
         path = str(folder.root)
         return RunPage(

@@ -41,6 +41,11 @@ class MirrorState:
         return "; ".join(filter(None, (behind, left, self.problem)))
 
     @property
+    def brief(self) -> str:
+        """The line; nothing that changes all the time while all is well."""
+        return self.line if self.late or self.complete else f"copied to {self.url}"
+
+    @property
     def lag(self) -> float:
         """Seconds of the run that would be lost with this machine."""
         return 0.0 if self.complete else max(0.0, time.time() - self.since)

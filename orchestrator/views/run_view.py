@@ -102,6 +102,7 @@ class LiveView(ViewModel):
     stages: tuple[StageView, ...]
     nodes: tuple[NodeView, ...]
     preparation: PreparationView | None = None  # of a run that makes its scene
+    store: Text = ""  # how far it has been copied to its object store; "" if it has none
 
 
 class RunView(LiveView):
@@ -122,11 +123,12 @@ def view_run(
     usages: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
     waiting: str = "",
     preparation: PreparationView | None = None,
+    store: str = "",
 ) -> RunView:
     """The view of a run.
 
     Args: info, run.json; running, root, as `summarize`; usages, `queries.usages`; waiting, of `presence`;
-    preparation, `view_preparation`.
+    preparation, `view_preparation`; store, `MirrorState.brief`.
     """
     state, now = history.state, time.time()
     state = replace(state, waiting=state.waiting or waiting)
@@ -141,6 +143,7 @@ def view_run(
         stages=tuple(_with_share(stage, preparation) for stage in stages),
         nodes=_nodes(history, usages, summary, running=running),
         preparation=preparation,
+        store=store,
         info=info,
         summary=summary,
         began=state.began,

@@ -15,7 +15,7 @@ const MOST = 12; // tasks listed for one machine
  * @param {number} since seconds for which it has run since the message
  * @returns {[string, string][]}
  */
-function facts({ summary, progress, eta, latest }, live, since) {
+function facts({ summary, progress, eta, latest, store }, live, since) {
   const { model, seconds } = summary;
   return [
     ["Progress", percent(progress)],
@@ -24,6 +24,7 @@ function facts({ summary, progress, eta, latest }, live, since) {
     ["PSNR, held out", decibel(summary.metrics?.psnr)],
     live || !model ? ["Gaussians in training", short(summary.training_gaussians)] : ["Size", bytes(model.bytes)],
     ["Gaussians kept", short(summary.kept_gaussians)],
+    .../** @type {[string, string][]} */ (store ? [["Object store", store]] : []),
   ];
 }
 

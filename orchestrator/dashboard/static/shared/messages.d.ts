@@ -286,6 +286,7 @@ export interface RunChanges {
   stages: Array<StageView>;
   nodes: Array<NodeView>;
   preparation: PreparationView | null;
+  store: string;
   id: string;
   actions: Actions;
   result: Results;
@@ -326,6 +327,7 @@ export interface RunPage {
   stages: Array<StageView>;
   nodes: Array<NodeView>;
   preparation: PreparationView | null;
+  store: string;
   info: Record<string, any>;
   summary: Summary;
   began: number | null;
