@@ -69,7 +69,7 @@ def object_store() -> Iterator[ObjectStore]:
     with _moto() as server:
         store = ObjectStore(0, server)
         _call(server, "PUT", f"/{BUCKET}", b"", {})
-        proxy = ThreadingHTTPServer(("127.0.0.1", 0), _handler(store))
+        proxy = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"store": store}))
         proxy.daemon_threads = True
         store.port = proxy.server_port
         thread = threading.Thread(target=proxy.serve_forever, args=(0.05,))
@@ -120,76 +120,76 @@ def _call(
     return answer.status, answer.getheaders(), data
 
 
-def _handler(store: ObjectStore) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
+class _Handler(BaseHTTPRequestHandler):
+    """Passes requests on to moto's server, with the faults of the self.store."""
 
-        def handle_any(self) -> None:
-            body = self._body()
-            fault = store.next_fault()
-            with store.lock:
-                store.requests[self.command] += 1
-                store.keys.append((self.command, self.path))
-            if fault in _CODES:
-                code, content = _CODES[str(fault)]
-                self._answer(code, [("Content-Type", "application/xml")], content)
-                return
-            if fault == "reset":
-                self._reset()
-                return
-            headers = {name: self.headers[name] for name in self.headers if name.lower() not in _HOP}
-            try:
-                status, given, data = _call(store.server, self.command, self.path, body, headers)
-            except OSError:  # the test has ended
-                return
-            if fault == "lost answer":
-                self._reset()
-                return
-            if fault == "slow":
-                time.sleep(_SLOW_S)
-            if fault == "truncated" and len(data) > 1:
-                self._answer(status, given, data[: len(data) // 2], size=len(data))
-                self._reset()
-                return
-            self._answer(status, given, data)
+    store: ObjectStore
+    protocol_version = "HTTP/1.1"
 
-        do_GET = do_PUT = do_POST = do_DELETE = do_HEAD = handle_any  # noqa: N815
+    def handle_any(self) -> None:
+        body = self._body()
+        fault = self.store.next_fault()
+        with self.store.lock:
+            self.store.requests[self.command] += 1
+            self.store.keys.append((self.command, self.path))
+        if fault in _CODES:
+            code, content = _CODES[str(fault)]
+            self._answer(code, [("Content-Type", "application/xml")], content)
+            return
+        if fault == "reset":
+            self._reset()
+            return
+        headers = {name: self.headers[name] for name in self.headers if name.lower() not in _HOP}
+        try:
+            status, given, data = _call(self.store.server, self.command, self.path, body, headers)
+        except OSError:  # the test has ended
+            return
+        if fault == "lost answer":
+            self._reset()
+            return
+        if fault == "slow":
+            time.sleep(_SLOW_S)
+        if fault == "truncated" and len(data) > 1:
+            self._answer(status, given, data[: len(data) // 2], size=len(data))
+            self._reset()
+            return
+        self._answer(status, given, data)
 
-        def _body(self) -> bytes:
-            if "chunked" in self.headers.get("Transfer-Encoding", ""):
-                pieces = []
-                while size := int(self.rfile.readline().split(b";")[0], 16):
-                    pieces.append(self.rfile.read(size))
-                    self.rfile.readline()
-                while self.rfile.readline().strip():
-                    pass
-                return b"".join(pieces)
-            return self.rfile.read(int(self.headers.get("Content-Length", 0)))
+    do_GET = do_PUT = do_POST = do_DELETE = do_HEAD = handle_any  # noqa: N815
 
-        def _answer(
-            self, status: int, headers: list[tuple[str, str]], data: bytes, size: int | None = None
-        ) -> None:
-            self.send_response(status)
-            given = dict(headers)
-            length = given.get("Content-Length") if self.command == "HEAD" else None
-            for name, value in headers:
-                if name.lower() not in _HOP:
-                    self.send_header(name, value)
-            self.send_header("Content-Length", length or str(len(data) if size is None else size))
-            self.end_headers()
-            if self.command != "HEAD":
-                self.wfile.write(data)
+    def _body(self) -> bytes:
+        if "chunked" in self.headers.get("Transfer-Encoding", ""):
+            pieces = []
+            while size := int(self.rfile.readline().split(b";")[0], 16):
+                pieces.append(self.rfile.read(size))
+                self.rfile.readline()
+            while self.rfile.readline().strip():
+                pass
+            return b"".join(pieces)
+        return self.rfile.read(int(self.headers.get("Content-Length", 0)))
 
-        def _reset(self) -> None:
-            self.close_connection = True
-            with suppress(OSError):
-                self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
-                self.connection.close()
+    def _answer(
+        self, status: int, headers: list[tuple[str, str]], data: bytes, size: int | None = None
+    ) -> None:
+        self.send_response(status)
+        given = dict(headers)
+        length = given.get("Content-Length") if self.command == "HEAD" else None
+        for name, value in headers:
+            if name.lower() not in _HOP:
+                self.send_header(name, value)
+        self.send_header("Content-Length", length or str(len(data) if size is None else size))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(data)
 
-        def log_message(self, *_: Any) -> None:
-            pass
+    def _reset(self) -> None:
+        self.close_connection = True
+        with suppress(OSError):
+            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+            self.connection.close()
 
-    return Handler
+    def log_message(self, *_: Any) -> None:
+        pass
 
 
 _HOP = ("host", "content-length", "connection", "transfer-encoding", "server", "date", "expect")

@@ -99,7 +99,7 @@ class Mirror:
                 if last:
                     self._withdraw()
                 return True
-            self._round(last=last)
+            self.round(last=last)
         except RunLockedError as error:
             self._say(problem=str(error))
             return False
@@ -108,7 +108,12 @@ class Mirror:
             return False
         return True
 
-    def _round(self, *, last: bool) -> None:
+    def round(self, *, last: bool = False) -> None:
+        """Copies what has changed, and publishes it.
+
+        Args: last, whether the driver has ended, so that results get their names. Raises RunLockedError if
+        another driver has taken the run over, and what the store or the disk raises.
+        """
         self._lease.require()
         first = self._send(self._present())
         began, moment = time.monotonic(), time.time()

@@ -14,6 +14,8 @@ PARENTS = {
     errors.PlyError: errors.InputError,
     errors.FormatError: errors.InputError,
     errors.ConfigError: errors.InputError,
+    errors.StoreError: errors.InputError,
+    errors.StoreLostError: errors.RunError,
     errors.DeviceError: errors.InputError,
     errors.ClusterError: errors.InputError,
     errors.ClusterLostError: errors.RunError,

@@ -118,7 +118,7 @@ def test_the_store_is_whole_after_every_change(tmp_path: Path) -> None:
     mirror, _ = mirror_of(driver, store)
     store.after = look
     for _ in range(3):
-        mirror._round(last=False)
+        mirror.round()
     store.after = lambda: None
     driver.end()
     rounds(mirror)
@@ -141,7 +141,7 @@ def test_what_was_replaced_is_removed_and_results_have_their_names(tmp_path: Pat
     mirror, lease = mirror_of(driver, store)
     for _ in range(5):
         driver.save()
-        mirror._round(last=False)
+        mirror.round()
     assert len(store.list(f"{OBJECTS}/coarse/checkpoint.safetensors")) <= 2
     driver.end()
     rounds(mirror)
@@ -156,7 +156,7 @@ def test_what_was_replaced_is_removed_and_results_have_their_names(tmp_path: Pat
     assert {it for it in store.list().keys() - before.keys() if "/leases/" not in it} == set()
     driver.save()  # as by `retry`
     third, _ = mirror_of(driver, store)
-    third._round(last=False)
+    third.round()
     named = current(store)
     assert named is not None
     kept = {entry.key for entry in named.files.values()}
@@ -169,7 +169,7 @@ def test_a_run_that_was_refused_leaves_nothing(tmp_path: Path) -> None:
     store = open_store(f"file://{tmp_path}/store")
     driver = Driver(tmp_path / "run")
     mirror, _ = mirror_of(driver, store)
-    mirror._round(last=False)
+    mirror.round()
     assert current(store) is not None
     driver.folder.info.unlink()
     rounds(mirror)
@@ -225,7 +225,7 @@ def test_one_driver_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     driver = Driver(tmp_path / "run")
     mirror, lease = mirror_of(driver, store)
     driver.save()
-    mirror._round(last=False)
+    mirror.round()
     assert holder(store).startswith("a driver on ")
     with pytest.raises(RunLockedError, match=r"is at work on it; stop that one first.*--force") as found:
         take(store, tmp_path / "elsewhere", force=False)
@@ -233,12 +233,12 @@ def test_one_driver_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     newer = take(store, tmp_path / "elsewhere", force=True)
     driver.save()
     with pytest.raises(RunLockedError, match="has taken the run over"):
-        mirror._round(last=False)
+        mirror.round()
     assert lease.lost
     named = current(store)
     assert named is not None
     assert named.name == mirror.state.published  # what the newer one continues from
-    Mirror(driver.folder, store, newer, named)._round(last=False)
+    Mirror(driver.folder, store, newer, named).round()
     newer.release()
     assert holder(store) == ""
     take(store, tmp_path / "elsewhere", force=False)
@@ -256,7 +256,7 @@ def test_a_damaged_store_is_one_line(tmp_path: Path) -> None:
     driver = Driver(tmp_path / "run")
     mirror, _ = mirror_of(driver, store)
     driver.save()
-    mirror._round(last=False)
+    mirror.round()
     (checkpoint,) = store.list(f"{OBJECTS}/coarse/checkpoint.safetensors")
     store.write(checkpoint, b"other")
     with pytest.raises(StoreError, match="its digest differs"):
@@ -284,7 +284,7 @@ def test_which_folder_is_brought_up_to_date_and_which_is_kept(tmp_path: Path) ->
     driver = Driver(tmp_path / "run")
     mirror, lease = mirror_of(driver, store)
     driver.save()
-    mirror._round(last=False)
+    mirror.round()
     lines: list[str] = []
     driver.save()  # newer than the store: this machine has gone on
     bring(store, driver.folder, current(store), lines.append)
@@ -294,7 +294,7 @@ def test_which_folder_is_brought_up_to_date_and_which_is_kept(tmp_path: Path) ->
     lease.release()
     second = Mirror(other, store, take(store, other.root, force=False), current(store))
     write_bytes(other.report, b"continued")
-    second._round(last=False)
+    second.round()
     bring(store, driver.folder, current(store), lines.append)
     assert int(driver.folder.checkpoint(COARSE).read_bytes()) == 1
     assert "another machine has continued this run" in lines[0]
@@ -313,7 +313,7 @@ def test_a_reader_gets_what_it_needs(tmp_path: Path) -> None:
     driver = Driver(tmp_path / "run")
     mirror, _ = mirror_of(driver, store)
     driver.save()
-    mirror._round(last=False)
+    mirror.round()
     with viewed(store.url, for_status) as found:
         names = {path.name for path in found.root.rglob("*") if path.is_file()}
         assert names == {"run.json", "run.db"}
@@ -361,7 +361,7 @@ def test_through_s3_with_faults_nothing_is_lost_and_nothing_doubled(
         driver.save()
         server.faults += ["lost answer", "throttled", "reset", "error", "truncated"]
         with suppress(StoreLostError):
-            mirror._round(last=False)
+            mirror.round()
     driver.end()
     rounds(mirror)
     lease.release()
