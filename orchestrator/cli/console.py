@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
@@ -120,3 +121,29 @@ def _lines(step: str) -> Iterator[Callable[[str, int, int], None]]:
     finally:
         ended.set()
         reporter.join()
+
+
+def say_results(root: Path, state: Any) -> None:
+    """Says what a run has made and where."""
+    from panolog.orchestrator.run.folder import RunFolder
+    from panolog.orchestrator.views.terminal import metrics_line
+
+    folder = RunFolder(root)
+    if state.money.reached is not None:
+        longer = command("resume", root, "--max-cost", "none", "--deadline", "none")
+        say(f"ended early: {state.money.reached.reason}; {longer}, or with higher limits, completes it")
+    if state.merged is None:
+        say("there is no model: the limit has ended the run before its first checkpoint")
+        return
+    say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")
+    say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {})})")
+    say(f"pictures  {folder.images}")
+    if folder.web.is_dir():
+        say(f"web page  {folder.web} (for any web server)")
+    if folder.plan_picture.exists():
+        say(f"partition {folder.plan_picture}")
+    say("now open")
+    if folder.report.exists():
+        say(f"  the report       {folder.report.absolute().as_uri()}")
+    say(f"  the model in 3D  {command('view', root)}")
+    say(f"  the dashboard    {command('dashboard', root)}")

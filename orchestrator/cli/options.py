@@ -11,6 +11,7 @@ import typer
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
+    from panolog.orchestrator.money.limits import Wanted
     from panolog.orchestrator.preparation.settings import Options
     from panolog.orchestrator.run.config import RunConfig
 
@@ -95,6 +96,31 @@ LogOption = Annotated[
         metavar="mlflow|tensorboard|wandb", help="Pass the curves on to a sink; may be given several times."
     ),
 ]
+_BUDGET = "Cost and time (docs/money.md)"  # the panel of these options in the help
+PricesOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE",
+        help="Prices of machines. Default: ~/.config/panolog/prices.toml, if there is one.",
+        rich_help_panel=_BUDGET,
+    ),
+]
+MaxCostOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="AMOUNT|none",
+        help="End the training in time for the whole run to cost at most so much, and deliver what there is.",
+        rich_help_panel=_BUDGET,
+    ),
+]
+DeadlineOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="6h|08:00|none",
+        help="The same, so that all is done at a time, or so long from now.",
+        rich_help_panel=_BUDGET,
+    ),
+]
 DeviceOption = Annotated[
     str | None,
     typer.Option(metavar="auto|cpu|cuda", help="Device to compute on. Default: as in the settings, or auto."),
@@ -162,6 +188,14 @@ PartialOption = Annotated[
         rich_help_panel=_MADE,
     ),
 ]
+
+
+def wanted(prices: str | None, max_cost: str | None, deadline: str | None) -> "Wanted":
+    """The values of these options. Raises ConfigError if one is wrong."""
+    from panolog.orchestrator.money.limits import Wanted
+    from panolog.orchestrator.money.prices import find_prices
+
+    return Wanted.of(max_cost, deadline, find_prices(prices))
 
 
 def axes_of(frame: str) -> Literal["export", "model"]:

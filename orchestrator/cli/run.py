@@ -10,20 +10,32 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from panolog.orchestrator.cli.console import command, err, print_json, print_result, progress_bar, say
+from panolog.orchestrator.cli.console import (
+    command,
+    err,
+    print_json,
+    print_result,
+    progress_bar,
+    say,
+    say_results,
+)
 from panolog.orchestrator.cli.options import (
     AddressOption,
     AnyRunArg,
     DashboardOption,
+    DeadlineOption,
     JsonOption,
     LocalOption,
     LogOption,
+    MaxCostOption,
     NewRunOption,
     NiceOption,
     NotifyOption,
+    PricesOption,
     ResumesOption,
     SourceArg,
     SuperviseOption,
+    wanted,
     with_preparation,
     with_run_config,
 )
@@ -52,23 +64,27 @@ def run(
     notify: NotifyOption = None,
     log: LogOption = None,
     local: LocalOption = None,
+    prices: PricesOption = None,
+    max_cost: MaxCostOption = None,
+    deadline: DeadlineOption = None,
 ) -> None:
     """Reconstruct a scene, a folder of panoramas or a 360° video: one model of the place."""
     from panolog.orchestrator.preparation.settings import as_arguments
     from panolog.orchestrator.run.config import as_settings
 
-    driver = _driver_options(address, nice, dashboard=dashboard)
+    driver, budget = _driver_options(address, nice, dashboard=dashboard), wanted(prices, max_cost, deadline)
     code, state = 0, None
     with mirrored(output, local) as root, _followed(root, notify, log):
         if _supervised(max_resumes, supervise=supervise):
-            first = ["run", source, "-o", str(root), *as_settings(config), *as_arguments(options), *driver]
+            first = ["run", source, "-o", str(root), *as_settings(config), *as_arguments(options)]
+            first += [*driver, *budget.options()]
             code = _supervise(root, first, driver, address, max_resumes)
         else:
             with progress_bar("starting"):
                 from panolog.orchestrator.commands import session
 
             with _display(root, output, dashboard=dashboard) as show:
-                state = session.start(source, root, config, address, show, None, nice, options)
+                state = session.start(source, root, config, address, show, None, nice, options, budget)
     _end(root, code, state)
 
 
@@ -85,6 +101,9 @@ def resume(
     force: Annotated[
         bool, typer.Option("--force", help="Take a run with a URL from a driver that may still be at work.")
     ] = False,
+    prices: PricesOption = None,
+    max_cost: MaxCostOption = None,
+    deadline: DeadlineOption = None,
     after: Annotated[str, typer.Option("--resumed-after", hidden=True)] = "",
     has_mirror: Annotated[bool, typer.Option("--has-mirror", hidden=True)] = False,
 ) -> None:
@@ -92,20 +111,20 @@ def resume(
     from panolog.orchestrator.run.folder import RunFolder
     from panolog.orchestrator.run.info import read_info
 
-    options = _driver_options(address, nice, dashboard=dashboard)
+    options, budget = _driver_options(address, nice, dashboard=dashboard), wanted(prices, max_cost, deadline)
     code, state = 0, None
     with mirrored(run, local, resumes=True, force=force, mirror=not has_mirror) as root:
         read_info(RunFolder(root))  # fails before torch is imported
         with _followed(root, notify, log):
             if _supervised(max_resumes, supervise=supervise):
-                first = ["resume", str(root), *options, "--has-mirror"]
+                first = ["resume", str(root), *options, *budget.options(), "--has-mirror"]
                 code = _supervise(root, first, options, address, max_resumes)
             else:
                 with progress_bar("starting"):
                     from panolog.orchestrator.commands import session
 
                 with _display(root, run, dashboard=dashboard) as show:
-                    state = session.resume(root, address, show, None, nice, after)
+                    state = session.resume(root, address, show, None, nice, after, budget)
     _end(root, code, state)
 
 
@@ -144,7 +163,7 @@ def demo(
         scene = make_place(root, place, lambda done, total: count(f"rendering {place.title}", done, total))
     with _display(root, str(root)) as show:
         state = run_demo(scene, root, place, address, show)
-    _say_results(root, state)
+    say_results(root, state)
 
 
 @with_run_config
@@ -331,26 +350,6 @@ def _display(root: Path, name: str, *, dashboard: bool = False) -> Iterator[Any]
 def _end(root: Path, code: int, state: Any) -> None:
     """Ends `run` or `resume`. Args: code, of the last supervised driver; state, if there is no supervisor."""
     if state is not None:
-        _say_results(root, state)
+        say_results(root, state)
     if code:
         raise typer.Exit(code)
-
-
-def _say_results(root: Path, state: Any) -> None:
-    """Says what a run has made and where."""
-    from panolog.orchestrator.run.folder import RunFolder
-    from panolog.orchestrator.views.terminal import metrics_line
-
-    folder = RunFolder(root)
-    say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")
-    say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {})})")
-    say(f"pictures  {folder.images}")
-    if folder.web.is_dir():
-        say(f"web page  {folder.web} (for any web server)")
-    if folder.plan_picture.exists():
-        say(f"partition {folder.plan_picture}")
-    say("now open")
-    if folder.report.exists():
-        say(f"  the report       {folder.report.absolute().as_uri()}")
-    say(f"  the model in 3D  {command('view', root)}")
-    say(f"  the dashboard    {command('dashboard', root)}")

@@ -1,5 +1,6 @@
 """The machines of a Ray cluster, each described by itself when it is first seen."""
 
+import re
 import time
 from typing import Any
 
@@ -10,11 +11,18 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.leaving import LeaveNotice
-from panolog.orchestrator.resources.machine import memory, memory_of, memory_total, oom_kills
+from panolog.orchestrator.resources.machine import (
+    instance_type,
+    memory,
+    memory_of,
+    memory_total,
+    oom_kills,
+)
 from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.run.records import Leaving
 from panolog.scene.errors import ClusterLostError
 
+_OWN = re.compile("CPU|GPU|memory|object_store_memory|node:|accelerator_type:")  # resources that Ray names
 _INTERVAL_S = 2.0  # between two queries of the machines
 _TIMEOUT_S = 30.0  # in which the machines that are there at the start must have described themselves
 
@@ -103,18 +111,25 @@ class RayNodes:
             except RayError:  # gone again: if it comes back, it is queried again
                 self._queried = float("-inf")
 
-    def _know(self, raw: dict[str, Any], free: int, gpus: tuple[Gpu, ...]) -> None:
+    def _know(self, raw: dict[str, Any], free: int, gpus: tuple[Gpu, ...], instance: str) -> None:
         id, host = raw["NodeID"], raw["NodeManagerHostname"]
-        self._known[id] = Node(id, host, int(raw["Resources"].get("CPU", 0)), free, gpus)
+        cpus = int(raw["Resources"].get("CPU", 0))
+        self._known[id] = Node(id, host, cpus, free, gpus, instance, _labels(raw))
 
 
-def describe(gpus: int, name: str) -> tuple[int, tuple[Gpu, ...]]:
-    """Bytes of memory that tasks may use on this machine, and the GPUs that Ray has found on it.
+def _labels(raw: dict[str, Any]) -> tuple[tuple[str, str], ...]:
+    """What a price list may know a machine by: Ray's labels, and resources that are not Ray's own."""
+    own = {name: f"{value:g}" for name, value in raw["Resources"].items() if _OWN.match(name) is None}
+    return tuple(sorted({**own, **raw.get("Labels", {})}.items()))
+
+
+def describe(gpus: int, name: str) -> tuple[int, tuple[Gpu, ...], str]:
+    """Bytes of memory that tasks may use on this machine, the GPUs that Ray has found on it, and its type.
 
     What workers of the run hold counts as free: after a kill, its next driver may find those of the last.
     """
     free = min(memory_total(), memory() + memory_of(f"ray::{name}"))
-    return free, describe_gpus(gpus)
+    return free, describe_gpus(gpus), instance_type()
 
 
 def on_node(function: Any, id: str) -> Any:

@@ -19,8 +19,10 @@ from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal, Patience
+from panolog.orchestrator.driver.purse import lost_with_driver, require_enough
 from panolog.orchestrator.driver.stopping import interruptible, on_signals
 from panolog.orchestrator.estimates.preflight import Preflight, examine
+from panolog.orchestrator.money.limits import Wanted
 from panolog.orchestrator.preparation.settings import Options, Settings, read_settings, write_settings
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.retention.clean import remove_models
@@ -30,6 +32,7 @@ from panolog.orchestrator.run import info as run_info
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo, SceneRef
+from panolog.orchestrator.run.money_records import BudgetSet
 from panolog.orchestrator.run.presence import Presence, why_waiting
 from panolog.orchestrator.run.records import (
     Noticed,
@@ -69,16 +72,19 @@ def start(
     pool: Pool | None = None,
     nice: int | None = None,
     options: Options | None = None,
+    wanted: Wanted | None = None,
 ) -> RunState:
     """Runs a scene, or the panoramas of a folder or of a video, into the new run folder `root`, to the end.
 
     The scene may be given by its URL in an object store.
 
     Args: address of a Ray cluster, None for Ray on this machine; pool, where tasks run instead, without Ray;
-    nice, as `cluster.connection.connect`; options, how a scene is made if `source` is none.
+    nice, as `cluster.connection.connect`; options, how a scene is made if `source` is none; wanted, limits of
+    cost and time, with prices.
     Raises InputError for anything that the user must fix, with `root` as it was if that is found before the
     first task, or before there is anything to resume from; RunError if the run failed.
     """
+    budget = (wanted or Wanted()).budget(RunState())
     new = _found(source, config, options or Options())
     new.check_output(root)
     folder = RunFolder(root)
@@ -97,7 +103,7 @@ def start(
         with closing(Database(folder.database)) as database:
             begin = _Beginning(folder, Journal(database, on_change), address, pool, nice, new.scene)
             with end_recorded(begin.journal):
-                begin.take_over(info.config)
+                begin.take_over(info.config, budget)
                 info = begin.prepare(info, new.settings)
                 with begin.workers() as workers:
                     config = begin.preflight(workers, info)
@@ -113,8 +119,9 @@ def resume(
     pool: Pool | None = None,
     nice: int | None = None,
     after: str = "",
+    wanted: Wanted | None = None,
 ) -> RunState:
-    """Resumes a run, to the end; does nothing if it is done.
+    """Resumes a run, to the end; does nothing if it is done, or at a limit that stays as it is.
 
     Args: as `start`; after, why the supervisor resumes it, which becomes a notice.
     Raises InputError if `root` is no run, its scene has changed or is gone, its device is missing or another
@@ -124,15 +131,17 @@ def resume(
     info = run_info.read_info(folder)
     with lock.hold(folder.lock), closing(_opened(folder, info.config)) as database:
         journal = Journal(database, on_change)
-        if journal.state.outcome == Outcome.DONE:
-            return _retained(folder, journal, info.config)
+        budget = (wanted or Wanted()).budget(journal.state)
+        if _is_over(journal.state, budget):
+            done = journal.state.outcome == Outcome.DONE
+            return _retained(folder, journal, info.config) if done else journal.state
         settings = read_settings(folder) if info.scene.fingerprint == run_info.PENDING else None
         scene = None if settings else scene_of(info, folder)
         remove_partial(root)
         prepared = journal.state.prepared
         begin = _Beginning(folder, journal, address, pool, nice, scene)
         with end_recorded(journal):
-            begin.take_over(info.config, resumed=True)
+            begin.take_over(info.config, budget, resumed=True)
             if after:
                 journal.record([Noticed(None, f"resumed by the supervisor after: {after}")])
             info = begin.prepare(info, settings)
@@ -143,6 +152,14 @@ def resume(
                 else:
                     config = begin.preflight(workers, info)
                 return begin.drive(workers, config)
+
+
+def _is_over(state: RunState, budget: BudgetSet | None) -> bool:
+    """Whether a driver would have nothing to do. Args: budget, another than before, if there is one."""
+    if state.outcome != Outcome.LIMITED:
+        return state.outcome == Outcome.DONE
+    before = state.money.budget or BudgetSet()
+    return budget is None or (budget.max_cost, budget.deadline) == (before.max_cost, before.deadline)
 
 
 def _opened(folder: RunFolder, config: RunConfig) -> Database:
@@ -235,12 +252,13 @@ class _Beginning:
         self.journal.until_done(lambda: run_info.write_info(self.folder, info))
         return info
 
-    def take_over(self, config: RunConfig, *, resumed: bool = False) -> None:
+    def take_over(self, config: RunConfig, budget: BudgetSet | None, *, resumed: bool = False) -> None:
         """Makes this the run's driver, which takes requests and from now on waits for a full disk."""
         presence = Presence(self.folder.presence)
         self.journal.patience = Patience(self.folder.root, config.disk.retry, presence)
         began = RunBegan(socket.gethostname(), os.getpid(), resumed, self.journal.state.latest)
-        self.journal.record([began, *control.begin(self.folder)])
+        lost = lost_with_driver(self.journal.state)
+        self.journal.record([*lost, began, *([budget] if budget else []), *control.begin(self.folder)])
 
     @contextmanager
     def workers(self) -> Iterator[Pool]:
@@ -264,6 +282,8 @@ class _Beginning:
         self.journal.until_done(lambda: run_info.write_info(folder, info))
         seconds = {str(stage.name): stage.seconds for stage in found.estimate.stages}
         done = PreflightSaved(folder.relative(folder.preflight), seconds)
+        if budget := self.journal.state.money.budget:
+            require_enough(seconds, budget, workers.nodes())
         self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), done])
         return found.config
 

@@ -125,8 +125,9 @@ class Sizes:
 
     @cached_property
     def _gaussians(self) -> int:
-        """What Stage I came to."""
-        return ply_header(self._job.folder.model(COARSE))[0]
+        """What Stage I came to; where a limit has ended it, what was made of it."""
+        model = self._job.folder.model(COARSE)
+        return ply_header(model if model.exists() else self._job.folder.point_cloud)[0]
 
     @property
     def _cameras(self) -> int:

@@ -7,7 +7,6 @@ import logging
 import math
 import sqlite3
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +17,8 @@ from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.journal import Journal, Patience
 from panolog.orchestrator.driver.machines import Machines
+from panolog.orchestrator.driver.purse import Purse
+from panolog.orchestrator.driver.requests import Requests
 from panolog.orchestrator.driver.results import Deliver, OnPlan, Results
 from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save, tidy
 from panolog.orchestrator.driver.stopping import Stop
@@ -28,16 +29,15 @@ from panolog.orchestrator.resources.delivery import Large, payload
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
 from panolog.orchestrator.resources.usage import Usage
-from panolog.orchestrator.run import control
 from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.orchestrator.run.folder import command_line
+from panolog.orchestrator.run.money_records import BudgetReached
 from panolog.orchestrator.run.presence import Presence
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
     Delivered,
     Failure,
     ModelSaved,
-    Noticed,
     Outcome,
     Record,
     RunEnded,
@@ -116,10 +116,11 @@ class Driver:
         self._sizes = Sizes(job)
         self._presence = Presence(job.folder.presence)
         retry = job.config.disk.retry
-        journal.patience = Patience(job.folder.root, retry, self._presence, self._poll)
+        self._requests = Requests(job.folder, journal, self._stop)
+        journal.patience = Patience(job.folder.root, retry, self._presence, self._requests.poll)
         self._writers = Writers(self._save, journal, retry, clock)
-        self._requests: list[control.ControlRequest | Noticed] = []  # of users, not yet carried out
         self._machines = Machines(pool, journal, job.config, clock)
+        self._purse = Purse(journal, clock)
         self._nodes: tuple[Node, ...] = ()
         self._usages = Usages(job.folder, journal.database, clock)
         self._wrong: InputError | None = None  # what a worker has found
@@ -175,29 +176,27 @@ class Driver:
             if self._stop.requested:
                 self._wind_down()
                 raise KeyboardInterrupt
+            if (
+                reached := self._purse.reached(self._writers.expected(self._state, self._attempts))
+            ) is not None:
+                self._end_training(reached)
         return end
 
-    def _poll(self) -> None:
-        """While the disk takes nothing: only a request to stop is carried out, at once."""
-        with suppress(OSError):
-            self._requests += control.take(self._job.folder)
-        if control.ControlRequest(control.Action.STOP) in self._requests:
-            self._stop.requested = True
-        if self._stop.requested:
-            raise KeyboardInterrupt
+    def _end_training(self, reached: BudgetReached) -> None:
+        """Ends all tasks with fresh checkpoints: what follows is made of what there is."""
+        self._wind_down()
+        started = [task for task in self._attempts if self._state.status(task) == Status.RUNNING]
+        for task in self._attempts:
+            self._pool.cancel(task)
+            self._writers.forget(task)
+        self._attempts.clear()
+        measures = 0 if self._state.plan else len(self._later.measures)
+        self._journal.record([*map(TaskYielded, started), replace(reached, measures=measures)])
+        self._news = True
 
     def _take_requests(self) -> None:
         """Carries out what users have requested through the run folder."""
-        self._requests += self._journal.until_done(lambda: control.take(self._job.folder))
-        while self._requests:
-            request = self._requests.pop(0)
-            if isinstance(request, Noticed):
-                self._journal.record([request])
-            elif request.action == control.Action.STOP:
-                self._stop.requested = True
-            else:
-                self._journal.record(control.answer(self._state, request))
-                self._news = True
+        self._news = self._requests.carry_out() or self._news
         for task, attempt in list(self._attempts.items()):
             leaves = bool(self._machines.leaves(attempt.placement.node))
             if leaves and not attempt.ready:  # it has not begun: nothing is lost
@@ -215,6 +214,7 @@ class Driver:
 
     def _next(self) -> tuple[Outcome, str] | None:
         """Starts what can start, if anything has happened. Returns how the run has ended, if it has."""
+        self._purse.see(self._pool.nodes())
         there, changed = self._machines.review()
         nodes, job = tuple(there), self._job
         self._news = self._news or changed
@@ -303,7 +303,7 @@ class Driver:
                 records += self._take(task)
             records += self._end_overdue()
         finally:
-            self._journal.record(records)
+            self._journal.record(self._purse.with_lost(records))
         if not ready and not records and self._writers.busy:
             self._writers.wait(_TURN_S)
 

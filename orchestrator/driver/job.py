@@ -214,7 +214,7 @@ class Specs:
     def _measure(self, task: TaskId) -> EvaluateSpec:
         """A shard of the evaluation, with levels of detail as fine as no metric shows."""
         job, folder, (views, faces) = self._job, self._job.folder, self.measures[task.number]
-        looks = Looks.of(job.scene, self.plan, faces)
+        looks = Looks.of(job.scene, self.plan, faces) if faces else Looks({}, {})
         models = {folder.seen(task): folder.point_cloud}
         if faces:
             models[folder.seen_coarse(task)] = folder.model(COARSE)
@@ -232,7 +232,8 @@ class Specs:
     def faces(self) -> tuple[Plane, ...]:
         """Those whose seams are measured."""
         config = self._job.config
-        return most_seen(self.plan, self._seams, config.eval.seams) if config.refine else ()
+        planned = config.refine and self._job.folder.plan.exists()  # a run that has ended early may have none
+        return most_seen(self.plan, self._seams, config.eval.seams) if planned else ()
 
     @cached_property
     def measures(self) -> tuple[tuple[tuple[int, ...], tuple[Plane, ...]], ...]:

@@ -23,7 +23,7 @@ import torch
 from panolog.orchestrator.resources.delivery import announced
 from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.leaving import LeaveNotice
-from panolog.orchestrator.resources.machine import cores, memory, oom_kills
+from panolog.orchestrator.resources.machine import cores, instance_type, memory, oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message, guarded
 from panolog.orchestrator.resources.usage import with_usage
@@ -52,7 +52,7 @@ class LocalPool(InProcess):
 
     def __init__(self) -> None:
         gpus = describe_gpus(torch.cuda.device_count())
-        self._node = Node("local", socket.gethostname(), cores(), memory(), gpus)
+        self._node = Node("local", socket.gethostname(), cores(), memory(), gpus, instance_type())
         self._watch = Watch()
         self._running: dict[TaskId, _Task] = {}
 

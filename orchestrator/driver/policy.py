@@ -1,11 +1,12 @@
 """What a run does next, and what follows a failure: pure functions of a `RunState`."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypedDict
 
 from panolog.orchestrator.run.records import Failure, Outcome
 from panolog.orchestrator.run.state import RunState, Status, TaskState
-from panolog.workers.tasks import COARSE, DELIVER, EVAL, MERGE, PLAN, TaskId
+from panolog.workers.tasks import COARSE, DELIVER, EVAL, MERGE, PLAN, Stage, TaskId
 
 
 class Stages(TypedDict):
@@ -29,14 +30,15 @@ def ready(
     Stage I, of several `districts` each apart and then their union, scoring in `shards` parts, the plan, the
     blocks longest first, their union and what trains once more in it, the merge, the evaluation, perhaps in
     shards and then as one, and the delivery: each waits for all before it. A block that has failed for good
-    holds no stage up, one that is paused does. Without `refine` the merge follows Stage I.
+    holds no stage up, one that is paused does. Without `refine` the merge follows Stage I. Where a limit has
+    ended the training, the merge follows at once, if there is anything to merge.
     """
-    stages: list[tuple[TaskId, ...]] = [(COARSE,)]
-    if districts > 1:
-        stages.insert(0, tuple(map(TaskId.district, range(districts))))
-    if refine:
-        stages += [tuple(map(TaskId.shard, range(shards))), (PLAN,), block_order(state)]
-        stages += state.between
+    stages: list[tuple[TaskId, ...]] = []
+    if state.money.reached is not None:
+        if not _trained(state):
+            return ()
+    else:
+        stages = list(_training(state, shards=shards, refine=refine, districts=districts))
     stages += [(MERGE,), state.measures, (EVAL,), *([(DELIVER,)] if deliver else [])]
     for tasks in stages:
         waiting = tuple(task for task in tasks if state.status(task) == Status.WAITING)
@@ -44,6 +46,22 @@ def ready(
         if waiting or unfinished:
             return waiting
     return ()
+
+
+def _training(state: RunState, *, shards: int, refine: bool, districts: int) -> Iterator[tuple[TaskId, ...]]:
+    """The stages before the merge."""
+    if districts > 1:
+        yield tuple(map(TaskId.district, range(districts)))
+    yield (COARSE,)
+    if refine:
+        yield from (tuple(map(TaskId.shard, range(shards))), (PLAN,), block_order(state))
+        yield from state.between
+
+
+def _trained(state: RunState) -> bool:
+    """Whether Stage I has come to anything: a model, or a checkpoint of one."""
+    first = [task for task in state.tasks.values() if task.id.stage in (Stage.DISTRICT, Stage.COARSE)]
+    return any(task.status == Status.DONE or task.checkpoint is not None for task in first)
 
 
 def block_order(state: RunState) -> tuple[TaskId, ...]:
@@ -64,9 +82,13 @@ def outcome(
     for task in state.tasks.values():
         if task.status == Status.FAILED and not task.id.stage.refines:
             return Outcome.FAILED, f"{task.id} failed: {task.reasons[-1]}"
-    unfinished = any(task.status in (Status.RUNNING, Status.PAUSED) for task in state.tasks.values())
+    reached = state.money.reached
+    held = (Status.RUNNING,) if reached else (Status.RUNNING, Status.PAUSED)
+    unfinished = any(task.status in held for task in state.tasks.values())
     if unfinished or ready(state, shards=shards, refine=refine, districts=districts, deliver=deliver):
         return None
+    if reached is not None:
+        return Outcome.LIMITED, reached.reason
     failed = state.failed_blocks()
     if failed:
         names = ", ".join(map(str, failed[:_NAMED]))

@@ -8,12 +8,20 @@ from numpy.typing import NDArray
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.saving import remove_checkpoints
 from panolog.orchestrator.run.records import EvaluationSaved, Noticed, Record
-from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.stages.evaluation import Evaluation
-from panolog.orchestrator.stages.merging import copy_coarse, join_districts, merge_run, unite_blocks
+from panolog.orchestrator.stages.merging import (
+    Early,
+    copy_coarse,
+    join_districts,
+    merge_run,
+    merge_unfinished,
+    unite_blocks,
+)
 from panolog.orchestrator.stages.partitioning import decide_plan, join_scores, plan_records, write_plan
+from panolog.partition.cells import Volume
 from panolog.partition.plan import Plan
-from panolog.workers.tasks import EVAL, Stage, TaskId
+from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 
 OnPlan = Callable[[Plan, NDArray[np.float32]], None]
 Deliver = Callable[[Job], list[Record]]
@@ -83,10 +91,18 @@ class Results:
         return [unite_blocks(folder, state, self._specs.plan, task)]
 
     def _merge(self, state: RunState) -> list[Record]:
-        folder = self._job.folder
-        if not self._job.config.refine:
+        job, folder = self._job, self._job.folder
+        if state.status(COARSE) != Status.DONE:
+            parts: list[tuple[TaskId, Volume | None]] = [(COARSE, None)]
+            if (districts := job.districts) is not None:
+                parts = [(TaskId.district(i), districts.cell(i)) for i in range(districts.count)]
+            return merge_unfinished(folder, state, job.scene, parts)
+        if not job.config.refine or state.plan is None:
             return [copy_coarse(folder)]
-        return [merge_run(folder, state, self._specs.plan, self._specs.repaired)]
+        early = None
+        if state.money.reached is not None:
+            early = Early(job.scene, job.config.densify.prune_opacity, job.config.iterations)
+        return [merge_run(folder, state, self._specs.plan, self._specs.repaired, early)]
 
     def _join(self, state: RunState) -> list[Record]:
         """The evaluation from its shards."""

@@ -128,7 +128,7 @@ def _restored(folder: RunFolder, task: TaskId) -> int | None:
 def remove_checkpoints(folder: RunFolder, task: TaskId) -> None:
     """Removes what a task needed until it was done, and what its attempts have left. Raises OSError."""
     path = folder.checkpoint(task)
-    for file in (path, *folder.earlier_checkpoints(task)):
+    for file in (path, *folder.earlier_checkpoints(task), folder.early(task)):
         file.unlink(missing_ok=True)
     if task.stage.refines:
         folder.initial(task).unlink(missing_ok=True)

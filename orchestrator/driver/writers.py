@@ -125,10 +125,14 @@ class Writers:
         self._seconds += seconds
 
     def grace(self, state: RunState, tasks: Iterable[TaskId]) -> float:
-        """Seconds in which tasks that train should have saved a checkpoint, at the rate measured so far."""
+        """Seconds in which tasks that train must have saved a checkpoint, and those that a slow one gets."""
+        return GRACE_S + self.expected(state, tasks)
+
+    def expected(self, state: RunState, tasks: Iterable[TaskId]) -> float:
+        """Seconds in which they save a checkpoint at the rate measured so far."""
         progress = [state.task(task).progress for task in tasks]
         size = CHECKPOINT * sum(p.gaussians or 0 for p in progress if p is not None)
-        return GRACE_S + size * (self._seconds / self._bytes if self._bytes else 1 / _UNMEASURED)
+        return size * (self._seconds / self._bytes if self._bytes else 1 / _UNMEASURED)
 
     def _write(self, event: Checkpoint | Trained) -> tuple[Record, float]:
         began = self._clock.monotonic()

@@ -1,6 +1,7 @@
 """What this machine has, without importing torch or Ray."""
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
@@ -10,6 +11,9 @@ import psutil
 _MOUNT = Path("/sys/fs/cgroup")  # of control groups: containers and services limit what their processes use
 _OWN = Path("/proc/self/cgroup")  # lines "0::/group", of version 1 "4:memory:/group"
 _VMSTAT = Path("/proc/vmstat")
+_PRODUCT = Path("/sys/class/dmi/id/product_name")  # on AWS the instance type
+_TYPE = re.compile(r"[a-z][a-z0-9-]*\.[a-z0-9-]+")  # other product names say nothing: "Standard PC", "KVM"
+_INSTANCE = "PANOLOG_INSTANCE"  # the variable that names it where that does not
 
 
 def groups(controller: str, mount: Path = _MOUNT, own: Path = _OWN) -> Iterator[Path]:
@@ -62,6 +66,16 @@ def _limits(mount: Path, own: Path) -> Iterator[tuple[Path, int]]:
         limit = _read(group / "memory.max") or _read(group / "memory.limit_in_bytes")
         if limit.isdecimal():  # not "max", and not "" = no such file
             yield group, int(limit)
+
+
+def instance_type(product: Path = _PRODUCT) -> str:
+    """The type of this machine as its provider calls it, such as g5.xlarge; "" if that cannot be seen."""
+    given = os.environ.get(_INSTANCE, "").strip()
+    try:
+        named = given or product.read_text().strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
+    return named if given or _TYPE.fullmatch(named) else ""
 
 
 def memory_of(title: str) -> int:

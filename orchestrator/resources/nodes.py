@@ -21,6 +21,8 @@ class Node:
     cpus: int
     memory: int  # bytes that were free, or held by workers of the run
     gpus: tuple[Gpu, ...] = ()
+    instance: str = ""  # its type, as its provider calls it; "" if it does not say
+    labels: tuple[tuple[str, str], ...] = ()  # Ray's, and its resources of the user's own
 
     @property
     def unequal(self) -> bool:

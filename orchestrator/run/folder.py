@@ -224,6 +224,10 @@ class RunFolder:
         """The Stage I Gaussians of a block that is not trained."""
         return self.of(TaskId.block(block)) / "stage1.ply"
 
+    def early(self, task: TaskId) -> Path:
+        """The model in the last checkpoint of a task that a limit has ended."""
+        return self.of(task) / "early.ply"
+
     def shard(self, task: TaskId) -> Path:
         """What one shard has come to: scores, or what an evaluation has measured."""
         if task.stage is Stage.MEASURE:

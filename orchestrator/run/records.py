@@ -6,6 +6,7 @@ names are in place. Nothing here imports torch or Ray, so that commands that rea
 
 from dataclasses import dataclass, field
 
+from panolog.orchestrator.run.money_records import OfMoney
 from panolog.workers.tasks import CALIBRATE, DELIVER, EVAL, MERGE, PLAN, StrEnum, TaskId
 
 
@@ -34,6 +35,7 @@ class Outcome(StrEnum):
     DONE = "done"
     FAILED = "failed"
     INTERRUPTED = "interrupted"
+    LIMITED = "limited"  # a limit of cost or time has ended its training early; the rest is done
 
 
 class Part(StrEnum):
@@ -379,7 +381,7 @@ OfAttempt = TaskStarted | Progressed | PreviewSaved | CheckpointSaved | Transfer
 Result = ModelSaved | ScoresSaved | PlanSaved | Merged | MeasuresSaved | EvaluationSaved | Delivered
 Request = StopRequested | PauseRequested | UnpauseRequested | RetryRequested
 OfNode = NodeQuarantined | NodeReleased | NodeLeaving | NodeStaying | NodeLeft
-Record = OfDriver | OfAttempt | Result | ViewEvaluated | SeamEvaluated | Noticed | Request | OfNode
+Record = OfDriver | OfAttempt | Result | ViewEvaluated | SeamEvaluated | Noticed | Request | OfNode | OfMoney
 
 
 @dataclass(frozen=True)

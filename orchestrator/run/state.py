@@ -6,6 +6,7 @@ from typing import Any
 
 from typing_extensions import assert_never
 
+from panolog.orchestrator.run.money_records import BudgetReached, BudgetSet
 from panolog.orchestrator.run.nodes import Nodes, NodeState, by_host, follow, leave_text, take_over
 from panolog.orchestrator.run.records import (
     BlockPlan,
@@ -17,11 +18,9 @@ from panolog.orchestrator.run.records import (
     Merged,
     ModelSaved,
     NodeLeaving,
-    NodeLeft,
     NodeQuarantined,
-    NodeReleased,
-    NodeStaying,
     Noticed,
+    OfAttempt,
     Outcome,
     Part,
     PauseRequested,
@@ -31,13 +30,14 @@ from panolog.orchestrator.run.records import (
     PreviewSaved,
     Progressed,
     Record,
+    Request,
+    Result,
     RetryRequested,
     RunBegan,
     RunContinued,
     RunEnded,
     RunWaiting,
     ScoresSaved,
-    SeamEvaluated,
     StopRequested,
     Stored,
     TaskFailed,
@@ -45,8 +45,8 @@ from panolog.orchestrator.run.records import (
     TaskYielded,
     Transferred,
     UnpauseRequested,
-    ViewEvaluated,
 )
+from panolog.orchestrator.run.spending import Spending, spend
 from panolog.workers.tasks import DELIVER, EVAL, MERGE, Stage, StrEnum, TaskId
 
 
@@ -70,6 +70,7 @@ class TaskState:
     retries: int = 0  # attempts that failed and were repeated, by any driver
     reasons: tuple[str, ...] = ()  # why attempts failed
     checkpoint: int | None = None  # iteration of the last one on disk
+    saved: float | None = None  # seconds since the epoch: when that was
     node: str = ""  # host of its latest attempt
     node_id: str = ""  # Node.id of the same
     progress: Progressed | None = None  # the latest
@@ -121,6 +122,7 @@ class RunState:
     waiting: str = ""  # why the run waits for its disk; "" if it does not
     estimate: dict[str, float | None] | None = None  # `PreflightSaved.seconds`
     nodes: Nodes = field(default_factory=dict)
+    money: Spending = field(default_factory=Spending)
 
     @property
     def prepared(self) -> bool:
@@ -171,6 +173,7 @@ class RunState:
         return tuple(b.block for b in self.plan or () if self.task(TaskId.block(b.block)).held)
 
 
+OfTask = OfAttempt | Result | Request
 OnChange = Callable[[RunState, Sequence[Stored]], None]  # called with each change of state and what is new
 
 
@@ -211,8 +214,8 @@ def _apply(state: RunState, stored: Stored) -> RunState:
         case RunWaiting() | RunContinued():
             state = replace(state, waiting=record.reason if isinstance(record, RunWaiting) else "")
         case RunEnded():
-            state = replace(state, outcome=record.outcome, reason=record.reason, transient=record.transient)
-            state = replace(state, waiting="", ended=stored.time)
+            state = replace(state, outcome=record.outcome, reason=record.reason, waiting="")
+            state = replace(state, transient=record.transient, ended=stored.time)
         case Noticed():
             state.notices[record] = None  # a task that is taken up again repeats its notices
         case PlanSaved():
@@ -225,8 +228,8 @@ def _apply(state: RunState, stored: Stored) -> RunState:
             state = replace(state, merged=record)
         case EvaluationSaved():
             state = replace(state, metrics=record.metrics)
-    state = _with_nodes(state, record, stored.time)
-    if isinstance(record.task, TaskId):
+    state = _with_money(_with_nodes(state, record, stored.time), stored)
+    if isinstance(record, OfTask) and record.task is not None:
         task = state.task(record.task)
         changes = _changes(task, record, stored.time)
         if changes:
@@ -235,7 +238,20 @@ def _apply(state: RunState, stored: Stored) -> RunState:
     return state
 
 
-def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
+def _with_money(state: RunState, stored: Stored) -> RunState:
+    """What a record changes of costs and limits; with another limit what had ended early is made anew."""
+    money = spend(state.money, stored)
+    if money is state.money:
+        return state
+    if isinstance(stored.record, BudgetReached) and state.plan is None:
+        state = replace(state, measures=tuple(map(TaskId.measure, range(stored.record.measures))))
+    if isinstance(stored.record, BudgetSet) and state.money.reached is not None:
+        state = _without(state, {MERGE, EVAL, DELIVER, *state.measures})
+        state = replace(state, measures=state.measures if state.plan else ())
+    return replace(state, money=money)
+
+
+def _changes(task: TaskState, record: OfTask, time: float) -> dict[str, Any]:
     """What a record of some time changes in its own task."""
     changes: dict[str, Any] = {}
     match record:
@@ -252,7 +268,8 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
         case Progressed():
             changes = {"progress": record}
         case CheckpointSaved():
-            changes = {"checkpoint": record.iteration, "failures": ()} | dict.fromkeys(_IN_A_ROW, 0)
+            changes = {"checkpoint": record.iteration, "saved": time, "failures": ()}
+            changes |= dict.fromkeys(_IN_A_ROW, 0)
         case ModelSaved():
             changes = {
                 "status": Status.DONE,
@@ -271,24 +288,7 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
             changes = _end(task, record) | {"spent": task.spent + _attempt(task, time)}
         case PauseRequested() | UnpauseRequested() | RetryRequested():
             changes = _request(task, record)
-        case (
-            RunBegan()
-            | RunEnded()
-            | RunWaiting()
-            | RunContinued()
-            | Preparing()
-            | PreflightSaved()
-            | StopRequested()
-            | Noticed()
-            | PreviewSaved()
-            | ViewEvaluated()
-            | SeamEvaluated()
-            | NodeQuarantined()
-            | NodeReleased()
-            | NodeLeaving()
-            | NodeStaying()
-            | NodeLeft()
-        ):
+        case PreviewSaved() | StopRequested():
             pass
         case _:
             assert_never(record)
@@ -393,7 +393,9 @@ def _interrupted(task: TaskState, time: float | None) -> TaskState:
 def _outdate(state: RunState, task: TaskId) -> RunState:
     """A new model makes what was made of older ones worthless: unions, what trained on, the merge."""
     follow = {EVAL, DELIVER, *state.measures, *(id for stage in state.following(task) for id in stage)}
-    if state.tasks.keys().isdisjoint(follow):
-        return state
-    tasks = {id: task for id, task in state.tasks.items() if id not in follow}
-    return replace(state, tasks=tasks, merged=None, metrics=None)
+    return state if state.tasks.keys().isdisjoint(follow) else _without(state, follow)
+
+
+def _without(state: RunState, tasks: set[TaskId]) -> RunState:
+    kept = {id: task for id, task in state.tasks.items() if id not in tasks}
+    return replace(state, tasks=kept, merged=None, metrics=None)

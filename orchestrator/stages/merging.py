@@ -2,13 +2,14 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import Merged, ModelSaved
+from panolog.orchestrator.run.records import Merged, ModelSaved, Noticed, Record
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.stages.scenes import save_captured
 from panolog.partition.cells import Volume
@@ -28,17 +29,37 @@ from panolog.scene.ply import (
 )
 from panolog.workers.capture.captured import Captured, joined
 from panolog.workers.merge import merge, retained
-from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.tasks import COARSE, MERGE, TaskId
+from panolog.workers.training.saved_model import SavedModel
+
+_TRAINED = 0.5  # of its iterations from which on a block's checkpoint is used: see `benchmarks.early_end`
 
 
-def merge_run(folder: RunFolder, state: RunState, plan: Plan, near: Regions) -> Merged:
+@dataclass(frozen=True, eq=False)
+class Early:
+    """How a run merges that a limit has ended early."""
+
+    scene: Scene
+    least: float  # opacity of what a block keeps
+    iterations: int  # that a block was to train for
+
+    def uses(self, folder: RunFolder, state: RunState, task: TaskId) -> bool:
+        """Whether a block that has not ended is taken from its checkpoint, and not from Stage I."""
+        done = state.task(task).checkpoint or 0
+        return done >= _TRAINED * self.iterations and folder.checkpoint(task).exists()
+
+
+def merge_run(
+    folder: RunFolder, state: RunState, plan: Plan, near: Regions, early: Early | None = None
+) -> Merged:
     """Writes the merged model: every block as trained or else as Stage I left it, then the sky (eq. 13).
 
-    Args: near, what is near faces: where that was repaired, it is taken from there.
+    Args: near, what is near faces: where that was repaired, it is taken from there; early, of a run that a
+    limit has ended: which blocks are taken from their checkpoints.
     Raises OSError, InputError or RunError if that fails.
     """
     started = time.monotonic()
-    parts, faces = _block_plys(folder, state, plan), range(len(near.faces))
+    parts, faces = _block_plys(folder, state, plan, early), range(len(near.faces))
     repaired = [face for face in faces if state.status(TaskId.repair(face)) == Status.DONE]
     if repaired:
         _merge_repaired(folder, parts, near, repaired)
@@ -109,6 +130,56 @@ def _mean(skies: Sequence[Gaussians]) -> Gaussians:
     return skies[0].with_tensors(means, sky=most)
 
 
+def merge_unfinished(
+    folder: RunFolder, state: RunState, scene: Scene, tasks: Sequence[tuple[TaskId, Volume | None]]
+) -> list[Record]:
+    """Writes a model of a Stage I that a limit has ended: of each task its model, or its last checkpoint.
+
+    Args: tasks of Stage I, each with the cell that it keeps, None = all. Of districts that have neither, a
+    notice says that the model has nothing there. Raises as `merge_run`.
+    """
+    started, found = time.monotonic(), list[tuple[Path, Volume | None]]()
+    for task, cell in tasks:
+        if state.status(task) == Status.DONE:
+            found.append((folder.model(task), cell))
+        elif folder.checkpoint(task).exists():
+            found.append((write_saved(folder, task, scene), cell))
+    skies = [read_sky(path) for path, _ in found]
+    sky = skies[0] if len(skies) == 1 else _mean(skies)
+
+    def parts() -> Iterator[Gaussians]:
+        for path, cell in found:
+            for piece in read_ply_chunks(path):
+                scenery = piece.select(torch.arange(len(piece)) < piece.scene.stop)
+                yield scenery if cell is None else retained(scenery, cell, 0.0)
+        yield sky
+
+    _write(folder.point_cloud, parts, len(sky), found[0][0])
+    missing = len(tasks) - len(found)
+    what = f"{missing} of {len(tasks)} districts were not begun: the model has nothing there"
+    return [*([Noticed(MERGE, what)] if missing else []), _merged(folder, started)]
+
+
+def write_saved(
+    folder: RunFolder, task: TaskId, scene: Scene, cell: Volume | None = None, least: float = 0.0
+) -> Path:
+    """Writes the model in the checkpoint of a task as a PLY, and returns its path.
+
+    Args: scene of the run; cell, of which alone the Gaussians are kept, without sky; least opacity of these.
+    Raises OSError or RunError if that fails.
+    """
+    path, saved = folder.early(task), SavedModel(folder.checkpoint(task))
+
+    def parts() -> Iterator[Gaussians]:
+        for piece in saved.pieces():
+            yield piece if cell is None else retained(piece, cell, least)
+
+    count = sum(map(len, parts()))
+    sky = saved.sky if cell is None else 0
+    write_ply_parts(path, parts(), count=count, sky=sky, offset=scene.offset, exact=saved.exact)
+    return path
+
+
 def copy_coarse(folder: RunFolder) -> Merged:
     """Without refinement the Stage I model is the final one. Raises OSError if it cannot be written."""
     started = time.monotonic()
@@ -119,16 +190,18 @@ def copy_coarse(folder: RunFolder) -> Merged:
     return _merged(folder, started)
 
 
-def _block_plys(folder: RunFolder, state: RunState, plan: Plan) -> list[Path]:
+def _block_plys(folder: RunFolder, state: RunState, plan: Plan, early: Early | None = None) -> list[Path]:
     """The files of all blocks that have Gaussians."""
-    return [_block_ply(folder, state, plan, int(block)) for block in np.flatnonzero(plan.gaussians)]
+    return [_block_ply(folder, state, plan, int(block), early) for block in np.flatnonzero(plan.gaussians)]
 
 
-def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int) -> Path:
+def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int, early: Early | None) -> Path:
     """The latest file of a block; made from the Stage I model if the block was not trained, or in vain."""
     for task in (TaskId.round(block), TaskId.block(block)):
         if state.status(task) == Status.DONE:
             return folder.model(task)
+    if early is not None and early.uses(folder, state, task):
+        return write_saved(folder, task, early.scene, plan.cell(block), early.least)
     coarse, cell, path = folder.model(COARSE), plan.cell(block), folder.kept(block)
     _write(path, lambda: _kept(coarse, cell), 0, coarse)
     return path

@@ -220,7 +220,7 @@ class Harness:
         self.pool, self.stop = FakePool(script, self.nodes), Stop()
         with closing(Database(self.folder.database, self.clock)) as database:
             database.append([RunBegan("host", 1, resumed)])
-            journal, hooks = Journal(database), Hooks(self._draw, deliver)
+            journal, hooks = Journal(database, clock=self.clock), Hooks(self._draw, deliver)
             return Driver(self.job, journal, self.pool, hooks, self.stop, self.clock).run()
 
     def _draw(self, plan: Plan, means: NDArray[np.float32]) -> None:

@@ -11,10 +11,10 @@ from panolog.renderer.adam import adam_
 from panolog.renderer.cuda.parts import Update
 from panolog.scene.gaussians import Gaussians
 
-_MOMENT = "exp_avg."  # in `ModelState.tensors`, before the name of a parameter
+MOMENT = "exp_avg."  # in `ModelState.tensors`, before the name of a parameter
 AVERAGE = "average."  # before the names of what `Average.tensors` has
 _COUNT = f"{AVERAGE}count"
-_EXACT = "exact"  # in them where `Gaussians.exact`
+EXACT = "exact"  # in them where `Gaussians.exact`
 
 
 @dataclass(eq=False)
@@ -35,21 +35,21 @@ class ModelState:
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> "ModelState":
         """The inverse of `tensors`, sharing memory: steps change the tensors in place."""
-        names = [name.removeprefix(_MOMENT) for name in tensors if name.startswith(_MOMENT)]
-        exact = _EXACT in tensors
+        names = [name.removeprefix(MOMENT) for name in tensors if name.startswith(MOMENT)]
+        exact = EXACT in tensors
         return ModelState(
             Gaussians(**{name: tensors[name] for name in names}, sky=int(tensors["sky"]), exact=exact),
-            {name: tensors[f"{_MOMENT}{name}"] for name in names},
+            {name: tensors[f"{MOMENT}{name}"] for name in names},
             {name: tensors[f"exp_avg_sq.{name}"] for name in names},
         )
 
     def tensors(self) -> dict[str, Tensor]:
         """Parameters, moments and the number of sky Gaussians by name, sharing memory."""
-        moments = {f"{_MOMENT}{name}": tensor for name, tensor in self.exp_avg.items()}
+        moments = {f"{MOMENT}{name}": tensor for name, tensor in self.exp_avg.items()}
         moments |= {f"exp_avg_sq.{name}": tensor for name, tensor in self.exp_avg_sq.items()}
         moments["sky"] = torch.tensor(self.gaussians.sky)
         if self.gaussians.exact:
-            moments[_EXACT] = torch.tensor(1)
+            moments[EXACT] = torch.tensor(1)
         return {**self.gaussians.tensors(), **moments}
 
     def leaves(self, sh_degree: int) -> Gaussians:

@@ -168,7 +168,7 @@ def test_what_workers_of_the_run_hold_counts_as_free(pool: RayPool) -> None:
     hello, _ = next(running), next(running)
     assert isinstance(hello, Hello)
     name = psutil.Process(hello.pid).cmdline()[0].removeprefix("ray::")
-    usable, _ = describe(0, name)
+    usable, *_ = describe(0, name)
     assert usable > memory() + 2**28
     pool.cancel(TASK)
 

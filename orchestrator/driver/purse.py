@@ -1,0 +1,161 @@
+"""The money and the time of a run: what it reserves and loses, and when a limit ends its training early.
+
+The driver foresees what follows the training: last checkpoints, merge, evaluation and delivery. It ends the
+training when what is left of a limit is just enough for these. What decides that is a pure function of the
+state and the time.
+"""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+from panolog.orchestrator.driver.journal import Journal
+from panolog.orchestrator.money import prices
+from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.run.clock import Clock
+from panolog.orchestrator.run.money_records import (
+    BudgetNear,
+    BudgetReached,
+    BudgetSet,
+    NodeReturned,
+    OfMoney,
+    WorkLost,
+)
+from panolog.orchestrator.run.records import Record, TaskFailed
+from panolog.orchestrator.run.state import RunState, Status, TaskState
+from panolog.orchestrator.run.units import duration
+from panolog.scene.errors import ConfigError
+from panolog.workers.tasks import MERGE, Stage
+
+_AFTER = (Stage.MERGE, Stage.MEASURE, Stage.EVAL, Stage.DELIVER)  # the stages after the training
+_UNSURE = 1.2  # times what is estimated of these: estimates of them were up to a fifth too low
+_TURN_S = 2.0  # in which tasks take note of a stop, and the driver of their end
+_NEAR = 0.8  # of a limit, from which on people are warned
+
+
+@dataclass(frozen=True)
+class _Limit:
+    """One limit of a run at a moment, in its own unit."""
+
+    name: str  # for people, with its value
+    allowed: float
+    used: float
+    needed: float  # for what follows the training
+    text: str  # what is used and needed, for people
+
+
+def after_training(estimate: Mapping[str, float | None] | None) -> float:
+    """Seconds that merge, evaluation and delivery are expected to take; of an unknown part, none.
+
+    Args: estimate, `PreflightSaved.seconds`.
+    """
+    return sum((estimate or {}).get(stage) or 0.0 for stage in _AFTER)
+
+
+def verdict(state: RunState, now: float, saving: float) -> BudgetNear | BudgetReached | None:
+    """Whether a limit ends the training now, or is near; None if neither is new.
+
+    Args: now, seconds since the epoch; saving, seconds in which the tasks that train save a checkpoint.
+    """
+    money = state.money
+    if money.budget is None or money.reached is not None or state.status(MERGE) == Status.DONE:
+        return None
+    limits = _limits(state, money.budget, now, _UNSURE * after_training(state.estimate) + saving + _TURN_S)
+    for limit in limits:
+        if limit.used + limit.needed >= limit.allowed:
+            return BudgetReached(f"{limit.name} is reached: {limit.text}")
+    near = [limit for limit in limits if limit.used >= _NEAR * limit.allowed]
+    if near and money.near is None:
+        return BudgetNear(f"{near[0].name}: {near[0].text}")
+    return None
+
+
+def _limits(state: RunState, budget: BudgetSet, now: float, needed: float) -> list[_Limit]:
+    """Args: needed, seconds for what follows the training."""
+    found, money = list[_Limit](), state.money.until(now)
+    later = "saving, merge, evaluation and delivery need about"
+    if budget.max_cost is not None:
+        used, cost = money.used.cost, money.rate * needed
+        name = f"the limit of {budget.max_cost:g} {money.currency}"
+        text = f"{used:.2f} {money.currency} are used, and {later} {cost:.2f}"
+        found.append(_Limit(name, budget.max_cost, used, cost, text))
+    if budget.deadline is not None and state.money.since is not None:
+        since = min(state.money.since, now)
+        name = f"the deadline {datetime.fromtimestamp(budget.deadline).astimezone():%Y-%m-%d %H:%M:%S}"
+        left = duration(max(0.0, budget.deadline - now))
+        text = f"{left} are left, and {later} {duration(needed)}"
+        found.append(_Limit(name, budget.deadline - since, now - since, needed, text))
+    return found
+
+
+def require_enough(
+    estimate: Mapping[str, float | None], budget: BudgetSet, nodes: Sequence[Node], now: float | None = None
+) -> None:
+    """Raises ConfigError if a new run could not train at all within a budget.
+
+    Args: estimate, as `after_training`; now, seconds since the epoch.
+    """
+    rate = sum(prices.reserved(node, prices.of_record(budget.prices)).price or 0.0 for node in nodes) / 3600
+    needed = _UNSURE * after_training(estimate) + _TURN_S
+    what = f"merge, evaluation and delivery alone need about {duration(needed)}"
+    if budget.max_cost is not None and rate * needed >= budget.max_cost:
+        cost = f"{rate * needed:.2g} {budget.prices.get('currency', '')}"
+        raise ConfigError(f"--max-cost {budget.max_cost:g}: {what}, which cost {cost}; give more")
+    left = math.inf if budget.deadline is None else budget.deadline - (time.time() if now is None else now)
+    if left <= needed:
+        raise ConfigError(f"--deadline: {duration(max(0.0, left))} are left, and {what}; give more")
+
+
+def lost_at(task: TaskState, end: float) -> list[WorkLost]:
+    """What is lost of a task whose attempt ends then, seconds since the epoch, without a checkpoint."""
+    if task.status != Status.RUNNING or task.since is None:
+        return []
+    since = max(task.since, task.saved or task.since)
+    return [WorkLost(task.id, max(0.0, end - since), end)]
+
+
+def lost_with_driver(state: RunState) -> list[WorkLost]:
+    """What the last driver of a run has lost by ending."""
+    end = state.ended or state.latest
+    return [] if end is None else [lost for task in state.tasks.values() for lost in lost_at(task, end)]
+
+
+class Purse:
+    """Keeps the account of a run."""
+
+    def __init__(self, journal: Journal, clock: Clock) -> None:
+        """Raises ConfigError if the run's prices are of another format."""
+        self._journal = journal
+        self._clock = clock
+        self._seen: tuple[Node, ...] = ()
+        budget = journal.state.money.budget
+        self._prices = prices.of_record(budget.prices) if budget else None
+
+    def see(self, nodes: tuple[Node, ...]) -> None:
+        """Records which machines have come and gone."""
+        if nodes == self._seen:
+            return
+        before, now = {node.id for node in self._seen}, {node.id for node in nodes}
+        new = [prices.reserved(node, self._prices) for node in nodes if node.id not in before]
+        records: list[OfMoney] = [*new, *map(NodeReturned, sorted(before - now))]
+        self._seen = nodes
+        self._journal.record(records)
+
+    def reached(self, saving: float) -> BudgetReached | None:
+        """The limit that ends the training now; records that one is near. Args: saving, as `verdict`."""
+        found = verdict(self._journal.state, self._clock.time(), saving)
+        if isinstance(found, BudgetNear):
+            self._journal.record([found])
+            return None
+        return found
+
+    def with_lost(self, records: Sequence[Record]) -> list[Record]:
+        """Records, and before each failure what is lost by it."""
+        state, now, found = self._journal.state, self._clock.time(), list[Record]()
+        for record in records:
+            if isinstance(record, TaskFailed):
+                found += lost_at(state.task(record.task), now)
+            found.append(record)
+        return found

@@ -1,0 +1,1 @@
+"""What machines cost, and how much of it a run may use."""

@@ -1,0 +1,67 @@
+"""The records of what a run costs: machines, work that was lost, and limits of cost and time.
+
+They are a part of `records.Record`, apart from the others because `spending` alone replays them.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from panolog.workers.tasks import TaskId
+
+
+@dataclass(frozen=True)
+class NodeReserved:
+    """A machine is there for the run, whether it works or not."""
+
+    node: str  # Node.id
+    host: str
+    kind: str  # name of its entry in the price list, else its instance type, its GPUs or its cores
+    price: float | None  # currency units per hour; None = not known
+    task: None = None
+
+
+@dataclass(frozen=True)
+class NodeReturned:
+    """A machine is there no longer."""
+
+    node: str  # Node.id
+    task: None = None
+
+
+@dataclass(frozen=True)
+class WorkLost:
+    """What an attempt has done since its last checkpoint has to be done again."""
+
+    task: TaskId
+    seconds: float
+    until: float  # seconds since the epoch at which the attempt ended
+
+
+@dataclass(frozen=True)
+class BudgetSet:
+    """Limits and prices of the run from now on: they replace those before."""
+
+    max_cost: float | None = None  # of all drivers of the run; None = no limit
+    deadline: float | None = None  # seconds since the epoch; None = none
+    prices: dict[str, Any] = field(default_factory=dict)  # a `PriceList`; {} = no prices
+    task: None = None
+
+
+@dataclass(frozen=True)
+class BudgetNear:
+    """Much of what a limit allows is used up."""
+
+    what: str  # for people
+    task: None = None
+
+
+@dataclass(frozen=True)
+class BudgetReached:
+    """The training ends early: what follows is made of what there is."""
+
+    reason: str  # for people: which limit, and what was foreseen
+    measures: int = 0  # shards of the evaluation, where there is no plan; 0 = as the plan says, or one task
+    task: None = None
+
+
+OfMoney = NodeReserved | NodeReturned | WorkLost | BudgetSet | BudgetNear | BudgetReached

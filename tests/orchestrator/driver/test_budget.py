@@ -1,0 +1,245 @@
+"""A driver with limits of cost and time, by a clock that the test sets."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from panolog.orchestrator.driver.purse import lost_with_driver, require_enough
+from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.run.money_records import BudgetNear, BudgetReached, BudgetSet, WorkLost
+from panolog.orchestrator.run.records import (
+    Outcome,
+    PreflightSaved,
+    RunBegan,
+)
+from panolog.orchestrator.run.state import RunState, Status
+from panolog.orchestrator.run.store import Database
+from panolog.scene.errors import ConfigError
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.ply import read_ply
+from panolog.workers.events import Checkpoint, Event, Progress
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import COARSE, EVAL, MERGE, TaskId
+from panolog.workers.training.optimizer import ModelState
+from panolog.workers.training.trainer import TrainSpec
+from tests.orchestrator.fakes import DIED, MACHINE, CrashError, Harness, SetClock, trained, well
+
+PRICES = {"currency": "USD", "machine": [{"name": "any", "price": 3600.0, "host": "*"}]}  # 1 USD per second
+AFTER = {"merge": 1.0, "eval": 5.0, "deliver": 4.0}  # seconds: 12 with what is unsure of them
+BLOCK = TaskId.block(1)
+
+
+class Limited(Harness):
+    """A job whose stages take as long as its clock says, with a budget."""
+
+    def __init__(self, folder: Path, budget: BudgetSet, **settings: Any) -> None:
+        super().__init__(folder, **settings)
+        self.clock = SetClock()  # type: ignore[assignment]
+        self.begin(budget)
+
+    def begin(self, budget: BudgetSet | None = None) -> None:
+        """What `session` records before the driver."""
+        with closing(Database(self.folder.database, self.clock)) as database:
+            lost = lost_with_driver(self.state)
+            new = [] if self.state.began else [PreflightSaved("preflight.json", dict(AFTER))]
+            database.append([*lost, RunBegan("host", 1, False, self.state.latest), *new])
+            database.append([budget] if budget else [])
+
+    def passes(self, seconds: float) -> None:
+        self.clock.sleep(seconds)
+
+
+def slow(harness: Limited, seconds: dict[TaskId, float], step: float = 1.0) -> Any:
+    """All goes well, but tasks take so long; one that is stopped saves a checkpoint first."""
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        left = seconds.get(spec.task, 0.0)
+        while left > 0:
+            harness.passes(step)
+            left -= step
+            yield Progress(spec.task, 1, 2, 3.0)
+            if spec.task in harness.pool.stopped and isinstance(spec, TrainSpec):
+                yield saved(spec)
+                return
+        yield from well(spec)
+
+    return script
+
+
+def saved(spec: TrainSpec, iteration: int = 20_000) -> Checkpoint:
+    """A checkpoint of what a task would end with, a little darker."""
+    gaussians = trained(spec)
+    darker = Gaussians(**{**gaussians.tensors(), "sh0": gaussians.sh0 - 7}, sky=gaussians.sky)
+    return Checkpoint(spec.task, iteration, ModelState.start(darker).tensors())
+
+
+def cost(state: RunState) -> float:
+    return state.money.used.cost
+
+
+def test_a_limit_of_cost_ends_stage_two_and_merges_what_there_is(tmp_path: Path) -> None:
+    whole = Harness(tmp_path_of(tmp_path, "whole"))
+    whole.drive()
+    harness = Limited(tmp_path, BudgetSet(max_cost=100.0, prices=PRICES))
+    state = harness.drive(slow(harness, {COARSE: 20, BLOCK: 500, EVAL: 10}))
+    assert (state.outcome, state.status(BLOCK)) == (Outcome.LIMITED, Status.WAITING)
+    assert "the limit of 100 USD is reached" in state.reason
+    assert 95 <= cost(state) <= 100
+    assert state.task(BLOCK).checkpoint == 20_000
+    assert state.merged is not None
+    assert state.metrics == {"psnr": 24.0, "lpips": None}
+    assert len(harness.records(BudgetNear)) == 1
+    merged, other = read_ply(harness.folder.point_cloud), read_ply(whole.folder.point_cloud)
+    assert len(merged) == len(other)
+    early = merged.sh0[:, 0, 0] < other.sh0[:, 0, 0] - 7
+    assert 0 < int(early.sum()) < len(merged)  # one block is the checkpoint's, a unit darker than Stage I
+    assert harness.state == state
+
+
+def tmp_path_of(folder: Path, name: str) -> Path:
+    path = folder / name
+    path.mkdir()
+    return path
+
+
+def test_a_higher_limit_completes_the_run_with_the_same_bytes(tmp_path: Path) -> None:
+    whole = Harness(tmp_path_of(tmp_path, "whole"))
+    whole.drive()
+    harness = Limited(tmp_path, BudgetSet(max_cost=100.0, prices=PRICES))
+    harness.drive(slow(harness, {COARSE: 20, BLOCK: 500, EVAL: 10}))
+    harness.passes(1000)  # nobody pays while no driver is at work
+    harness.begin(BudgetSet(max_cost=1000.0, prices=PRICES))
+    assert harness.state.status(MERGE) == Status.WAITING
+    assert harness.state.merged is None
+    state = harness.drive(slow(harness, {BLOCK: 30, EVAL: 10}), resumed=True)
+    assert state.outcome == Outcome.DONE
+    assert harness.trainings(BLOCK)[0].checkpoint is not None
+    assert harness.folder.point_cloud.read_bytes() == whole.folder.point_cloud.read_bytes()
+    assert not list(harness.folder.root.rglob("early.ply"))
+    assert not list(harness.folder.root.rglob("checkpoint.safetensors"))
+    assert cost(state) < 200
+
+
+def test_a_block_that_has_hardly_begun_keeps_its_stage_one_gaussians(tmp_path: Path) -> None:
+    harness = Limited(tmp_path, BudgetSet(max_cost=60.0, prices=PRICES))
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        for event in slow(harness, {BLOCK: 500})(spec):
+            yield saved(spec, 100) if isinstance(event, Checkpoint) and isinstance(spec, TrainSpec) else event
+
+    state = harness.drive(script)
+    assert state.outcome == Outcome.LIMITED
+    assert harness.folder.kept(1).exists()
+    assert not harness.folder.early(BLOCK).exists()
+
+
+def test_a_deadline_in_stage_one_delivers_its_checkpoint(tmp_path: Path) -> None:
+    harness = Limited(tmp_path, BudgetSet(deadline=1e9 + 50))
+    state = harness.drive(slow(harness, {COARSE: 500, EVAL: 10}))
+    assert (state.outcome, state.status(COARSE)) == (Outcome.LIMITED, Status.WAITING)
+    assert "the deadline" in state.reason
+    assert state.merged is not None
+    assert (state.merged.gaussians, state.merged.sky) == (202, 2)
+    assert state.metrics is not None
+    assert 45 <= harness.clock.time() - 1e9 <= 50
+    assert harness.state == state
+    harness.begin(BudgetSet())
+    assert harness.drive(resumed=True).outcome == Outcome.DONE
+
+
+def test_districts_that_were_not_begun_are_missing_from_an_early_model(tmp_path: Path) -> None:
+    nodes = [Node("node", "host", cpus=1, memory=2**40)]
+    settings = {"districts": 2, "overlap": 0.0, "partition": {"min_cameras": 1}, "blocks": "1x1x1"}
+    harness = Limited(tmp_path, BudgetSet(max_cost=60.0, prices=PRICES), nodes=nodes, **settings)
+    state = harness.drive(slow(harness, {TaskId.district(0): 500}))
+    assert state.outcome == Outcome.LIMITED
+    assert any("1 of 2 districts were not begun" in notice.message for notice in state.notices)
+    assert state.merged is not None
+    assert 2 < state.merged.gaussians < 202
+
+
+def test_a_limit_before_the_first_checkpoint_leaves_no_model(tmp_path: Path) -> None:
+    harness = Limited(tmp_path, BudgetSet(max_cost=30.0, prices=PRICES))
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        while spec.task not in harness.pool.stopped:
+            harness.passes(1)
+            yield Progress(spec.task, 1, 2, 3.0)
+
+    state = harness.drive(script)
+    assert (state.outcome, state.merged) == (Outcome.LIMITED, None)
+
+
+def test_what_follows_the_training_is_not_ended(tmp_path: Path) -> None:
+    harness = Limited(tmp_path, BudgetSet(max_cost=30.0, prices=PRICES))
+    state = harness.drive(slow(harness, {EVAL: 100}))
+    assert (state.outcome, harness.records(BudgetReached)) == (Outcome.DONE, [])
+
+
+def test_a_driver_that_dies_after_a_limit_leaves_the_rest_to_the_next(tmp_path: Path) -> None:
+    harness = Limited(tmp_path, BudgetSet(max_cost=60.0, prices=PRICES))
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == EVAL:
+            harness.stop.signal()
+            yield Progress(EVAL, 1, 2, 3.0)
+        yield from slow(harness, {BLOCK: 500})(spec)
+
+    with pytest.raises(KeyboardInterrupt):
+        harness.drive(script)
+    assert harness.state.outcome == Outcome.INTERRUPTED
+    harness.begin()
+    state = harness.drive(resumed=True)
+    assert (state.outcome, harness.tasks) == (Outcome.LIMITED, [EVAL])
+
+
+def test_what_attempts_lose_is_recorded(tmp_path: Path) -> None:
+    harness = Limited(tmp_path, BudgetSet(prices=PRICES))
+    lost = [True]
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == COARSE and lost.pop() if lost else False:
+            harness.passes(10)
+            yield Checkpoint(COARSE, 1, {"x": torch.arange(3)})
+            harness.passes(4)
+            raise CrashError(DIED)
+        yield from slow(harness, {EVAL: 6})(spec)
+
+    state = harness.drive(script)
+    assert [(record.task, record.seconds) for record in harness.records(WorkLost)] == [(COARSE, 4.0)]
+    assert (state.money.lost.cost, state.money.used.cost) == pytest.approx((4.0, 20.0))
+
+
+def test_what_a_killed_driver_loses_is_recorded_by_the_next(tmp_path: Path) -> None:
+    harness = Limited(tmp_path, BudgetSet(prices=PRICES))
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        yield Progress(spec.task, 1, 2, 3.0)
+        harness.passes(7)
+        yield Progress(spec.task, 2, 2, 3.0)
+        raise SystemExit
+
+    with pytest.raises(SystemExit):
+        harness.drive(script)
+    harness.begin()
+    state = harness.drive(resumed=True)
+    assert [record.seconds for record in harness.records(WorkLost)] == [7.0]
+    assert state.money.lost.cost == pytest.approx(7.0)
+    assert state.money.used.cost == pytest.approx(7.0)
+
+
+@pytest.mark.parametrize(
+    ("budget", "message"),
+    [
+        (BudgetSet(max_cost=13.0, prices=PRICES), "which cost 14 USD; give more"),
+        (BudgetSet(deadline=1013.0), "0:13 are left, and merge, evaluation and delivery alone"),
+    ],
+)
+def test_a_budget_that_leaves_no_time_to_train_is_refused(budget: BudgetSet, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        require_enough(AFTER, budget, [MACHINE], 1000.0)
+    require_enough(AFTER, BudgetSet(max_cost=20.0, deadline=1020.0, prices=PRICES), [MACHINE], 1000.0)
