@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from panolog.orchestrator.cli.console import command, print_json, progress_bar, say
-from panolog.orchestrator.cli.options import JsonOption, with_preparation, with_run_config
+from panolog.orchestrator.cli.options import (
+    DeadlineOption,
+    JsonOption,
+    MaxCostOption,
+    PricesOption,
+    wanted,
+    with_preparation,
+    with_run_config,
+)
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import InputError
 
@@ -64,9 +72,12 @@ def submit(
     config: "RunConfig",
     options: "Options",
     address: ServerOption = _LOCAL,
+    prices: PricesOption = None,
+    max_cost: MaxCostOption = None,
+    deadline: DeadlineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Start a run on the cluster, with the options of `panolog run`; F.yaml is read on this machine."""
+    """Start a run on the cluster, with the options of `panolog run`; F.yaml and prices are read here."""
     from panolog.orchestrator.cluster.jobs import on_head
     from panolog.orchestrator.preparation.settings import as_arguments
     from panolog.orchestrator.run.config import as_settings
@@ -78,17 +89,26 @@ def submit(
     }.items():
         if path is not None:
             on_head(path, what)
-    words = ["run", source, "-o", run, *as_settings(config), *as_arguments(options)]
+    budget = wanted(prices, max_cost, deadline).options()
+    words = ["run", source, "-o", run, *as_settings(config), *as_arguments(options), *budget]
     _start(address, run, words, as_json=as_json)
 
 
 @app.command(cls=Command)
-def resume(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption = False) -> None:
+def resume(
+    run: HeadRunArg,
+    address: ServerOption = _LOCAL,
+    prices: PricesOption = None,
+    max_cost: MaxCostOption = None,
+    deadline: DeadlineOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """Resume a run on the cluster from its last checkpoints."""
     from panolog.orchestrator.cluster.jobs import on_head
 
     run = on_head(run, "RUN")
-    _start(address, run, ["resume", run], as_json=as_json)
+    words = ["resume", run, *wanted(prices, max_cost, deadline).options()]
+    _start(address, run, words, as_json=as_json)
 
 
 @app.command(cls=Command)

@@ -19,7 +19,7 @@ from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal, Patience
-from panolog.orchestrator.driver.purse import lost_with_driver, require_enough
+from panolog.orchestrator.driver.purse import require_enough
 from panolog.orchestrator.driver.stopping import interruptible, on_signals
 from panolog.orchestrator.estimates.preflight import Preflight, examine
 from panolog.orchestrator.money.limits import Wanted
@@ -32,6 +32,7 @@ from panolog.orchestrator.run import info as run_info
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo, SceneRef
+from panolog.orchestrator.run.losses import lost_with_driver
 from panolog.orchestrator.run.money_records import BudgetSet
 from panolog.orchestrator.run.presence import Presence, why_waiting
 from panolog.orchestrator.run.records import (

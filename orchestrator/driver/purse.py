@@ -15,16 +15,16 @@ from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.money import prices
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.run.clock import Clock
+from panolog.orchestrator.run.losses import lost_at
 from panolog.orchestrator.run.money_records import (
     BudgetNear,
     BudgetReached,
     BudgetSet,
     NodeReturned,
     OfMoney,
-    WorkLost,
 )
 from panolog.orchestrator.run.records import Record, TaskFailed
-from panolog.orchestrator.run.state import RunState, Status, TaskState
+from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.units import duration
 from panolog.scene.errors import ConfigError
 from panolog.workers.tasks import MERGE, Stage
@@ -106,20 +106,6 @@ def require_enough(
     left = math.inf if budget.deadline is None else budget.deadline - (time.time() if now is None else now)
     if left <= needed:
         raise ConfigError(f"--deadline: {duration(max(0.0, left))} are left, and {what}; give more")
-
-
-def lost_at(task: TaskState, end: float) -> list[WorkLost]:
-    """What is lost of a task whose attempt ends then, seconds since the epoch, without a checkpoint."""
-    if task.status != Status.RUNNING or task.since is None:
-        return []
-    since = max(task.since, task.saved or task.since)
-    return [WorkLost(task.id, max(0.0, end - since), end)]
-
-
-def lost_with_driver(state: RunState) -> list[WorkLost]:
-    """What the last driver of a run has lost by ending."""
-    end = state.ended or state.latest
-    return [] if end is None else [lost for task in state.tasks.values() for lost in lost_at(task, end)]
 
 
 class Purse:

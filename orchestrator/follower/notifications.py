@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from panolog.orchestrator.run.money_records import BudgetNear
 from panolog.orchestrator.run.nodes import MACHINE_DIED, MACHINE_GONE, leave_text
 from panolog.orchestrator.run.records import (
     Failure,
@@ -39,7 +40,7 @@ class Kind(StrEnum):
     FAILED = "failed"
     STALLED = "stalled"
     PREEMPTED = "preempted"
-    OVER_BUDGET = "over_budget"  # a run that has reached its `--max-cost`
+    OVER_BUDGET = "over_budget"  # a limit of cost or time is near, or has ended a run early
     TEST = "test"
 
 
@@ -140,11 +141,16 @@ def end_of(state: RunState, last: Stored | None, run: str, name: str) -> Notific
         return None
     seconds = None if state.began is None or state.latest is None else state.worked(state.began, state.latest)
     facts: dict[str, Any] = {"seconds": seconds}
-    if state.outcome == Outcome.DONE:
+    if state.outcome in (Outcome.DONE, Outcome.LIMITED):
         facts |= {
             "metrics": state.metrics or {},
             "gaussians": state.merged.gaussians if state.merged else None,
         }
+        if state.outcome == Outcome.LIMITED:
+            what = "a model of what there is is ready" if state.merged else "there is no model yet"
+            facts["limit"] = state.reason
+            text = f"ended early, {what}: {state.reason}"
+            return _made(run, name, Kind.OVER_BUDGET, last.id, last.time, text + _measured(state), **facts)
         text = "the model is ready" + (f" after {duration(seconds)}" if seconds else "")
         return _made(run, name, Kind.DONE, last.id, last.time, text + _measured(state), **facts)
     why = (
@@ -157,6 +163,11 @@ def _measured(state: RunState) -> str:
     values = {key: (state.metrics or {}).get(key) for key in ("psnr", "ssim")}
     shown = [f"{key.upper()} {value:.3g}" for key, value in values.items() if value is not None]
     return f" ({', '.join(shown)})" if shown else ""
+
+
+def near_of(near: Stored, record: BudgetNear, run: str, name: str) -> Notification:
+    """That a limit of cost or time is near. Args: near, the stored record; run, name as `end_of`."""
+    return _made(run, name, Kind.OVER_BUDGET, near.id, near.time, f"soon: {record.what}", limit=record.what)
 
 
 def stall_of(seconds: float, why: str, record: int, time: float, run: str, name: str) -> Notification:

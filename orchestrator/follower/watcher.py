@@ -6,9 +6,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from panolog.orchestrator.follower.board import ALL, News
-from panolog.orchestrator.follower.notifications import Losses, Notification, end_of, run_id, stall_of
+from panolog.orchestrator.follower.notifications import (
+    Losses,
+    Notification,
+    end_of,
+    near_of,
+    run_id,
+    stall_of,
+)
 from panolog.orchestrator.run import presence
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.money_records import BudgetNear
 from panolog.orchestrator.run.reading import version
 from panolog.orchestrator.run.records import Outcome, RunBegan, RunEnded, Stored
 from panolog.orchestrator.run.state import RunState, Status, apply, replay
@@ -35,6 +43,7 @@ class Watcher:
     _version: tuple[Any, ...] = ()  # of the database, the state of nodes aside
     _since: float = field(default_factory=time.monotonic)  # when that has changed
     _stalls: dict[str, Notification] = field(default_factory=dict)
+    _near: dict[str, Notification] = field(default_factory=dict)  # limits
 
     def look(self) -> bool:
         """Reads what is new. Returns whether anything is; a database that cannot be read now has no news."""
@@ -56,6 +65,7 @@ class Watcher:
         records = read_milestones(self.folder.database, timeout_s=_LOCK_S)
         self.state, self.run = replay(records), run_id(records)
         self._losses, self._turn, self._began, self._last = Losses(), None, 0, 0
+        self._near.clear()
         self._add(records)
 
     def _add(self, records: list[Stored]) -> None:
@@ -63,6 +73,9 @@ class Watcher:
         self.run = self.run or run_id(records)
         for item in records:
             self._last = item.id
+            if isinstance(item.record, BudgetNear):
+                near = near_of(item, item.record, self.run, self.name)
+                self._near[near.id] = near
             if isinstance(item.record, RunBegan | RunEnded):
                 self._turn = item
                 self._began = item.id if isinstance(item.record, RunBegan) else self._began
@@ -94,11 +107,15 @@ class Watcher:
         """What is known. Args: ended, no more will be read; left, no driver is at work on the run."""
         if not self.run or not self.folder.info.is_file() or not (self.state.prepared or left):
             return News(ended=ended)
-        found = [*self._losses.notifications(self.run, self.name), *self._stalls.values()]
+        found = [
+            *self._losses.notifications(self.run, self.name),
+            *self._stalls.values(),
+            *self._near.values(),
+        ]
         found.sort(key=lambda notification: (notification.time, notification.id))
         if left and (end := end_of(self.state, self._turn, self.run, self.name)):
             found.append(end)
-        done = self.state.outcome == Outcome.DONE
+        done = self.state.outcome in (Outcome.DONE, Outcome.LIMITED)
         return News(
             self.run,
             self._began,

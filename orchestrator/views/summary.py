@@ -10,6 +10,7 @@ from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.nodes import Leave, NodeState, why_leaving
 from panolog.orchestrator.run.records import Leaving, task_name
 from panolog.orchestrator.run.state import RunState, Status, TaskState, at_rest
+from panolog.orchestrator.views.money import MoneyView, view_money
 from panolog.orchestrator.views.timing import eta_of, run_eta, seconds_of, share_of, tasks_of
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
@@ -38,7 +39,11 @@ _TASKS = STAGES | {
     Stage.REPAIR: "repair of seam",
 }
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws_psnr": "WS-PSNR", "ws_ssim": "WS-SSIM"}
-LABELS = {"interrupted": "stopped", "stopped": "driver lost"}  # statuses that people read by another name
+LABELS = {
+    "interrupted": "stopped",
+    "stopped": "driver lost",
+    "limited": "ended early",
+}  # by which people read them
 _PROGRESS = ("iteration", "iterations", "rate", "loss", "psnr", "gaussians", "memory", "host_peak")
 Text = Annotated[str, SkipValidation]  # of users and file systems: also what UTF-8 cannot represent
 
@@ -150,6 +155,7 @@ class SummaryHead(ViewModel):
     notices: tuple[NoticeView, ...]
     quarantined: tuple[QuarantineView, ...]  # machines
     leaving: tuple[LeavingView, ...] = ()  # machines
+    money: MoneyView | None = None  # what it has cost; None of runs of older versions
 
 
 class Summary(SummaryHead):
@@ -206,6 +212,7 @@ def summarize(
             if running or (node.until or 0.0) > end
         ),
         leaving=tuple(_leaving(node) for node in state.leaving() if running),
+        money=view_money(state, end, running=running),
         tasks=tuple(_task_view(task, end) for task in tasks_of(state)),
         blocks=tuple(
             BlockView(block=b.block, cameras=b.cameras, gaussians=b.gaussians, train=b.train)
@@ -274,7 +281,7 @@ def reason_of(state: RunState, *, running: bool) -> str | None:
 
 def stage_of(state: RunState) -> str:
     """The key in STAGES of the stage that the run is in; "done" at its end."""
-    if state.outcome == "done":
+    if state.outcome in ("done", "limited"):
         return "done"
     for status in (Status.RUNNING, Status.DONE):
         if tasks := [task.id for task in state.tasks.values() if task.status == status]:

@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from panolog.orchestrator.run.folder import RunFolder, command_line, read_json
+from panolog.orchestrator.run.money_records import BudgetNear, BudgetReached
 from panolog.orchestrator.run.nodes import leave_text
 from panolog.orchestrator.run.records import (
     Delivered,
@@ -104,6 +105,7 @@ def table(
     waits = [Text(summary.waiting, style="yellow")] if summary.waiting else []
     waits += _leaving(summary, now)
     waits += _quarantined(summary, now, name or root)
+    waits += [Text(summary.money.line(), style="dim")] if summary.money else []
     return Group(head, *waits, *_gaussians(summary), *shown, *_failures(state))
 
 
@@ -169,7 +171,8 @@ def page(
     if reason := reason_of(state, running=running):
         lines.append(Text(reason, style="red"))
     if not running and state.outcome != "done":
-        lines.append(_to_copy(f"`{command_line('resume', name or root)}` resumes it"))
+        more = ("--max-cost", "none", "--deadline", "none") if state.outcome == "limited" else ()
+        lines.append(_to_copy(f"`{command_line('resume', name or root, *more)}` resumes it"))
     return Group(table(state, root=root, info=info, running=running, wide=wide, name=name), *lines)
 
 
@@ -304,6 +307,8 @@ def _urgent(record: Record) -> str:
         case TaskFailed():
             then = record.then or ("given up" if record.final else "trying again")
             return f"{task}: {record.reason}; {then}"
+        case BudgetNear() | BudgetReached():
+            return record.what if isinstance(record, BudgetNear) else record.reason
         case StopRequested():
             return f"stopping: {record.tasks} tasks save a checkpoint first; repeat to stop at once"
         case NodeQuarantined():

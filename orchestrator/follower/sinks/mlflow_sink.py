@@ -19,7 +19,13 @@ from panolog.orchestrator.run.records import Outcome
 _TAG = "panolog.run"
 _BATCH, _PARAMS = 1000, 100  # of one request, as the REST API of MLflow limits them
 _LONGEST = 500  # characters of a parameter that every store takes
-_STATUS = {Outcome.DONE: "FINISHED", Outcome.FAILED: "FAILED", Outcome.INTERRUPTED: "KILLED", None: "FAILED"}
+_STATUS = {
+    Outcome.DONE: "FINISHED",
+    Outcome.LIMITED: "FINISHED",
+    Outcome.FAILED: "FAILED",
+    Outcome.INTERRUPTED: "KILLED",
+    None: "FAILED",
+}
 
 
 class MlflowSink(Sink):

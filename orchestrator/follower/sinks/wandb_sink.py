@@ -18,7 +18,7 @@ from panolog.orchestrator.follower.curves import Point
 from panolog.orchestrator.follower.sinks.interface import Facts, Sink
 from panolog.orchestrator.run.records import Outcome
 
-_CODES = {Outcome.DONE: 0, Outcome.FAILED: 1, Outcome.INTERRUPTED: 130, None: 137}
+_CODES = {Outcome.DONE: 0, Outcome.LIMITED: 0, Outcome.FAILED: 1, Outcome.INTERRUPTED: 130, None: 137}
 
 
 class WandbSink(Sink):

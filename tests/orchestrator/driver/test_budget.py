@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 import torch
 
-from panolog.orchestrator.driver.purse import lost_with_driver, require_enough
+from panolog.orchestrator.driver.purse import require_enough
 from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.run.losses import lost_with_driver
 from panolog.orchestrator.run.money_records import BudgetNear, BudgetReached, BudgetSet, WorkLost
 from panolog.orchestrator.run.records import (
     Outcome,
@@ -95,8 +96,8 @@ def test_a_limit_of_cost_ends_stage_two_and_merges_what_there_is(tmp_path: Path)
     assert len(harness.records(BudgetNear)) == 1
     merged, other = read_ply(harness.folder.point_cloud), read_ply(whole.folder.point_cloud)
     assert len(merged) == len(other)
-    early = merged.sh0[:, 0, 0] < other.sh0[:, 0, 0] - 7
-    assert 0 < int(early.sum()) < len(merged)  # one block is the checkpoint's, a unit darker than Stage I
+    early = merged.sh0[:, 0, 0] < other.sh0[:, 0, 0] - 6
+    assert 0 < int(early.sum()) < len(merged)  # one block is that of its checkpoint, which is darker
     assert harness.state == state
 
 
