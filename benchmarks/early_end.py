@@ -43,9 +43,7 @@ def main() -> None:
         folder, kept = RunFolder(Path(place) / "run"), Path(place) / "kept"
         scene = make_place(folder.root, demo_of(), ignore)
         _train(scene, folder, kept, load_config(flags=flags))
-        print(
-            f"{given.recipe}, {given.iterations} iterations, width {given.width}: WS-PSNR of held-out panoramas"
-        )
+        print(f"{given.recipe}, {given.iterations} iterations, width {given.width}: held-out WS-PSNR")
         print(f"{'Stage I':>10} {_quality(folder, folder.model(COARSE)):6.2f} dB")
         for part in _PARTS:
             model = _merged(folder, kept, round(part * given.iterations))

@@ -177,15 +177,17 @@ def doctor(
         ),
     ] = None,
     address: AddressOption = None,
+    prices: PricesOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check this machine; with SCENE, also estimate what a run needs."""
+    found = wanted(prices, None, None).prices
     with progress_bar(
         "checking this machine" if scene is None else "measuring on the machine that will train"
     ):
         from panolog.orchestrator.commands.doctor import diagnose
 
-        diagnosis = diagnose(scene, config, address)
+        diagnosis = diagnose(scene, config, address, found)
     print_result(diagnosis.as_json(), diagnosis.lines(), as_json=as_json)
     if not diagnosis.ready:
         raise typer.Exit(2)

@@ -20,6 +20,7 @@ from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
     from panolog.orchestrator.estimates.preflight import Preflight
+    from panolog.orchestrator.money.prices import PriceList
     from panolog.orchestrator.preparation.settings import Settings
     from panolog.scene.model import Scene
 
@@ -61,13 +62,18 @@ class Diagnosis:
         for it in self.findings:
             mark = "ok" if it.ok else "MISSING" if it.fatal else "note"
             yield f"{mark:8}{it.what}: {it.value}" + (f"; {it.fix}" if it.fix else "")
+        if self.preflight is not None:
+            yield from self.preflight.workers.lines()
 
 
-def diagnose(scene: Path | None, config: RunConfig, address: str | None) -> Diagnosis:
+def diagnose(
+    scene: Path | None, config: RunConfig, address: str | None, prices: "PriceList | None" = None
+) -> Diagnosis:
     """Checks this machine and, if it is ready, what a run of `scene` needs here or on a cluster.
 
     Of panoramas or a video the scene is made first, so only what can be known before is said.
 
+    Args: prices of machines, if they are known.
     Raises InputError if the scene, the settings or the address are wrong.
     """
     packages = (_package("ray", "'ray[default]'"), _package("pycolmap", "pycolmap"))
@@ -82,7 +88,7 @@ def diagnose(scene: Path | None, config: RunConfig, address: str | None) -> Diag
     if (settings := preparing.settings_of(scene, Options())) is not None:
         session.with_width(settings.width, config)
         return Diagnosis([*findings, *_source(settings)])
-    found, preflight = session.estimate_run(scene, config, address)
+    found, preflight = session.estimate_run(scene, config, address, prices)
     return Diagnosis([*findings, *_needs(found, preflight)], preflight)
 
 

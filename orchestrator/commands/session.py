@@ -22,7 +22,8 @@ from panolog.orchestrator.driver.journal import Journal, Patience
 from panolog.orchestrator.driver.purse import require_enough
 from panolog.orchestrator.driver.stopping import interruptible, on_signals
 from panolog.orchestrator.estimates.preflight import Preflight, examine
-from panolog.orchestrator.money.limits import Wanted
+from panolog.orchestrator.money.limits import Wanted, prices_of
+from panolog.orchestrator.money.prices import PriceList
 from panolog.orchestrator.preparation.settings import Options, Settings, read_settings, write_settings
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.retention.clean import remove_models
@@ -276,7 +277,8 @@ class _Beginning:
         folder, root = self.folder, self.folder.root
         self._measure(info.config)
         self.journal.record([Preparing("calibrating")])
-        found = _examine(workers, self.scene, info.config, root, self.warn, local=self.address is None)
+        prices, local = prices_of(self.journal.state), self.address is None
+        found = _examine(workers, self.scene, info.config, root, self.warn, prices, local=local)
         found.require()
         info = info.model_copy(update={"config": found.config})
         self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
@@ -324,7 +326,9 @@ def check(source: Path, root: Path, config: RunConfig, options: Options) -> None
     _found(source, config, options).check_output(root)
 
 
-def estimate_run(scene_path: Path, config: RunConfig, address: str | None) -> tuple[Scene, Preflight]:
+def estimate_run(
+    scene_path: Path, config: RunConfig, address: str | None, prices: PriceList | None = None
+) -> tuple[Scene, Preflight]:
     """What a run of a scene would need, on this machine or on a cluster, with its folder in the current one.
 
     Raises InputError as `start`, except if the run does not fit: that is the problem of the preflight.
@@ -332,14 +336,21 @@ def estimate_run(scene_path: Path, config: RunConfig, address: str | None) -> tu
     scene = read_scene(scene_path)
     config = with_width(scene.width, config)
     with _workers(address, scene.root, None) as pool:
-        return scene, _examine(pool, scene, config, Path.cwd(), ignore, local=address is None)
+        return scene, _examine(pool, scene, config, Path.cwd(), ignore, prices, local=address is None)
 
 
 def _examine(
-    pool: Pool, scene: Scene, config: RunConfig, root: Path, warn: Callable[[str], None], *, local: bool
+    pool: Pool,
+    scene: Scene,
+    config: RunConfig,
+    root: Path,
+    warn: Callable[[str], None],
+    prices: PriceList | None,
+    *,
+    local: bool,
 ) -> Preflight:
     device = _device(config.device, pool, warn, local=local)
-    return examine(pool, scene, config.model_copy(update={"device": device}), root)
+    return examine(pool, scene, config.model_copy(update={"device": device}), root, prices)
 
 
 @contextmanager

@@ -75,6 +75,8 @@ def _no_resume(entry: RunEntry, history: History, resumed: ResumedDriver | None)
     host, command = state.driver.host if state.driver else None, command_line("resume", root)
     if state.outcome == "done":
         return "the run is done"
+    if state.outcome == "limited":
+        return f"a limit has ended it: use `{command}` with a higher --max-cost or a later --deadline"
     if resumed and resumed.starting:
         return "it is being resumed"
     if not os.access(root, os.W_OK | os.X_OK):

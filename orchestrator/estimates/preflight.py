@@ -3,7 +3,7 @@
 import math
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ from panolog.orchestrator.estimates.suggestions import (
     problem,
     within_memory,
 )
+from panolog.orchestrator.estimates.workers import Workers, workers
+from panolog.orchestrator.money.prices import PriceList
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.run.config import AUTO, RunConfig, change
@@ -42,6 +44,7 @@ class Preflight:
     free: int  # bytes of the run folder's disk
     problem: str | None  # why the job cannot be done, in one line
     chosen: Settings  # that `memory` has led to
+    workers: Workers
 
     def require(self) -> None:
         """Raises InputError if the job cannot be done."""
@@ -56,6 +59,7 @@ class Preflight:
             "machines": [asdict(node) for node in self.nodes],
             "free_disk": self.free,
             "basis": self.basis.as_json(),
+            "workers": self.workers.as_json(),
         }
 
     def summary(self) -> str:
@@ -73,13 +77,25 @@ class Preflight:
                 if cap
                 else ""
             )
+            + self._cost()
         )
 
+    def _cost(self) -> str:
+        """What it costs on the machines that there are, for people; "" without prices."""
+        if self.workers.price is None or self.estimate.seconds is None:
+            return ""
+        cost = len(self.nodes) * self.workers.price * self.estimate.seconds / 3600
+        machines = f"{len(self.nodes)} x {self.workers.kind}"
+        return f"; about {cost:,.2f} {self.workers.currency} on {machines}, storage not counted"
 
-def examine(pool: Pool, scene: Scene, config: RunConfig, root: Path) -> Preflight:
+
+def examine(
+    pool: Pool, scene: Scene, config: RunConfig, root: Path, prices: PriceList | None = None
+) -> Preflight:
     """Calibrates and estimates a job whose run folder is to be `root`; refuses nothing yet.
 
-    Args: config with width and device resolved. Raises InputError if an image of the scene is wrong.
+    Args: config with width and device resolved; prices of machines, if they are known. Raises InputError if
+    an image of the scene is wrong.
     """
     basis, nodes = calibrate(pool, scene, config), pool.nodes()
     estimator, free = estimator_of(scene, config, basis, nodes), free_disk(root)
@@ -93,7 +109,17 @@ def examine(pool: Pool, scene: Scene, config: RunConfig, root: Path) -> Prefligh
         estimator = other(chosen)
     why = problem(estimator, free)
     why = why and f"{scene.root}: {why}"
-    return Preflight(estimator.config, basis, estimator.estimate(), nodes, free, why, chosen)
+    final = change(config, chosen) if chosen else config
+
+    def on(machines: Sequence[Node]) -> Estimator:
+        if config.blocks == AUTO:
+            return estimator_of(scene, final, basis, machines)
+        other = replace(estimator, nodes=machines)
+        vars(other)["parts"] = estimator.parts  # those of the place, which take long to count
+        return other
+
+    table = workers(on, nodes, prices)
+    return Preflight(estimator.config, basis, estimator.estimate(), nodes, free, why, chosen, table)
 
 
 def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[Node]) -> Estimator:

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 
-from panolog.orchestrator.money.prices import PriceList
+from panolog.orchestrator.money.prices import PriceList, of_record
 from panolog.orchestrator.run.money_records import BudgetSet
 from panolog.orchestrator.run.state import RunState
 from panolog.scene.errors import ConfigError
@@ -64,6 +64,11 @@ class Wanted:
             return None
         _check(after, state)
         return after
+
+
+def prices_of(state: RunState) -> PriceList | None:
+    """The prices of a run; None if it has none. Raises ConfigError if they are of another format."""
+    return of_record(state.money.budget.prices) if state.money.budget else None
 
 
 def _check(budget: BudgetSet, state: RunState) -> None:

@@ -37,13 +37,19 @@ const TYPES = {
   NodeLeaving: ["Leaves", (e) => `${e.host} announces that it leaves${e.seconds === null ? "" : ` in ${duration(e.seconds)}`} (${e.kind}): its tasks save a checkpoint and move`],
   NodeStaying: ["Stays", (e) => `${e.host} stays after all, and is used again`],
   NodeLeft: ["Left", (e) => `${e.host} has left`],
-  RunEnded: ["Ended", (e) => [e.outcome === "interrupted" ? "stopped" : e.outcome, e.reason].filter(Boolean).join(": ")],
+  NodeReserved: ["Machine", (e) => `${e.host} is there: ${e.kind}${e.price === null ? "" : `, ${e.price} per hour`}`],
+  NodeReturned: ["Machine", () => "one is there no longer"],
+  WorkLost: ["Lost", (e) => `${duration(e.seconds)} since the last checkpoint`],
+  BudgetSet: ["Limits", (e) => [e.max_cost === null ? "" : `at most ${e.max_cost} ${e.prices.currency}`, e.deadline === null ? "" : `until ${clock(e.deadline)}`].filter(Boolean).join(", ") || "none"],
+  BudgetNear: ["Limit near", (e) => e.what],
+  BudgetReached: ["Limit reached", (e) => e.reason],
+  RunEnded: ["Ended", (e) => [{ interrupted: "stopped", limited: "ended early" }[String(e.outcome)] ?? e.outcome, e.reason].filter(Boolean).join(": ")],
 };
 
 /** @param {RunEvent} event */
 function line(event) {
   const [label, describe] = TYPES[event.type] ?? [event.type, () => ""];
-  const tone = event.type === "TaskFailed" || event.outcome === "failed" ? "failed" : ["Noticed", "RunWaiting"].includes(event.type) ? "paused" : event.type.endsWith("Saved") || event.outcome === "done" ? "done" : "waiting";
+  const tone = event.type === "TaskFailed" || event.outcome === "failed" ? "failed" : ["Noticed", "RunWaiting", "BudgetNear", "BudgetReached", "WorkLost"].includes(event.type) ? "paused" : event.type.endsWith("Saved") || event.outcome === "done" ? "done" : "waiting";
   const time = el("time", { datetime: new Date(event.time * 1000).toISOString() }, clock(event.time));
   const detail = event.detail && el("details", {}, el("summary", {}, "Traceback"), el("pre", { tabindex: 0 }, event.detail));
   return el("li", { "data-key": event.id }, time, el("span", { class: "kind", "data-status": tone }, label), el("span", { class: "task" }, taskLabel(event.task)), el("span", { class: "what" }, describe(event), detail));

@@ -1,7 +1,7 @@
 // The facts about a run: the head of the page with its stages, the machines, and the settings.
 
 /** @import { ActionButtons } from "./actions.js" */
-/** @import { NodeView, RunPage, SettingView, StageView, UsageView } from "../shared/messages.js" */
+/** @import { NodeView, RunPage, SettingView, StageView, SummaryHead, UsageView } from "../shared/messages.js" */
 import { bar, byId, childrenOf, el, first, pill, reconcile, replaceIfChanged, setBar, setMessage, setPill, setText } from "../shared/dom.js";
 import { ago, bytes, clock, decibel, duration, fixed, percent, shellWord, short, taskLabel } from "../shared/format.js";
 
@@ -25,6 +25,20 @@ function facts({ summary, progress, eta, latest, store }, live, since) {
     live || !model ? ["Gaussians in training", short(summary.training_gaussians)] : ["Size", bytes(model.bytes)],
     ["Gaussians kept", short(summary.kept_gaussians)],
     .../** @type {[string, string][]} */ (store ? [["Object store", store]] : []),
+    ...costs(summary.money),
+  ];
+}
+
+/** What the run has cost, where prices are known. @param {SummaryHead["money"]} money @returns {[string, string][]} */
+function costs(money) {
+  if (!money || money.used.cost === null) return [];
+  /** @param {number | null} cost */
+  const amount = (cost) => `${fixed(cost ?? 0, 2)} ${money.currency}`;
+  const limit = money.max_cost === null ? "" : ` of ${fixed(money.max_cost, 2)}`;
+  return [
+    ["Cost", `${fixed(money.used.cost, 2)}${limit} ${money.currency}`],
+    ["Of it idle", amount(money.idle.cost)],
+    ["Of it lost", amount(money.lost.cost)],
   ];
 }
 
@@ -34,6 +48,7 @@ function hint({ summary: { status, stage }, latest, path }) {
   const kept = stage === "prepare" ? "What is done is kept" : "The checkpoints are kept";
   const last = latest ? ` Last update: ${clock(latest)}, ${ago(latest)}.` : "";
   if (status === "stopped") return [`${kept}.${last} To resume the run:`, resume];
+  if (status === "limited") return ["A limit has ended the training early; the model is what there was. To complete the run, also with a higher limit:", `${resume} --max-cost none --deadline none`];
   if (status === "interrupted") return [`The run was stopped. ${kept}. To resume it:`, resume];
   return status === "failed" ? ["To try again from the last checkpoints:", resume] : null;
 }

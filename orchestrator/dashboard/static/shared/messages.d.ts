@@ -162,6 +162,17 @@ export interface Line {
   y: Array<number | null>;
 }
 
+/** All machines of one kind; `there` counts those that are there now, `price` is per hour. */
+export interface MachineKindView {
+  kind: string;
+  price: number | null;
+  count: number;
+  there: number;
+  used: UsedView;
+  idle: UsedView;
+  lost: UsedView;
+}
+
 /** How the metrics of a run were measured: what metrics.json says besides the metrics. */
 export interface MeasuredView {
   width: number | null;
@@ -186,6 +197,19 @@ export interface ModelView {
   path: string;
   gaussians: number;
   bytes: number;
+}
+
+/** The account of a run: all that was reserved, and what of it was idle or had to be done again. */
+export interface MoneyView {
+  currency: string;
+  used: UsedView;
+  idle: UsedView;
+  lost: UsedView;
+  rate: number | null;
+  max_cost: number | null;
+  deadline: number | null;
+  reached: string | null;
+  kinds: Array<MachineKindView>;
 }
 
 /** Bytes between machines. */
@@ -448,6 +472,7 @@ export interface Summary {
   notices: Array<NoticeView>;
   quarantined: Array<QuarantineView>;
   leaving: Array<LeavingView>;
+  money: MoneyView | null;
   tasks: Array<TaskView>;
   blocks: Array<BlockView>;
 }
@@ -472,6 +497,7 @@ export interface SummaryHead {
   notices: Array<NoticeView>;
   quarantined: Array<QuarantineView>;
   leaving: Array<LeavingView>;
+  money: MoneyView | null;
 }
 
 /** A task: its progress, where it runs, and what went wrong; `seconds` of all its attempts. */
@@ -513,4 +539,10 @@ export interface UsageView {
   disk_used: number;
   disk_total: number;
   gpus: Array<GpuUsageView>;
+}
+
+/** Seconds of machines, and their cost; None where no price is known. */
+export interface UsedView {
+  seconds: number;
+  cost: number | null;
 }
