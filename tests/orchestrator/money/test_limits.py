@@ -1,0 +1,79 @@
+from datetime import datetime
+
+import pytest
+
+from panolog.orchestrator.money.limits import Wanted, parse_deadline
+from panolog.orchestrator.money.prices import PriceList
+from panolog.orchestrator.run.money_records import BudgetSet, NodeReserved
+from panolog.orchestrator.run.records import Outcome, RunBegan, RunEnded, Stored
+from panolog.orchestrator.run.state import RunState, replay
+from panolog.scene.errors import ConfigError
+
+NOW = datetime(2026, 11, 24, 23, 0).timestamp()  # of this machine
+PRICES = PriceList.model_validate({"currency": "USD", "machine": [{"name": "a", "price": 3600, "host": "*"}]})
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("6h", 21_600), ("1h30m", 5400), ("1d 2h", 93_600), ("90s", 90), ("23:30", 1800), ("22:00", 23 * 3600)],
+)
+def test_a_deadline_is_a_duration_or_the_next_time_of_day(text: str, seconds: float) -> None:
+    assert parse_deadline(text, NOW) == NOW + seconds
+
+
+def test_a_deadline_is_an_iso_time() -> None:
+    assert parse_deadline("2026-11-25T00:00:00", NOW) == NOW + 3600
+    assert (
+        parse_deadline("2026-12-01T00:00:00Z", NOW)
+        == datetime.fromisoformat("2026-12-01T00:00:00+00:00").timestamp()
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["", "soon", "6", "25:00", "12:60", "2020-01-01", "99999d", "0s", "1h tomorrow"]
+)
+def test_what_is_no_deadline_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="--deadline"):
+        parse_deadline(text, NOW)
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "five"])
+def test_what_is_no_amount_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="--max-cost"):
+        Wanted.of(text, None, PRICES)
+
+
+def spent(*more: Stored) -> RunState:
+    budget = Wanted.of("10", None, PRICES).budget(RunState())
+    assert budget is not None
+    records = [RunBegan("host", 1, False), budget, NodeReserved("n", "host", "a", 3600.0)]
+    stored = [Stored(i, 0.0, record) for i, record in enumerate(records, 1)]
+    return replay([*stored, Stored(9, 8.0, RunEnded(Outcome.LIMITED)), *more])
+
+
+def test_what_a_command_was_not_given_stays(tmp_path: object) -> None:
+    state = spent()
+    assert Wanted().budget(state) is None
+    assert Wanted.of("10", None, None).budget(state) is None
+    higher = Wanted.of("20", None, None).budget(state)
+    assert higher is not None
+    assert (higher.max_cost, higher.prices["currency"]) == (20.0, "USD")
+    assert Wanted.of("none", None, None).budget(state) == BudgetSet(None, None, higher.prices)
+
+
+def test_a_limit_that_is_used_up_or_has_no_prices_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"the run has cost 8\.00 already"):
+        Wanted.of("7", None, None).budget(spent())
+    with pytest.raises(ConfigError, match="there are no prices"):
+        Wanted.of("7", None, None).budget(RunState())
+
+
+def test_another_command_gets_the_same() -> None:
+    wanted = Wanted.of("2.5", "none", PRICES)
+    words = wanted.options()
+    given = dict(zip(words[::2], words[1::2], strict=True))
+    assert (given["--max-cost"], given["--deadline"]) == ("2.5", "none")
+    assert PriceList.model_validate_json(given["--prices"]) == PRICES
+    later = Wanted.of(None, "6h", None)
+    again = Wanted.of(None, later.options()[1], None)
+    assert again.deadline == pytest.approx(later.deadline)
