@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from panolog.orchestrator.driver.purse import require_enough
+from panolog.orchestrator.driver.purse import require_enough, slowness, verdict
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.run.losses import lost_with_driver
 from panolog.orchestrator.run.money_records import BudgetNear, BudgetReached, BudgetSet, WorkLost
@@ -244,3 +245,16 @@ def test_a_budget_that_leaves_no_time_to_train_is_refused(budget: BudgetSet, mes
     with pytest.raises(ConfigError, match=message):
         require_enough(AFTER, budget, [MACHINE], 1000.0)
     require_enough(AFTER, BudgetSet(max_cost=20.0, deadline=1020.0, prices=PRICES), [MACHINE], 1000.0)
+
+
+def test_where_stage_one_was_slower_than_estimated_more_is_kept_for_what_follows(tmp_path: Path) -> None:
+    harness = Limited(tmp_path, BudgetSet(prices=PRICES))
+    coarse = replace(harness.state.task(COARSE), status=Status.DONE, seconds=30.0, iterations=2)
+    state = replace(harness.state, tasks={COARSE: coarse}, estimate={**AFTER, "coarse": 10.0})
+    assert slowness(state) == pytest.approx(3.0)
+    assert slowness(replace(state, estimate={**AFTER, "coarse": 100.0})) == 1.0
+    assert slowness(replace(state, estimate=None)) == 1.0
+    money = replace(state.money, budget=BudgetSet(deadline=1e9 + 39), since=1e9 - 1000)
+    assert isinstance(verdict(replace(state, money=money), 1e9, 1.0), BudgetReached)  # 36 + 1 + 2 seconds
+    money = replace(money, budget=BudgetSet(deadline=1e9 + 40))
+    assert isinstance(verdict(replace(state, money=money), 1e9, 1.0), BudgetNear)

@@ -12,6 +12,7 @@ from panolog.orchestrator.follower.watcher import Watcher
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.money_records import BudgetNear, BudgetReached
 from panolog.orchestrator.run.nodes import MACHINE_DIED
 from panolog.orchestrator.run.presence import Presence
 from panolog.orchestrator.run.records import (
@@ -198,3 +199,16 @@ def test_a_database_that_is_damaged_or_replaced_stops_no_watcher(run: Run) -> No
         assert watcher.look()
     assert watcher.run != first
     assert watcher.news().run == watcher.run
+
+
+def test_a_limit_is_notified_when_it_is_near_and_when_it_has_ended_the_run(run: Run) -> None:
+    run.add(BEGAN, STARTED, BudgetNear("the limit of 5 USD: 4.1 are used"))
+    assert run.kinds() == ["over_budget"]
+    assert "soon: the limit of 5 USD" in run.news().notifications[0].text
+    reason = "the limit of 5 USD is reached"
+    run.add(BudgetReached(reason), RunEnded(Outcome.LIMITED, reason))
+    near, end = run.news(left=True).notifications
+    assert (near.kind, end.kind) == (Kind.OVER_BUDGET, Kind.OVER_BUDGET)
+    assert near.id != end.id
+    assert "there is no model yet: the limit of 5 USD is reached" in end.text
+    assert run.news(left=True).outcome == Outcome.LIMITED

@@ -51,7 +51,7 @@ def spent(*more: Stored) -> RunState:
     return replay([*stored, Stored(9, 8.0, RunEnded(Outcome.LIMITED)), *more])
 
 
-def test_what_a_command_was_not_given_stays(tmp_path: object) -> None:
+def test_what_a_command_was_not_given_stays() -> None:
     state = spent()
     assert Wanted().budget(state) is None
     assert Wanted.of("10", None, None).budget(state) is None
