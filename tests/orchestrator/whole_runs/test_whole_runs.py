@@ -200,6 +200,33 @@ def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, 
         assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
 
 
+def test_a_limit_delivers_what_there_is_and_without_it_the_bytes_are_the_same(
+    runs: tuple[Path, Ended, Path], tmp_path: Path
+) -> None:
+    calm, _, _ = runs
+    root, prices = tmp_path / "run", tmp_path / "prices.toml"
+    prices.write_text('currency = "EUR"\n[[machine]]\nname = "any"\nprice = 3600\nhost = "*"\n')
+    more = ("--set", "checkpoint.every=1000", "--set", "preview.every=20", "--prices", prices)
+    stop: list[Accident] = [("PreviewSaved", str(TaskId.block(1)), "terminal", 2)]
+    end = end_of(launch("run", calm.parent / "town", "-o", root, *SETTINGS, *more, accidents=stop))
+    assert end.code == 130, end.stderr
+    cost = state_of(root).money.used.cost
+    assert cost > 0
+    end = end_of(launch("resume", root, "--max-cost", cost * 1.001))  # which is used up by what follows
+    assert (end.code, end.stdout) == (0, ""), end.stderr
+    assert "ended early: the limit of" in end.stderr
+    limited = state_of(root)
+    assert (limited.outcome, limited.status(TaskId.block(1))) == ("limited", "waiting")
+    assert limited.merged is not None
+    assert (limited.metrics or {})["psnr"] is not None
+    assert "<h2>Cost</h2>" in RunFolder(root).report.read_text()
+    again = end_of(launch("resume", root))
+    assert (again.code, state_of(root)) == (0, limited), again.stderr
+    end = end_of(launch("resume", root, "--max-cost", "none"))
+    assert (end.code, state_of(root).outcome) == (0, "done"), end.stderr
+    assert (root / "point_cloud.ply").read_bytes() == (calm / "point_cloud.ply").read_bytes()
+
+
 def test_ctrl_c_leaves_fresh_checkpoints(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
     """The whole foreground of a terminal gets the signal, and the run ends as if nothing had been."""
     calm, _, _ = runs
