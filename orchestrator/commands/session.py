@@ -23,6 +23,7 @@ from panolog.orchestrator.driver.purse import require_enough
 from panolog.orchestrator.driver.stopping import interruptible, on_signals
 from panolog.orchestrator.estimates.preflight import Preflight, examine
 from panolog.orchestrator.money.limits import Wanted, prices_of
+from panolog.orchestrator.money.losses import lost_with_driver
 from panolog.orchestrator.money.prices import PriceList
 from panolog.orchestrator.preparation.settings import Options, Settings, read_settings, write_settings
 from panolog.orchestrator.resources.pool import Pool
@@ -33,8 +34,7 @@ from panolog.orchestrator.run import info as run_info
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo, SceneRef
-from panolog.orchestrator.run.losses import lost_with_driver
-from panolog.orchestrator.run.money_records import BudgetSet
+from panolog.orchestrator.run.money.records import BudgetSet
 from panolog.orchestrator.run.presence import Presence, why_waiting
 from panolog.orchestrator.run.records import (
     Noticed,

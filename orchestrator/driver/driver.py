@@ -31,7 +31,7 @@ from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
 from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.orchestrator.run.folder import command_line
-from panolog.orchestrator.run.money_records import BudgetReached
+from panolog.orchestrator.run.money.records import BudgetReached
 from panolog.orchestrator.run.presence import Presence
 from panolog.orchestrator.run.records import (
     CheckpointSaved,

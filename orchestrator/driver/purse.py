@@ -14,10 +14,10 @@ from datetime import datetime
 from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.estimates.costs import whole_seconds
 from panolog.orchestrator.money import prices
+from panolog.orchestrator.money.losses import lost_at
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.run.clock import Clock
-from panolog.orchestrator.run.losses import lost_at
-from panolog.orchestrator.run.money_records import (
+from panolog.orchestrator.run.money.records import (
     BudgetNear,
     BudgetReached,
     BudgetSet,

@@ -16,7 +16,7 @@ from panolog.orchestrator.follower.notifications import (
 )
 from panolog.orchestrator.run import presence
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.money_records import BudgetNear
+from panolog.orchestrator.run.money.records import BudgetNear
 from panolog.orchestrator.run.reading import version
 from panolog.orchestrator.run.records import Outcome, RunBegan, RunEnded, Stored
 from panolog.orchestrator.run.state import RunState, Status, apply, replay

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 
 from panolog.orchestrator.money.prices import PriceList, of_record
-from panolog.orchestrator.run.money_records import BudgetSet
+from panolog.orchestrator.run.money.records import BudgetSet
 from panolog.orchestrator.run.state import RunState
 from panolog.scene.errors import ConfigError
 

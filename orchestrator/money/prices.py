@@ -27,7 +27,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from panolog.orchestrator.resources.nodes import Node
-from panolog.orchestrator.run.money_records import NodeReserved
+from panolog.orchestrator.run.money.records import NodeReserved
 from panolog.orchestrator.run.units import gib
 from panolog.scene.errors import ConfigError
 

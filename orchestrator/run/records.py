@@ -6,7 +6,7 @@ names are in place. Nothing here imports torch or Ray, so that commands that rea
 
 from dataclasses import dataclass, field
 
-from panolog.orchestrator.run.money_records import OfMoney
+from panolog.orchestrator.run.money.records import OfMoney
 from panolog.workers.tasks import CALIBRATE, DELIVER, EVAL, MERGE, PLAN, StrEnum, TaskId
 
 

@@ -6,7 +6,8 @@ from typing import Any
 
 from typing_extensions import assert_never
 
-from panolog.orchestrator.run.money_records import BudgetReached, BudgetSet
+from panolog.orchestrator.run.money.records import BudgetReached, BudgetSet
+from panolog.orchestrator.run.money.spending import Spending, spend
 from panolog.orchestrator.run.nodes import Nodes, NodeState, by_host, follow, leave_text, take_over
 from panolog.orchestrator.run.records import (
     BlockPlan,
@@ -46,7 +47,6 @@ from panolog.orchestrator.run.records import (
     Transferred,
     UnpauseRequested,
 )
-from panolog.orchestrator.run.spending import Spending, spend
 from panolog.workers.tasks import DELIVER, EVAL, MERGE, Stage, StrEnum, TaskId
 
 

@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, SkipValidation
 
+from panolog.orchestrator.money.account import MoneyView, view_money
 from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.nodes import Leave, NodeState, why_leaving
 from panolog.orchestrator.run.records import Leaving, task_name
 from panolog.orchestrator.run.state import RunState, Status, TaskState, at_rest
-from panolog.orchestrator.views.money import MoneyView, view_money
 from panolog.orchestrator.views.timing import eta_of, run_eta, seconds_of, share_of, tasks_of
 from panolog.workers.tasks import COARSE, Stage, TaskId
 

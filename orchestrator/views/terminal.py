@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from panolog.orchestrator.run.folder import RunFolder, command_line, read_json
-from panolog.orchestrator.run.money_records import BudgetNear, BudgetReached
+from panolog.orchestrator.run.money.records import BudgetNear, BudgetReached
 from panolog.orchestrator.run.nodes import leave_text
 from panolog.orchestrator.run.records import (
     Delivered,

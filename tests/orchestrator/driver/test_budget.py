@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from panolog.orchestrator.driver.purse import require_enough, slowness, verdict
+from panolog.orchestrator.money.losses import lost_with_driver
 from panolog.orchestrator.resources.nodes import Node
-from panolog.orchestrator.run.losses import lost_with_driver
-from panolog.orchestrator.run.money_records import BudgetNear, BudgetReached, BudgetSet, WorkLost
+from panolog.orchestrator.run.money.records import BudgetNear, BudgetReached, BudgetSet, WorkLost
 from panolog.orchestrator.run.records import (
     Outcome,
     PreflightSaved,
@@ -21,7 +21,6 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import ConfigError
-from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import read_ply
 from panolog.workers.events import Checkpoint, Event, Progress
 from panolog.workers.specs import TaskSpec
@@ -40,7 +39,7 @@ class Limited(Harness):
 
     def __init__(self, folder: Path, budget: BudgetSet, **settings: Any) -> None:
         super().__init__(folder, **settings)
-        self.clock = SetClock()  # type: ignore[assignment]
+        self.clock = SetClock()
         self.begin(budget)
 
     def begin(self, budget: BudgetSet | None = None) -> None:
@@ -75,7 +74,7 @@ def slow(harness: Limited, seconds: dict[TaskId, float], step: float = 1.0) -> A
 def saved(spec: TrainSpec, iteration: int = 20_000) -> Checkpoint:
     """A checkpoint of what a task would end with, a little darker."""
     gaussians = trained(spec)
-    darker = Gaussians(**{**gaussians.tensors(), "sh0": gaussians.sh0 - 7}, sky=gaussians.sky)
+    darker = replace(gaussians, sh0=gaussians.sh0 - 7)
     return Checkpoint(spec.task, iteration, ModelState.start(darker).tensors())
 
 
@@ -113,7 +112,7 @@ def test_a_higher_limit_completes_the_run_with_the_same_bytes(tmp_path: Path) ->
     whole.drive()
     harness = Limited(tmp_path, BudgetSet(max_cost=100.0, prices=PRICES))
     harness.drive(slow(harness, {COARSE: 20, BLOCK: 500, EVAL: 10}))
-    harness.passes(1000)  # nobody pays while no driver is at work
+    harness.passes(1000)  # nothing is counted while no driver is at work
     harness.begin(BudgetSet(max_cost=1000.0, prices=PRICES))
     assert harness.state.status(MERGE) == Status.WAITING
     assert harness.state.merged is None

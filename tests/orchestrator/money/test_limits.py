@@ -4,8 +4,8 @@ import pytest
 
 from panolog.orchestrator.money.limits import Wanted, parse_deadline
 from panolog.orchestrator.money.prices import PriceList
-from panolog.orchestrator.run.money_records import BudgetSet, NodeReserved
-from panolog.orchestrator.run.records import Outcome, RunBegan, RunEnded, Stored
+from panolog.orchestrator.run.money.records import BudgetSet, NodeReserved
+from panolog.orchestrator.run.records import Outcome, Record, RunBegan, RunEnded, Stored
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.scene.errors import ConfigError
 
@@ -46,7 +46,7 @@ def test_what_is_no_amount_is_refused(text: str) -> None:
 def spent(*more: Stored) -> RunState:
     budget = Wanted.of("10", None, PRICES).budget(RunState())
     assert budget is not None
-    records = [RunBegan("host", 1, False), budget, NodeReserved("n", "host", "a", 3600.0)]
+    records: list[Record] = [RunBegan("host", 1, False), budget, NodeReserved("n", "host", "a", 3600.0)]
     stored = [Stored(i, 0.0, record) for i, record in enumerate(records, 1)]
     return replay([*stored, Stored(9, 8.0, RunEnded(Outcome.LIMITED)), *more])
 

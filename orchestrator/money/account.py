@@ -5,8 +5,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from panolog.orchestrator.run.losses import settled
-from panolog.orchestrator.run.spending import Machine, Spending, Used
+from panolog.orchestrator.money.losses import settled
+from panolog.orchestrator.run.money.spending import Machine, Spending, Used
 from panolog.orchestrator.run.state import RunState
 
 

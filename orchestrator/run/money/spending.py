@@ -9,7 +9,7 @@ and no machine while no driver is at work.
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from panolog.orchestrator.run.money_records import (
+from panolog.orchestrator.run.money.records import (
     BudgetNear,
     BudgetReached,
     BudgetSet,

@@ -1,7 +1,7 @@
 """What of the work of a run is lost when an attempt or a driver ends."""
 
-from panolog.orchestrator.run.money_records import WorkLost
-from panolog.orchestrator.run.spending import Spending
+from panolog.orchestrator.run.money.records import WorkLost
+from panolog.orchestrator.run.money.spending import Spending
 from panolog.orchestrator.run.state import RunState, Status, TaskState
 
 

@@ -2,8 +2,9 @@
 
 import pytest
 
-from panolog.orchestrator.run.losses import settled
-from panolog.orchestrator.run.money_records import NodeReserved, NodeReturned, WorkLost
+from panolog.orchestrator.money.losses import settled
+from panolog.orchestrator.run.money.records import NodeReserved, NodeReturned, WorkLost
+from panolog.orchestrator.run.money.spending import Spending
 from panolog.orchestrator.run.records import (
     Outcome,
     Record,
@@ -15,7 +16,6 @@ from panolog.orchestrator.run.records import (
     TaskStarted,
     TaskYielded,
 )
-from panolog.orchestrator.run.spending import Spending
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.workers.tasks import COARSE, TaskId
 
@@ -70,9 +70,8 @@ def test_a_killed_driver_pays_until_its_last_record_and_loses_what_ran() -> None
     state = after((0, BEGAN), (0, A), (2, started(ONE)), (8, started(TWO)))
     assert parts(settled(state, 50, running=False)) == pytest.approx((8, 2, 6))
     again = RunBegan("host", 2, resumed=True, previous=8.0)
-    later = after(
-        *[(0, BEGAN), (0, A), (2, started(ONE)), (8, started(TWO)), (50, WorkLost(ONE, 6, 8)), (50, again)]
-    )
+    before: list[tuple[float, Record]] = [(0, BEGAN), (0, A), (2, started(ONE)), (8, started(TWO))]
+    later = after(*before, (50, WorkLost(ONE, 6, 8)), (50, again))
     assert parts(later.money.until(60)) == pytest.approx((8, 2, 6))
 
 
