@@ -10,6 +10,7 @@ import sys
 import threading
 from contextlib import suppress
 
+from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.units import gib
 from panolog.orchestrator.storage.fetch import bring
@@ -51,9 +52,11 @@ def main() -> None:
 def _begun(plan: Plan) -> tuple[Store, Lease, Manifest | None]:
     """Takes the lease, and brings the run if it is to be resumed. Raises PanologError."""
     folder, store = RunFolder(plan.root), open_store(plan.url, _PATIENCE_S)
-    lease = take(store, plan.root, force=plan.force)
+    lease = take(store, plan.root, force=plan.force, again=plan.again)
     try:
         manifest = current(store)
+        if plan.again:
+            return store, lease, manifest
         if plan.resumes:
             bring(store, folder, manifest, lambda line: _tell(say=line))
         elif manifest is not None:
@@ -67,9 +70,13 @@ def _begun(plan: Plan) -> tuple[Store, Lease, Manifest | None]:
 
 def _follow(plan: Plan, mirror: Mirror, lease: Lease, ended: threading.Event, stop: threading.Event) -> None:
     """Mirrors the run, and says what is left."""
+    folder = RunFolder(plan.root)
     mirror.follow(ended, stop, plan.period, plan.patience)
     with suppress(StoreError, StoreLostError):
         lease.release()
+    if lease.lost and lock.held(folder.lock):  # what is trained from now on would be lost
+        with suppress(InputError, OSError):
+            control.send(folder, "stop")
     state = mirror.state
     if not state.complete:
         left = (

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from subprocess import DEVNULL, PIPE
 from typing import Any
 
@@ -114,8 +115,8 @@ class _Keeper:
 
 def _started(plan: Plan, *, again: bool = False) -> "subprocess.Popen[str]":
     """The process, in a session of its own, so that Ctrl-C does not reach it. Its words have no secret."""
-    if again:  # the lease of the killed one is still there, and the folder as new as can be
-        plan = Plan(plan.root, plan.url, True, True, plan.period, plan.patience)
+    if again:
+        plan = replace(plan, again=True, force=False)
     command = [sys.executable, "-m", "panolog.orchestrator.storage"]
     process = subprocess.Popen(
         command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, text=True, start_new_session=True, env=os.environ

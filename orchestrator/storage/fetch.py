@@ -47,7 +47,7 @@ def bring(store: Store, folder: RunFolder, manifest: Manifest | None, say: Say) 
     if folder.info.exists():
         if kept is None and manifest is not None:
             raise RunFolderError(f"{folder.root}: holds a run of its own; choose another folder with --local")
-        if manifest is None or (kept is not None and kept.published == manifest.name):
+        if manifest is None or (kept is not None and manifest.name in (kept.published, kept.announced)):
             return
         _set_aside(folder, say)
     elif folder.root.is_dir() and kept is None and any(folder.root.iterdir()):
@@ -55,7 +55,7 @@ def bring(store: Store, folder: RunFolder, manifest: Manifest | None, say: Say) 
     if manifest is None:
         raise StoreError(f"{url}: there is no run yet; start it with `panolog run`")
     folder.root.mkdir(parents=True, exist_ok=True)
-    write_state(folder.mirror, MirrorState(url, manifest.name, time.time()))
+    write_state(folder.mirror, MirrorState(url, manifest.name, since=time.time()))
     size = sum(entry.size for entry in manifest.files.values())
     say(f"fetching {len(manifest.files):,} files ({size / 1e6:,.0f} MB) from {url}")
     first = {name: entry for name, entry in manifest.files.items() if name != INFO}

@@ -81,19 +81,20 @@ class _Owner:
         return json.dumps(held | {"host": socket.gethostname(), "pid": os.getpid()}).encode()
 
 
-def take(store: Store, root: Path, *, force: bool) -> Lease:
+def take(store: Store, root: Path, *, force: bool, again: bool = False) -> Lease:
     """Takes the lease of a run.
 
     Where only the mirror of this machine's last driver is left, it waits for its end.
-    Args: root, the run's folder on this machine; force, also from a driver that may still be at work.
+    Args: root, the run's folder on this machine; force, also from a driver that may still be at work; again,
+    also that of the driver at work here, whose mirror was killed.
     Raises RunLockedError if another driver has it; StoreError, StoreLostError as `Store`.
     """
     owner = _Owner(sha256(str(root.resolve()).encode()).hexdigest()[:16])
     while True:
         found = newest(store, LEASES)
         held = _read(store, found) if found else {}
-        if _live(held) and not force:
-            own = (held.get("host"), held.get("folder")) == (socket.gethostname(), owner.folder)
+        own = (held.get("host"), held.get("folder")) == (socket.gethostname(), owner.folder)
+        if _live(held) and not force and not (own and again):
             if own and not lock.held(root / "lock"):
                 time.sleep(_POLL_S)
                 continue

@@ -231,6 +231,7 @@ class Mirror:
         manifest = Manifest(f"{MANIFESTS}/{time.time_ns():x}-{secrets.token_hex(4)}", files)
         packed = manifest.pack()
         self._store.write(manifest.name, packed)
+        self._say(announced=manifest.name)
         put_pointer(self._store, self._lease.number, manifest, packed)
         for key in self._replaced:
             self._store.remove(key)

@@ -27,6 +27,7 @@ class Plan:
     url: str
     resumes: bool  # the run is there already, here or in the store
     force: bool = False  # take it from another driver
+    again: bool = False  # the mirror of a driver that is at work was killed: this one takes its place
     period: float = _PERIOD_S  # seconds between two rounds
     patience: float = (
         60 * _PATIENCE_MIN
@@ -58,7 +59,7 @@ def plan_of(
     require_package(url)
     period = _number(PERIOD, environment, _PERIOD_S)
     patience = 60 * _number(PATIENCE, environment, _PATIENCE_MIN)
-    return Plan(root, str(url), resumes, force, period, patience)
+    return Plan(root, str(url), resumes, force, period=period, patience=patience)
 
 
 def local_folder(url: str, environment: Mapping[str, str]) -> Path:

@@ -22,6 +22,7 @@ class MirrorState:
 
     url: str  # of the run
     published: str = ""  # the manifest that its pointer names
+    announced: str = ""  # one that its pointer may name already
     since: float = 0.0  # all that the run had made by then is in the store; 0: nothing is yet
     pending_files: int = 0
     pending_bytes: int = 0

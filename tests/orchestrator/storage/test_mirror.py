@@ -5,18 +5,29 @@ import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import CheckpointSaved, Outcome, Record, RunBegan, RunEnded
 from panolog.orchestrator.run.state import replay
 from panolog.orchestrator.run.store import Database, read_milestones
 from panolog.orchestrator.storage import lease as leases
 from panolog.orchestrator.storage.fetch import bring, for_status, viewed
-from panolog.orchestrator.storage.layout import MANIFESTS, OBJECTS, POINTERS, current, mirrored
+from panolog.orchestrator.storage.layout import (
+    MANIFESTS,
+    OBJECTS,
+    POINTERS,
+    Entry,
+    Manifest,
+    current,
+    mirrored,
+    put_pointer,
+)
 from panolog.orchestrator.storage.lease import Lease, holder, take
 from panolog.orchestrator.storage.mirror import Mirror
 from panolog.orchestrator.storage.state import MirrorState, read_state, write_state
@@ -63,8 +74,8 @@ def mirror_of(driver: Driver, store: Store, *, force: bool = False) -> tuple[Mir
     return Mirror(driver.folder, store, lease, current(store)), lease
 
 
-def rounds(mirror: Mirror, *, ended: bool = True) -> None:
-    """One round, as when the driver has ended; or as many as it takes until it has."""
+def rounds(mirror: Mirror) -> None:
+    """As many rounds as it takes, as when the driver has ended."""
     over = threading.Event()
     over.set()
     mirror.follow(over, threading.Event(), 0.01, 5.0)
@@ -244,6 +255,31 @@ def test_one_driver_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     take(store, tmp_path / "elsewhere", force=False)
 
 
+def test_the_mirror_of_a_live_driver_is_replaced_but_not_that_of_another(tmp_path: Path) -> None:
+    store = open_store(f"file://{tmp_path}/store")
+    driver = Driver(tmp_path / "run")
+    with lock.hold(driver.folder.lock):
+        mirror_of(driver, store)
+        with pytest.raises(RunLockedError):
+            take(store, driver.folder.root, force=False)
+        take(store, driver.folder.root, force=False, again=True)
+        with pytest.raises(RunLockedError):
+            take(store, tmp_path / "elsewhere", force=False, again=True)
+
+
+def test_a_mirror_that_was_killed_after_its_pointer_leaves_a_folder_that_is_kept(tmp_path: Path) -> None:
+    store = open_store(f"file://{tmp_path}/store")
+    driver = Driver(tmp_path / "run")
+    mirror, _ = mirror_of(driver, store)
+    driver.save()
+    mirror.round()
+    state = read_state(driver.folder.mirror)
+    assert state is not None
+    write_state(driver.folder.mirror, replace(state, published="before"))
+    bring(store, driver.folder, current(store), pytest.fail)
+    assert driver.folder.info.exists()
+
+
 def test_a_lease_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = open_store(f"file://{tmp_path}/store")
     take(store, tmp_path / "elsewhere", force=False)
@@ -269,8 +305,6 @@ def test_a_damaged_store_is_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["../x", "/x", "control/stop", "lock"])
 def test_a_manifest_that_names_what_is_no_file_of_a_run_is_refused(tmp_path: Path, name: str) -> None:
-    from panolog.orchestrator.storage.layout import Entry, Manifest, put_pointer  # noqa: PLC0415
-
     store = open_store(f"file://{tmp_path}/store")
     manifest = Manifest(f"{MANIFESTS}/x", {name: Entry("k", 1, "0", 0)})
     store.write(manifest.name, manifest.pack())
