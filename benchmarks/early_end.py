@@ -69,7 +69,7 @@ def _train(scene: Path, folder: RunFolder, kept: Path, config: RunConfig) -> Non
 def _merged(folder: RunFolder, kept: Path, iteration: int) -> Path:
     """The model of the checkpoints at an iteration, or at the one before for which there are some."""
     info, plan, parts = read_info(folder), read_plan(folder.plan), list[Path]()
-    scene, least = scene_of(info), info.config.densify.prune_opacity
+    scene, least = scene_of(info, folder), info.config.densify.prune_opacity
     for block in range(info.config.grid.count):
         found = [int(place.name) for place in kept.iterdir() if (place / str(block)).exists()]
         at = max(number for number in found if number <= iteration)

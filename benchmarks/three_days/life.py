@@ -23,7 +23,7 @@ from benchmarks.three_days.load import HOUR, Load
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.driver.stopping import Stop
+from panolog.orchestrator.driver.requests import Stop
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 
 from panolog.orchestrator.cli import (
-    clean,
     cluster,
     control,
     dashboard,
@@ -75,7 +74,7 @@ _PANELS: dict[str, dict[str, Any]] = {
         "compare": results.compare,
         "eval": results.evaluate,
         "partition": results.partition,
-        "clean": clean.clean,
+        "clean": control.clean,
     },
 }
 for _panel, _commands in _PANELS.items():

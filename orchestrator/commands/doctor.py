@@ -86,7 +86,7 @@ def diagnose(
     from panolog.orchestrator.preparation.settings import Options  # noqa: PLC0415
 
     if (settings := preparing.settings_of(scene, Options())) is not None:
-        session.with_width(settings.width, config)
+        preparing.with_width(settings.width, config)
         return Diagnosis([*findings, *_source(settings)])
     found, preflight = session.estimate_run(scene, config, address, prices)
     return Diagnosis([*findings, *_needs(found, preflight)], preflight)

@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.driver.stopping import interrupt
+from panolog.orchestrator.driver.requests import interrupt
 from panolog.orchestrator.preparation import notes
 from panolog.orchestrator.preparation.notes import Counts, StepProgress, StepResult
 from panolog.orchestrator.preparation.settings import (
@@ -32,7 +32,9 @@ from panolog.orchestrator.preparation.settings import (
 from panolog.orchestrator.run import control
 from panolog.orchestrator.run import info as run_info
 from panolog.orchestrator.run.control import Action, ControlRequest
+from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, command_line
+from panolog.orchestrator.run.info import SceneRef
 from panolog.orchestrator.run.records import Noticed, Preparing
 from panolog.orchestrator.views.mask_picture import write_mask_picture
 from panolog.prepare.networks.depth_maps import BATCH, plan_depth
@@ -43,6 +45,8 @@ from panolog.scene.errors import ConfigError, RunFolderError, SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.model import Scene
 from panolog.scene.read import MASKS, model_folder, read_scene
+from panolog.scene.stores.outline import url_of
+from panolog.scene.stores.url import is_url
 from panolog.workers.tasks import PREPARE
 
 LABELS = {
@@ -53,6 +57,60 @@ LABELS = {
 }
 _SHOWN_S = 0.5  # between two reports of progress
 _POLL_S = 0.5  # between two looks for a request to stop
+
+
+def with_width(most: int, config: RunConfig) -> RunConfig:
+    """The settings with their width. Args: most, pixels of the panoramas. Raises ConfigError beyond it."""
+    width = config.width or most
+    if width > most:
+        raise ConfigError(f"--width {width}: the panoramas have {most} pixels; give at most that")
+    return config.model_copy(update={"width": width})
+
+
+@dataclass(frozen=True)
+class NewRun:
+    """What a new run is of: a scene, or what one is made of."""
+
+    config: RunConfig  # with its width
+    scene: Scene | None
+    settings: Settings | None
+
+    def check_output(self, root: Path) -> None:
+        """Makes sure that the run may be written to `root`; changes nothing. Raises RunFolderError."""
+        if self.settings is not None:
+            check_output(root, self.settings)
+        elif root.is_dir() and read_settings(RunFolder(root)) is not None:
+            raise RunFolderError(
+                f"{root}: belongs to a run that makes its scene itself; choose another folder"
+            )
+        elif self.scene is not None:
+            run_info.check_output(root, self.scene.fingerprint)
+
+    def reference(self, folder: RunFolder) -> SceneRef:
+        """How run.json names the scene."""
+        if self.scene is None:
+            return SceneRef(path=str(folder.scene.resolve()), fingerprint=run_info.PENDING)
+        return reference(self.scene)
+
+
+def found(source: Path | str, config: RunConfig, options: Options) -> NewRun:
+    """What is at `source`. Raises InputError if nothing of that can be run."""
+    if isinstance(source, str) and is_url(source):
+        if options.given:
+            raise ConfigError("a URL is that of a scene; leave out the options for panoramas and videos")
+        scene = read_scene(source)
+        return NewRun(with_width(scene.width, config), scene, None)
+    settings = settings_of(Path(source), options)
+    if settings is not None:
+        return NewRun(with_width(settings.width, config), None, settings)
+    scene = read_scene(source)
+    return NewRun(with_width(scene.width, config), scene, None)
+
+
+def reference(scene: Scene) -> SceneRef:
+    """How run.json names a scene."""
+    path = url_of(scene.root) or str(scene.root)
+    return SceneRef(path=path, fingerprint=scene.fingerprint, offset=scene.offset)
 
 
 def settings_of(source: Path, options: Options) -> Settings | None:

@@ -20,7 +20,7 @@ from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal, Patience
 from panolog.orchestrator.driver.purse import require_enough
-from panolog.orchestrator.driver.stopping import interruptible, on_signals
+from panolog.orchestrator.driver.requests import interruptible, on_signals
 from panolog.orchestrator.estimates.preflight import Preflight, examine
 from panolog.orchestrator.money.limits import Wanted, prices_of
 from panolog.orchestrator.money.losses import lost_with_driver
@@ -33,7 +33,7 @@ from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run import info as run_info
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import RunInfo, SceneRef
+from panolog.orchestrator.run.info import RunInfo
 from panolog.orchestrator.run.money.records import BudgetSet
 from panolog.orchestrator.run.presence import Presence, why_waiting
 from panolog.orchestrator.run.records import (
@@ -54,12 +54,10 @@ from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
 from panolog.partition.plan import Plan
 from panolog.renderer.process import choose_device
-from panolog.scene.errors import ClusterError, ConfigError, RunFolderError, RunLockedError
+from panolog.scene.errors import ClusterError, RunFolderError, RunLockedError
 from panolog.scene.files import remove_partial
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
-from panolog.scene.stores.outline import url_of
-from panolog.scene.stores.url import is_url
 
 _LOG = logging.getLogger(__name__)
 
@@ -87,7 +85,7 @@ def start(
     first task, or before there is anything to resume from; RunError if the run failed.
     """
     budget = (wanted or Wanted()).budget(RunState())
-    new = _found(source, config, options or Options())
+    new = preparing.found(source, config, options or Options())
     new.check_output(root)
     folder = RunFolder(root)
     made = run_folder.make(root)
@@ -179,51 +177,6 @@ def _opened(folder: RunFolder, config: RunConfig) -> Database:
             time.sleep(config.disk.retry)
 
 
-@dataclass(frozen=True)
-class _New:
-    """What a new run is of: a scene, or what one is made of."""
-
-    config: RunConfig  # with its width
-    scene: Scene | None
-    settings: Settings | None
-
-    def check_output(self, root: Path) -> None:
-        """Makes sure that the run may be written to `root`; changes nothing. Raises RunFolderError."""
-        if self.settings is not None:
-            preparing.check_output(root, self.settings)
-        elif root.is_dir() and read_settings(RunFolder(root)) is not None:
-            raise RunFolderError(
-                f"{root}: belongs to a run that makes its scene itself; choose another folder"
-            )
-        elif self.scene is not None:
-            run_info.check_output(root, self.scene.fingerprint)
-
-    def reference(self, folder: RunFolder) -> SceneRef:
-        """How run.json names the scene."""
-        if self.scene is None:
-            return SceneRef(path=str(folder.scene.resolve()), fingerprint=run_info.PENDING)
-        return _reference(self.scene)
-
-
-def _found(source: Path | str, config: RunConfig, options: Options) -> _New:
-    """What is at `source`. Raises InputError if nothing of that can be run."""
-    if isinstance(source, str) and is_url(source):
-        if options.given:
-            raise ConfigError("a URL is that of a scene; leave out the options for panoramas and videos")
-        scene = read_scene(source)
-        return _New(with_width(scene.width, config), scene, None)
-    settings = preparing.settings_of(Path(source), options)
-    if settings is not None:
-        return _New(with_width(settings.width, config), None, settings)
-    scene = read_scene(source)
-    return _New(with_width(scene.width, config), scene, None)
-
-
-def _reference(scene: Scene) -> SceneRef:
-    path = url_of(scene.root) or str(scene.root)
-    return SceneRef(path=path, fingerprint=scene.fingerprint, offset=scene.offset)
-
-
 @dataclass
 class _Beginning:
     """A driver before its first task. The caller holds the lock."""
@@ -249,8 +202,8 @@ class _Beginning:
         if settings is None:
             return info
         self.made = preparing.Preparation(self.folder, settings, self.journal).make()
-        config = with_width(self.made.width, info.config)
-        info = info.model_copy(update={"scene": _reference(self.made), "config": config})
+        config = preparing.with_width(self.made.width, info.config)
+        info = info.model_copy(update={"scene": preparing.reference(self.made), "config": config})
         self.journal.until_done(lambda: run_info.write_info(self.folder, info))
         return info
 
@@ -323,7 +276,7 @@ class _Beginning:
 
 def check(source: Path, root: Path, config: RunConfig, options: Options) -> None:
     """All that `start` checks before it makes anything. Raises InputError as it does."""
-    _found(source, config, options).check_output(root)
+    preparing.found(source, config, options).check_output(root)
 
 
 def estimate_run(
@@ -334,7 +287,7 @@ def estimate_run(
     Raises InputError as `start`, except if the run does not fit: that is the problem of the preflight.
     """
     scene = read_scene(scene_path)
-    config = with_width(scene.width, config)
+    config = preparing.with_width(scene.width, config)
     with _workers(address, scene.root, None) as pool:
         return scene, _examine(pool, scene, config, Path.cwd(), ignore, prices, local=address is None)
 
@@ -403,14 +356,6 @@ def _moved(scene: Scene) -> list[Record]:
         f"the scene is far from its origin: add {scene.offset} to the coordinates of the run for the scene's"
     )
     return [Noticed(None, message)] if any(scene.offset) else []
-
-
-def with_width(most: int, config: RunConfig) -> RunConfig:
-    """The settings with their width. Args: most, pixels of the panoramas. Raises ConfigError beyond it."""
-    width = config.width or most
-    if width > most:
-        raise ConfigError(f"--width {width}: the panoramas have {most} pixels; give at most that")
-    return config.model_copy(update={"width": width})
 
 
 def _device(wanted: str, pool: Pool, warn: Callable[[str], None], *, local: bool) -> str:

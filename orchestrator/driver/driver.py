@@ -18,10 +18,9 @@ from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.journal import Journal, Patience
 from panolog.orchestrator.driver.machines import Machines
 from panolog.orchestrator.driver.purse import Purse
-from panolog.orchestrator.driver.requests import Requests
+from panolog.orchestrator.driver.requests import Requests, Stop
 from panolog.orchestrator.driver.results import Deliver, OnPlan, Results
 from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save, tidy
-from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.driver.writers import Writers
 from panolog.orchestrator.estimates import costs
 from panolog.orchestrator.resources import placement, quarantine

@@ -1,12 +1,87 @@
-"""What users request of a driver through the run folder."""
+"""What users request of a driver, by signals and through the run folder.
 
-from contextlib import suppress
+Ctrl-C: the first requests a run to stop with fresh checkpoints, the second stops it at once.
+
+A driver must not be interrupted in the middle of a record, so the first signal only sets a flag; it does
+interrupt work that takes long and can be discarded (`at_once`). SIGTERM, as job systems send it, and SIGHUP,
+when a terminal is closed, are the same.
+"""
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
 
 from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.run import control
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Noticed
+
+_ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_ONE_S = 1.0  # signals within it are one request: a terminal or job system and a supervisor may both send it
+
+
+class Stop:
+    """Whether the run is requested to stop."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._at_once = False
+        self._latest = -math.inf  # time.monotonic() of the last request
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Inside, the first signal raises KeyboardInterrupt too. So does entering after it."""
+        if self.requested:
+            raise KeyboardInterrupt
+        self._at_once = True
+        try:
+            yield
+        finally:
+            self._at_once = False
+
+    def signal(self, _number: int = 0, _frame: FrameType | None = None) -> None:
+        """One signal. Raises KeyboardInterrupt if it is to stop at once."""
+        now = time.monotonic()
+        if now - self._latest < _ONE_S:
+            return
+        self._latest = now
+        again, self.requested = self.requested, True
+        if again or self._at_once:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def on_signals() -> Iterator[Stop]:
+    """A `Stop` that handles those signals while the context lasts; for the main thread.
+
+    A signal that is ignored, as Ctrl-C is by a shell's background jobs and SIGHUP by nohup, stays so.
+    """
+    stop = Stop()
+    handled = [number for number in _ENDS if signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, stop.signal) for number in handled}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def interrupt() -> None:
+    """Sends the main thread one of those signals that it handles: for another thread of the process."""
+    handled = [number for number in _ENDS if signal.getsignal(number) not in (signal.SIG_IGN, signal.SIG_DFL)]
+    if handled and (ident := threading.main_thread().ident) is not None:
+        signal.pthread_kill(ident, handled[0])
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Each of those signals raises KeyboardInterrupt while the context lasts, once for each request."""
+    with on_signals() as stop, stop.at_once():
+        yield
 
 
 class Requests:

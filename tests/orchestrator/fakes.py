@@ -15,7 +15,7 @@ from panolog.orchestrator.commands.delivery import deliver
 from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.driver.stopping import Stop
+from panolog.orchestrator.driver.requests import Stop
 from panolog.orchestrator.resources.delivery import announced
 from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.nodes import Node, Placement

@@ -1,6 +1,6 @@
 """Places whose facades repeat, as photographs, with shuffled names and as videos: right, refused or wrong.
 
-    python -m benchmarks.repetition FOLDER [--places square grid …] [--kinds photographs shuffled video]
+    python -m benchmarks.places.repetition FOLDER [--places square grid …] [--kinds photographs …]
 
 FOLDER keeps the panoramas, so a second call renders nothing. A result is right if the positions of all
 panoramas with a pose differ from the true ones by at most 0.2 % of the way, root mean square after the best

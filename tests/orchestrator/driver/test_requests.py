@@ -3,8 +3,8 @@ import signal
 
 import pytest
 
-from panolog.orchestrator.driver import stopping
-from panolog.orchestrator.driver.stopping import Stop, interruptible, on_signals
+from panolog.orchestrator.driver import requests
+from panolog.orchestrator.driver.requests import Stop, interruptible, on_signals
 
 ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
