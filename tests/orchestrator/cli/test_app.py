@@ -174,7 +174,7 @@ def test_a_town_whose_making_was_cut_off_is_made_again(
         "panolog.orchestrator.commands.demo.make_town", lambda town, progress: made.append(town)
     )
     monkeypatch.setattr("panolog.orchestrator.commands.session.start", lambda *_: None)
-    monkeypatch.setattr("panolog.orchestrator.cli.run._say_results", lambda *_: None)
+    monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
     model = tmp_path / "run-town" / "sparse" / "0"
     model.mkdir(parents=True)
     (model / "cameras.bin").touch()
@@ -194,7 +194,7 @@ def test_a_flight_is_made_next_to_its_run(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(
         "panolog.orchestrator.commands.session.start", lambda scene, root, *_: started.append((scene, root))
     )
-    monkeypatch.setattr("panolog.orchestrator.cli.run._say_results", lambda *_: None)
+    monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
     assert call("demo", "--flight").exit_code == 0
     scene = tmp_path / "runs" / "flight-district"
     assert (made, started) == ([scene], [(scene, Path("runs/flight"))])
@@ -220,7 +220,7 @@ def test_a_city_has_a_scene_for_each_size(tmp_path: Path, monkeypatch: pytest.Mo
         "panolog.orchestrator.commands.session.start",
         lambda scene, root, config, *_: started.append(f"{config.recipe} {config.blocks}"),
     )
-    monkeypatch.setattr("panolog.orchestrator.cli.run._say_results", lambda *_: None)
+    monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
     assert call("demo", "--city", "300").exit_code == 0
     assert call("demo", "--city", "20", "--flight").exit_code == 0
     runs = tmp_path / "runs"
