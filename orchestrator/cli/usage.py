@@ -9,8 +9,7 @@ from panolog.scene.stores.url import PROTOCOLS, is_url
 
 # What takes URLs of object stores.
 _RUNS = ("run", "resume", "status", "events", "report", "export", "scene info", "scene check")
-_JOBS = ("submit", "resume", "status", "stop")
-_STORES = (*(f"panolog {name}" for name in _RUNS), *(f"panolog cluster {name}" for name in _JOBS))
+_STORES = (*_RUNS, *(f"cluster {name}" for name in ("submit", "resume", "status", "stop")))
 
 
 class _PlainUsage:
@@ -35,13 +34,14 @@ class Command(_PlainUsage, TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parses the words. Raises StoreError for the URL of a store where the command reads folders only."""
-        if ctx.command_path not in _STORES:
+        name = ctx.command_path.partition(" ")[2]  # after that of the program
+        if name not in _STORES:
             for word in args:
                 value = word.partition("=")[2] if word.startswith("--") and "=" in word else word
                 protocol = value.partition("://")[0].lower()
                 if is_url(value) and protocol in PROTOCOLS:
                     raise StoreError(
-                        f"{protocol}://…: `{ctx.command_path}` takes files and folders of this machine only;"
+                        f"{protocol}://…: `panolog {name}` takes files and folders of this machine only;"
                         " docs/storage.md has the commands that take URLs"
                     )
         return super().parse_args(ctx, args)
