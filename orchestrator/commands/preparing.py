@@ -31,8 +31,8 @@ from panolog.orchestrator.preparation.settings import (
 )
 from panolog.orchestrator.run import control
 from panolog.orchestrator.run import info as run_info
-from panolog.orchestrator.run.control import Action, ControlRequest
 from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.control import Action, ControlRequest
 from panolog.orchestrator.run.folder import RunFolder, command_line
 from panolog.orchestrator.run.info import SceneRef
 from panolog.orchestrator.run.records import Noticed, Preparing

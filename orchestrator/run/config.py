@@ -109,20 +109,14 @@ class RetentionConfig(Group):
         " last if that is damaged when a run is resumed",
     )
     models: bool = Field(
-        default=True,
-        description="whether the models of blocks, districts, repairs and unions stay when the run is done;"
-        " the merged model has their Gaussians",
+        default=True, description="whether the models of blocks and other parts stay when the run is done"
     )
 
 
 class DiskConfig(Group):
     """What a run does when its disk takes nothing more."""
 
-    retry: float = Field(
-        default=10.0,
-        gt=0,
-        description="seconds between two tries to write while the disk is full or cannot be reached",
-    )
+    retry: float = Field(default=10.0, gt=0, description="seconds between two tries to write meanwhile")
 
 
 _MEASURED = 1.0  # pixels: renders of a city were 87 to 101 dB from those of the whole model, with 2 71 to 78

@@ -342,8 +342,9 @@ def _excuse(state: RunState, record: NodeQuarantined) -> None:
             losses=max(0, task.losses - losses),
             failures=tuple(failure for failure in task.failures if failure[0] != record.node),
         )
-    notice = Noticed(None, f"{record.host} ({record.node[:8]}) is in quarantine: {record.reason}")
-    state.notices[notice] = None
+    state.notices[Noticed(None, f"{record.host} ({record.node[:8]}) is in quarantine: {record.reason}")] = (
+        None
+    )
 
 
 # A new driver may have other machines: earlier failures do not count.

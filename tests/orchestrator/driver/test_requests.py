@@ -21,7 +21,7 @@ class Hand:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Hand:
     clock = Hand()
-    monkeypatch.setattr(stopping, "time", clock)
+    monkeypatch.setattr(requests, "time", clock)
     return clock
 
 
