@@ -354,9 +354,8 @@ _FRESH: dict[str, Any] = {"failures": (), **dict.fromkeys([*_IN_A_ROW, *_COUNTS]
 
 def _request(task: TaskState, record: PauseRequested | UnpauseRequested | RetryRequested) -> dict[str, Any]:
     """The user's request about a task. One that runs continues until it yields."""
-    changes: dict[str, Any] = dict(_FRESH)
-    if not isinstance(record, RetryRequested):
-        changes = {"held": isinstance(record, PauseRequested)}
+    held = {"held": isinstance(record, PauseRequested)}
+    changes: dict[str, Any] = dict(_FRESH) if isinstance(record, RetryRequested) else held
     if task.status != Status.RUNNING:
         changes["status"] = replace(task, **changes).at_rest
     return changes
