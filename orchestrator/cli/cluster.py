@@ -52,7 +52,7 @@ ServerOption = Annotated[
     ),
 ]
 SecondsArg = Annotated[
-    int, typer.Argument(min=0, max=86_400, metavar="[SECONDS]", help="Seconds until the machine ends.")
+    int, typer.Argument(min=0, max=86_400, metavar="SECONDS", help="Seconds until the machine ends.")
 ]
 NodeOption = Annotated[
     str,

@@ -10,10 +10,12 @@ import typer
 
 from panolog.orchestrator.cli import run as runs
 from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
-from panolog.orchestrator.cli.options import JsonOption, preparation, run_config
+from panolog.orchestrator.cli.options import JsonOption, preparation, run_config, wanted
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import QueueError
+from panolog.scene.stores.url import is_url
 
+_KEPT = {"prices", "max_cost", "deadline", "local", "force"}  # the run itself has them, or a queue has none
 app = typer.Typer(
     cls=Group, no_args_is_help=True, help="A queue of runs: add, list, move, remove, retry, run."
 )
@@ -52,10 +54,12 @@ def add(context: typer.Context, queue: QueueOption = None, **given: Any) -> None
     from panolog.orchestrator.queue.entries import Command as Words
     from panolog.orchestrator.queue.store import opened
 
-    root = Path(given["output"]).resolve()
+    given |= _absolute(given)
+    root = Path(given["output"])
     _check(given)
     first = tuple(_words(context, given, inspect.signature(runs.run).parameters))
-    later = tuple(_words(context, given, inspect.signature(runs.resume).parameters))
+    resumes = inspect.signature(runs.resume).parameters.keys() - _KEPT
+    later = tuple(_words(context, given, resumes))
     with opened(_folder(queue)) as found:
         print(found.add(Words(root, first, later, Path.cwd())))
 
@@ -138,6 +142,21 @@ def _folder(given: Path | None) -> Path:
     return default_folder() if given is None else given.absolute()
 
 
+def _absolute(given: dict[str, Any]) -> dict[str, str]:
+    """Paths that may also be something else, absolute. Raises QueueError if the run is to be in a store."""
+    for name in ("output", "local"):
+        if given[name] is not None and (name == "local" or is_url(given[name])):
+            raise QueueError(
+                f"{given[name]}: a queue has its runs in folders of this machine; give one with -o"
+            )
+    found = {"output": str(Path(given["output"]).resolve())}
+    if not is_url(given["source"]):
+        found["source"] = str(Path(given["source"]).resolve())
+    if given["prices"] is not None:
+        found["prices"] = str(Path(given["prices"]).resolve())
+    return found
+
+
 def _check(given: dict[str, Any]) -> None:
     """Everything that `panolog run` checks before it trains. Raises InputError as it does."""
     from panolog.orchestrator.follower.plan import read_plan
@@ -147,7 +166,8 @@ def _check(given: dict[str, Any]) -> None:
 
     config, options = made(run_config), made(preparation)
     read_plan(given["notify"] or (), given["log"] or (), os.environ)
-    output = given["output"]
+    wanted(given["prices"], given["max_cost"], given["deadline"])
+    output = Path(given["output"])
     if (output / "run.json").exists():
         raise QueueError(
             f"{output}: is a run already; {command('resume', output)} resumes it, or give another -o"

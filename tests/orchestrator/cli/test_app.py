@@ -384,7 +384,7 @@ def test_the_commands_are_those_of_the_contract() -> None:
     reading |= {"compare", "export"}
     assert program.commands.keys() == running | reading | {"clean", "scene", "cluster", "notify", "queue"}
     groups = {name: group for name, group in program.commands.items() if isinstance(group, TyperGroup)}
-    assert list(groups["cluster"].commands) == ["submit", "resume", "status", "stop"]
+    assert list(groups["cluster"].commands) == ["submit", "resume", "status", "stop", "leave"]
     assert list(groups["notify"].commands) == ["test"]
     assert list(groups["queue"].commands) == ["add", "list", "move", "remove", "retry", "run"]
     assert set(groups["scene"].commands) == {"info", "check", "import", "sfm", "mask", "depth"}

@@ -23,6 +23,9 @@ SETTINGS += ["--set", "sky.count=100", "--set", "checkpoint.every=10", "--set", 
 SETTINGS += ["--set", "refine=false", "--set", "deliver=false"]
 
 
+PRICES = Path(__file__).parents[3] / "deploy" / "prices.toml"
+
+
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_town(tmp_path_factory.mktemp("queued") / "town", panoramas=9, width=64, points=300)
@@ -68,6 +71,15 @@ def test_the_words_of_a_run_come_back_with_absolute_paths(here: Path, scene: Pat
     assert list(command.later) == later
 
 
+def test_limits_are_given_to_the_start_alone(here: Path, scene: Path) -> None:
+    words = ["--prices", os.path.relpath(PRICES), "--max-cost", "9", "--deadline", "3h"]
+    assert panolog("queue", "add", scene, "-o", here / "run", *words)[0] == 0
+    with opened(here / "queue", make=False) as queue:
+        command = queue.entry(1).command
+    assert command.first[-6:] == ("--prices", str(PRICES), "--max-cost", "9", "--deadline", "3h")
+    assert command.later == ()  # the run itself has them
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
@@ -83,6 +95,8 @@ def test_the_words_of_a_run_come_back_with_absolute_paths(here: Path, scene: Pat
         ),
         (["town", "-o", "{}/run", "--no-gps"], "is a scene already; leave out the options for panoramas"),
         (["town", "-o", "{}/run", "--log", "paper"], "--log paper: there is no such sink"),
+        (["town", "-o", "s3://bucket/run"], "s3://bucket/run: a queue has its runs in folders"),
+        (["town", "-o", "{}/run", "--max-cost", "much"], "much"),
         (["town", "-o", "{}/run", "--notify", "slack:https://h.example/x"], "slack"),
     ],
 )
