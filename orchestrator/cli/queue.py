@@ -13,7 +13,6 @@ from panolog.orchestrator.cli.console import command, print_result, progress_bar
 from panolog.orchestrator.cli.options import JsonOption, preparation, run_config, wanted
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import QueueError
-from panolog.scene.stores.url import is_url
 
 _KEPT = {"prices", "max_cost", "deadline", "local", "force"}  # the run itself has them, or a queue has none
 app = typer.Typer(
@@ -143,18 +142,11 @@ def _folder(given: Path | None) -> Path:
 
 
 def _absolute(given: dict[str, Any]) -> dict[str, str]:
-    """Paths that may also be something else, absolute. Raises QueueError if the run is to be in a store."""
-    for name in ("output", "local"):
-        if given[name] is not None and (name == "local" or is_url(given[name])):
-            raise QueueError(
-                f"{given[name]}: a queue has its runs in folders of this machine; give one with -o"
-            )
-    found = {"output": str(Path(given["output"]).resolve())}
-    if not is_url(given["source"]):
-        found["source"] = str(Path(given["source"]).resolve())
-    if given["prices"] is not None:
-        found["prices"] = str(Path(given["prices"]).resolve())
-    return found
+    """The arguments that are paths on this machine, as `run` may take URLs. Raises QueueError for `--local`."""
+    if given["local"] is not None:
+        raise QueueError("--local: is for runs with a URL, which a queue does not take; leave it out")
+    names = [name for name in ("source", "output", "prices") if given[name] is not None]
+    return {name: str(Path(given[name]).resolve()) for name in names}
 
 
 def _check(given: dict[str, Any]) -> None:
