@@ -142,7 +142,7 @@ def _folder(given: Path | None) -> Path:
 
 
 def _absolute(given: dict[str, Any]) -> dict[str, str]:
-    """The arguments that are paths on this machine, as `run` may take URLs. Raises QueueError for `--local`."""
+    """Arguments that are paths: `run` takes URLs as well. Raises QueueError for `--local`."""
     if given["local"] is not None:
         raise QueueError("--local: is for runs with a URL, which a queue does not take; leave it out")
     names = [name for name in ("source", "output", "prices") if given[name] is not None]
