@@ -43,7 +43,9 @@ def shown() -> list[list[str]]:
 def test_commands_are_as_the_pages_show_them() -> None:
     assert len(shown()) > 8
     for arguments in shown():
-        command, words = get_command(app.app), list(arguments)
+        command, words, name, parent = get_command(app.app), list(arguments), "panolog", None
         while isinstance(command, typer.core.TyperGroup):
-            command = command.commands[words.pop(0)]
-        command.make_context("panolog", words, resilient_parsing=False)
+            parent = typer.Context(command, info_name=name, parent=parent)
+            name = words.pop(0)
+            command = command.commands[name]
+        command.make_context(name, words, parent=parent)

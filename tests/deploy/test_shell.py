@@ -27,7 +27,7 @@ def shellcheck(*arguments: str, text: str | None = None) -> None:
 
 
 def test_scripts() -> None:
-    shellcheck("--external-sources", "deploy/slurm.sh", "deploy/slurm-array.sh")
+    shellcheck("--external-sources", "deploy/slurm.sh", "deploy/slurm-array.sh", "deploy/nodes.sh")
     shellcheck("--shell=bash", "--exclude=SC2034", "deploy/recovery.env")  # settings for others to read
 
 

@@ -1,0 +1,81 @@
+"""Tasks of SkyPilot and dstack: what they start, and that the tools themselves read them, where installed."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.deploy.files import DEPLOY, load
+
+RECORDS = '#!/bin/bash\necho "${0##*/} $*" >> "$CALLS"\n'
+SCENE, RUN = "s3://bucket/scene", "s3://bucket/run"
+
+
+def started(tmp_path: Path, rank: int, *, exists: bool = False, heads: int = 1) -> list[str]:
+    """What `nodes.sh` calls. Args: exists, whether the run does; heads, times the first machine answers."""
+    calls = tmp_path / "calls"
+    programs = {
+        "panolog": RECORDS + ("" if exists else "[[ $1 != status ]] || exit 2\n"),
+        "ray": RECORDS
+        + '[[ $1 != health-check ]] || (($(grep --count health-check "$CALLS") <= HEADS)) || exit 1\n',
+        "sleep": "#!/bin/bash\n",
+    }
+    for name, text in programs.items():
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    environment = os.environ | {
+        "PATH": f"{tmp_path}:{os.environ['PATH']}",
+        "CALLS": str(calls),
+        "HEADS": str(heads),
+        "RANK": str(rank),
+        "HEAD": "10.0.0.4",
+    }
+    subprocess.run([DEPLOY / "nodes.sh", SCENE, RUN, "--seed", "3"], env=environment, check=True, timeout=60)
+    return calls.read_text().splitlines()
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_the_first_machine_starts_or_resumes_the_run(tmp_path: Path, exists: bool) -> None:
+    address = "--address=10.0.0.4:6380"
+    run = f"resume {RUN} {address}" if exists else f"run {SCENE} --output {RUN} {address} --seed 3"
+    assert started(tmp_path, 0, exists=exists) == [
+        "ray start --head --node-ip-address=10.0.0.4 --port=6380",
+        f"panolog status {RUN}",
+        f"panolog {run}",
+        "ray stop",
+    ]
+
+
+def test_another_machine_joins_again_until_the_first_has_ended(tmp_path: Path) -> None:
+    joined = [call for call in started(tmp_path, 2, heads=3) if "health-check" not in call]
+    assert joined == ["ray start --address=10.0.0.4:6380 --block"] * 2
+
+
+@pytest.mark.parametrize(
+    ("file", "rank", "commands"),
+    [
+        ("skypilot.yaml", "$SKYPILOT_NODE_RANK", lambda task: [task["setup"], task["run"]]),
+        ("panolog.dstack.yml", "$DSTACK_NODE_RANK", lambda task: task["commands"]),
+    ],
+)
+def test_the_tasks_start_it_with_their_rank(file: str, rank: str, commands: object) -> None:
+    assert callable(commands)
+    text = "\n".join(commands(load(file)))
+    assert f"RANK={rank} HEAD=" in text
+    assert 'deploy/nodes.sh "$SCENE" "$RUN" $OPTIONS' in text
+    assert "make setup" in text
+
+
+def test_skypilot_reads_its_task() -> None:
+    sky = pytest.importorskip("sky", reason="skypilot is not installed")
+    task = sky.Task.from_yaml(str(DEPLOY / "skypilot.yaml"))
+    assert task.num_nodes == 4
+    assert all(resources.use_spot for resources in task.resources)
+
+
+def test_dstack_reads_its_task() -> None:
+    models = pytest.importorskip(
+        "dstack._internal.core.models.configurations", reason="dstack is not installed"
+    )
+    assert models.parse_apply_configuration(load("panolog.dstack.yml")).nodes == 4
