@@ -125,7 +125,9 @@ class Mirror:
             entry = self._put(snapshot, DATABASE, self._files.get(DATABASE))
         finally:
             snapshot.unlink(missing_ok=True)
-        if last and self._done():
+        if last and self._delivered():
+            if any(known.key == name for name, known in self._files.items()):  # of an end before
+                self._publish(files | {DATABASE: entry}, moment)  # what is in force must not change
             files = self._publish_results(files)
         self._publish(files | {DATABASE: entry}, moment)
         self._cost = time.monotonic() - began
@@ -233,9 +235,10 @@ class Mirror:
         self._store.write(manifest.name, packed)
         self._say(announced=manifest.name)
         put_pointer(self._store, self._lease.number, manifest, packed)
-        for key in self._replaced:
-            self._store.remove(key)
         kept = {entry.key for entry in files.values()}
+        for key in self._replaced:
+            if key not in kept:  # a result by its name
+                self._store.remove(key)
         self._replaced = [it.key for it in self._files.values() if it.key not in kept]
         self._replaced += [self._state.published] if self._state.published else []
         self._files = files
@@ -255,7 +258,7 @@ class Mirror:
         self._swept = True
 
     def _publish_results(self, files: dict[str, Entry]) -> dict[str, Entry]:
-        """Gives the results of a run that is done their own names in the store."""
+        """Gives the results of a run that has a model their own names in the store."""
         named = dict(files)
         for name, entry in files.items():
             if is_result(name) and entry.key != name:
@@ -268,8 +271,9 @@ class Mirror:
         self._replaced += sorted(unnamed - {it.key for it in named.values()})
         return named
 
-    def _done(self) -> bool:
-        return replay(read_milestones(self._folder.database)).outcome == Outcome.DONE
+    def _delivered(self) -> bool:
+        outcome = replay(read_milestones(self._folder.database)).outcome
+        return outcome in (Outcome.DONE, Outcome.LIMITED)
 
     def _withdraw(self) -> None:
         """Removes a run that has been refused, from the store as from the disk."""

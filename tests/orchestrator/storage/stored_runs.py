@@ -42,8 +42,8 @@ class Driver:
             self._append(CheckpointSaved(COARSE, self.iteration, self.folder.relative(path), 3000))
 
     def end(self, outcome: Outcome = Outcome.DONE) -> None:
-        if outcome is Outcome.DONE:
-            write_bytes(self.folder.point_cloud, b"ply" * 1000)
+        if outcome in (Outcome.DONE, Outcome.LIMITED):
+            write_bytes(self.folder.point_cloud, b"ply" * (1000 + self.iteration))
         self._append(RunEnded(outcome))
 
     def _append(self, record: Record) -> None:

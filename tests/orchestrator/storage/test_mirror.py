@@ -12,6 +12,7 @@ import pytest
 
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.storage import lease as leases
 from panolog.orchestrator.storage.fetch import bring, for_status, viewed
 from panolog.orchestrator.storage.layout import (
@@ -77,7 +78,7 @@ def test_what_was_replaced_is_removed_and_results_have_their_names(tmp_path: Pat
     rounds(mirror)
     lease.release()
     assert holder(store) == ""
-    assert store.read("point_cloud.ply") == b"ply" * 1000
+    assert store.read("point_cloud.ply") == b"ply" * 1005
     assert store.read("run.json") == driver.folder.info.read_bytes()
     second, lease = mirror_of(driver, store)  # as by `resume` of a run that is done: nothing is stored again
     before = store.list()
@@ -93,6 +94,29 @@ def test_what_was_replaced_is_removed_and_results_have_their_names(tmp_path: Pat
     left = {it.split("/")[2] for it in store.list(OBJECTS) if it not in kept}
     assert left <= {"run.db", "coarse"}  # what the last round has replaced
     assert len(store.list(POINTERS)) == 1
+
+
+def test_results_of_a_run_that_a_limit_has_ended_are_replaced_when_it_is_completed(tmp_path: Path) -> None:
+    store = Watched(open_store(f"file://{tmp_path}/store").url)
+    driver, seen = Driver(tmp_path / "run"), 0
+    for outcome in (Outcome.LIMITED, Outcome.DONE):
+
+        def look() -> None:
+            nonlocal seen
+            if current(store) is not None:
+                seen += 1
+                fetched(store, tmp_path / f"fresh{seen}")  # whatever is in force has the bytes that it names
+
+        mirror, lease = mirror_of(driver, store)
+        store.after = look
+        driver.save()
+        driver.end(outcome)
+        rounds(mirror)
+        store.after = lambda: None
+        lease.release()
+        assert store.read("point_cloud.ply") == driver.folder.point_cloud.read_bytes()
+    assert seen > 10
+    assert files(fetched(store, tmp_path / "last").root) == files(driver.folder.root)
 
 
 def test_a_run_that_was_refused_leaves_nothing(tmp_path: Path) -> None:
