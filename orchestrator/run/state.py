@@ -384,10 +384,8 @@ def _attempt(task: TaskState, time: float) -> float:
 
 def _interrupted(task: TaskState, time: float | None) -> TaskState:
     """The task, if it was running, after the end of its driver at some time, None = unknown."""
-    if task.status != Status.RUNNING:
-        return task
     spent = task.spent if time is None else task.spent + _attempt(task, time)
-    return replace(task, status=task.at_rest, spent=spent)
+    return replace(task, status=task.at_rest, spent=spent) if task.status == Status.RUNNING else task
 
 
 def _outdate(state: RunState, task: TaskId) -> RunState:

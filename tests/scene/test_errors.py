@@ -21,6 +21,7 @@ PARENTS = {
     errors.ClusterLostError: errors.RunError,
     errors.RunFolderError: errors.InputError,
     errors.RunLockedError: errors.RunFolderError,
+    errors.QueueError: errors.InputError,
     errors.RunError: errors.PanologError,
 }
 

@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app
-from panolog.orchestrator.commands import session
+from panolog.orchestrator.commands import preparing, session
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run.config import RunConfig, load_config
@@ -199,7 +199,7 @@ def test_a_scene_far_from_its_origin_is_noticed(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     moved = replace(read_scene(scene), offset=(465_000.0, 5_250_000.0, 408.0))
-    monkeypatch.setattr(session, "read_scene", lambda _: moved)
+    monkeypatch.setattr(preparing, "read_scene", lambda _: moved)
     start(scene, tmp_path / "run")
     messages = [notice["message"] for notice in status(tmp_path / "run")["notices"]]
     assert any(str(moved.offset) in message for message in messages)

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
-from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
 PHONE, DESK = 390, 1440  # pixels
+expect.set_options(timeout=30_000)  # ms: Playwright's 5 s are too few on a loaded machine
 # What a browser reports of itself, whatever the page does: a screenshot has to wait for a software GPU.
 _NOISE = re.compile("GPU stall due to ReadPixels")
 

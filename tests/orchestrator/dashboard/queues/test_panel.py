@@ -149,6 +149,7 @@ def test_entries_are_moved_and_removed_by_keyboard(browser: Browser, tmp_path: P
         assert order(queue) == [1, 4, 3]
         queue.end(1, State.STOPPED, 130, "stopped by a user")
         page.get_by_role("button", name="Retry a").click()
+        expect(page.get_by_role("button", name="Retry a")).to_have_count(0)
         expect(page.locator("#queue-entries .run-name").nth(2)).to_have_text("a")
         assert queue.entry(1).state == State.WAITING
 
