@@ -233,7 +233,7 @@ def test_fingers_look_around_move_and_go_there(browser: Browser, site: str) -> N
         for at in (
             first,
             first + 0.1,
-        ):  # moments of their own: on a loaded machine the calls are farther apart
+        ):  # calls are farther apart on a loaded machine
             touch("touchStart", (195, 430), at=at)
             touch("touchEnd", at=at + 0.02)
         until(page, f"Math.hypot(...panolog.flight.position.map((x, i) => x - {before}[i])) > 1")
