@@ -7,6 +7,7 @@ more pixels than the panorama. Features are written in pixels of the panorama: m
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -42,12 +43,17 @@ class Faces:
 
     def view(self, panorama: NDArray[np.uint8], face: int) -> NDArray[np.uint8]:
         """(height, width) the view `face` of a grey panorama (width / 2, width)."""
+        u, v = _places(self, face)
+        return np.asarray(cv2.remap(panorama, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP), np.uint8)
+
+    def places(self, face: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(height, width) columns and rows of the panorama, in OpenCV's pixels, that a view's pixels show."""
         across, high = self.size(face)
         x, y = np.meshgrid(np.arange(across) + 0.5, np.arange(high) + 0.5)
         rays = self._rays(np.column_stack([x.ravel(), y.ravel()]), face)
         where = project_to_fractions(rays) * (self.width, self.width // 2) - 0.5
         u, v = (np.ascontiguousarray(axis.reshape(high, across), np.float32) for axis in where.T)
-        return np.asarray(cv2.remap(panorama, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP), np.uint8)
+        return u, v
 
     def to_panorama(self, pixels: NDArray[np.floating], face: int) -> tuple[Array, NDArray[np.bool_]]:
         """Where pixels (N, 2) of a view are in the panorama, with the centre of the first at (0.5, 0.5).
@@ -78,3 +84,9 @@ class Faces:
         sign = 1.0 if face == DOWN else -1.0
         rays: Array = np.column_stack([x, sign * (1 - square), -sign * y]) / (1 + square)[:, None]
         return rays
+
+
+@lru_cache(maxsize=3)
+def _places(faces: Faces, face: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """`Faces.places`, once for the panoramas of one size: it takes a third as long as finding features."""
+    return faces.places(face)
