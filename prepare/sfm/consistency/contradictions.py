@@ -100,8 +100,7 @@ def consistent_part(
     part, tree = set(rows), {edge for edge in skeleton.tree if set(edge) <= set(rows)}
     if is_repetitive(skeleton, rows):
         tree -= skeleton.rivalled
-        of = components(tree, len(evidence.rays))
-        part = max(({row for row in part if of[row] == of[one]} for one in sorted(part)), key=len)
+        part = _largest(part, tree, sorted(part), len(evidence.rays))
     for it in contradictions:
         if not set(it.between) <= part:
             continue
@@ -110,7 +109,12 @@ def consistent_part(
             part -= {max(it.between)}
             continue
         tree.remove(min(path, key=lambda edge: (coverage[edge], edge)))
-        sides = [{row for row in part if row == end or tree_path(tree, (end, row))} for end in it.between]
-        part = max(sides, key=len)
+        part = _largest(part, tree, it.between, len(evidence.rays))
         tree = {edge for edge in tree if set(edge) <= part}
     return sorted(part)
+
+
+def _largest(part: set[int], tree: set[Edge], ends: Sequence[int], count: int) -> set[int]:
+    """The rows of a part that a tree connects with one of the ends: the most, of equally many the first."""
+    of = components(tree, count)
+    return max(({row for row in part if of[row] == of[end]} for end in ends), key=len)
