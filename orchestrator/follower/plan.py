@@ -1,7 +1,6 @@
 """What a follower is to do, as the command line says it and as its process gets it: on stdin."""
 
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -11,6 +10,7 @@ from urllib.parse import urlsplit
 
 from panolog.orchestrator.follower.references import References
 from panolog.orchestrator.follower.targets import Target, read_targets
+from panolog.orchestrator.run.units import positive
 from panolog.scene.errors import ConfigError
 
 STALLED = "PANOLOG_NOTIFY_STALLED"  # minutes without a record after which a run counts as stalled
@@ -100,11 +100,4 @@ def _sink(text: str, environment: Mapping[str, str]) -> SinkChoice:
 
 
 def _stalled(environment: Mapping[str, str]) -> float:
-    text = environment.get(STALLED, "") or str(_STALLED_MIN)
-    try:
-        minutes = float(text)
-    except ValueError:
-        minutes = math.nan
-    if not 0 < minutes < 1e6:
-        raise ConfigError(f"{STALLED}={text}: write minutes, such as 30")
-    return 60 * minutes
+    return 60 * positive(STALLED, environment, _STALLED_MIN, "minutes, such as 30")

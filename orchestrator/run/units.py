@@ -1,4 +1,9 @@
-"""Numbers for people."""
+"""Numbers for people, and from them."""
+
+import math
+from collections.abc import Mapping
+
+from panolog.scene.errors import ConfigError
 
 
 def gib(size: float) -> str:
@@ -11,3 +16,15 @@ def duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def positive(name: str, environment: Mapping[str, str], default: float, hint: str) -> float:
+    """The number in a variable of the environment, or a default. Raises ConfigError with the hint."""
+    text = environment.get(name, "") or str(default)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < 1e6:
+        raise ConfigError(f"{name}={text}: write {hint}")
+    return value

@@ -1,7 +1,6 @@
 """Where a run in a store is on this machine, and what its mirror gets: on stdin, without a secret."""
 
 import json
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,6 +8,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.units import positive
 from panolog.orchestrator.storage.state import read_state
 from panolog.scene.errors import ConfigError
 from panolog.scene.stores.cache import cache_folder
@@ -17,6 +17,7 @@ from panolog.scene.stores.url import is_url, parse_url
 
 PERIOD, PATIENCE = "PANOLOG_STORE_SECONDS", "PANOLOG_STORE_PATIENCE_MINUTES"
 _PERIOD_S, _PATIENCE_MIN = 15.0, 30.0
+_NUMBER = "a number above 0"
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,8 @@ def plan_of(
             return None
         url = parse_url(noted.url)
     require_package(url)
-    period = _number(PERIOD, environment, _PERIOD_S)
-    patience = 60 * _number(PATIENCE, environment, _PATIENCE_MIN)
+    period = positive(PERIOD, environment, _PERIOD_S, _NUMBER)
+    patience = 60 * positive(PATIENCE, environment, _PATIENCE_MIN, _NUMBER)
     return Plan(root, str(url), resumes, force, period=period, patience=patience)
 
 
@@ -77,17 +78,6 @@ def plan_from_json(text: str) -> Plan:
     """The plan of a line of `to_json`."""
     content = json.loads(text)
     return Plan(**content | {"root": Path(content["root"])})
-
-
-def _number(name: str, environment: Mapping[str, str], default: float) -> float:
-    text = environment.get(name, "") or str(default)
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < 1e6:
-        raise ConfigError(f"{name}={text}: write a number above 0")
-    return value
 
 
 def shown(root: Path) -> str:
