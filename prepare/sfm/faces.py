@@ -46,15 +46,6 @@ class Faces:
         u, v = _places(self, face)
         return np.asarray(cv2.remap(panorama, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP), np.uint8)
 
-    def places(self, face: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(height, width) columns and rows of the panorama, in OpenCV's pixels, that a view's pixels show."""
-        across, high = self.size(face)
-        x, y = np.meshgrid(np.arange(across) + 0.5, np.arange(high) + 0.5)
-        rays = self._rays(np.column_stack([x.ravel(), y.ravel()]), face)
-        where = project_to_fractions(rays) * (self.width, self.width // 2) - 0.5
-        u, v = (np.ascontiguousarray(axis.reshape(high, across), np.float32) for axis in where.T)
-        return u, v
-
     def to_panorama(self, pixels: NDArray[np.floating], face: int) -> tuple[Array, NDArray[np.bool_]]:
         """Where pixels (N, 2) of a view are in the panorama, with the centre of the first at (0.5, 0.5).
 
@@ -88,5 +79,13 @@ class Faces:
 
 @lru_cache(maxsize=3)
 def _places(faces: Faces, face: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """`Faces.places`, once for the panoramas of one size: it takes a third as long as finding features."""
-    return faces.places(face)
+    """(height, width) columns and rows of the panorama, in OpenCV's pixels, that a view's pixels show.
+
+    Once for the panoramas of one size: it takes a third as long as finding their features.
+    """
+    across, high = faces.size(face)
+    x, y = np.meshgrid(np.arange(across) + 0.5, np.arange(high) + 0.5)
+    rays = faces._rays(np.column_stack([x.ravel(), y.ravel()]), face)
+    where = project_to_fractions(rays) * (faces.width, faces.width // 2) - 0.5
+    u, v = (np.ascontiguousarray(axis.reshape(high, across), np.float32) for axis in where.T)
+    return u, v
