@@ -14,6 +14,7 @@ from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.machine import cores
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import NONE, Message, Pool
+from panolog.orchestrator.resources.scaling import Growth
 from panolog.orchestrator.run.config import change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import make_info, read_info, write_info
@@ -57,6 +58,14 @@ class OneAtATime:
     def notices(self) -> Mapping[str, LeaveNotice]:
         """As the pool."""
         return self.pool.notices()
+
+    def growth(self) -> Growth:
+        """As the pool."""
+        return self.pool.growth()
+
+    def request(self, wanted: Mapping[str, int]) -> None:
+        """Requests machines of the pool."""
+        self.pool.request(wanted)
 
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         """Runs a spec with all cores, or on its GPU."""

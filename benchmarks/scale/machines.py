@@ -41,7 +41,8 @@ _STEPS = 30_000
 _TITAN_RTX = 672.0  # GB/s of memory, as the vendor says; so are those below
 _CORES = 8  # of the host, for each GPU
 _PANORAMAS = 5637  # of the paper's four scenes; it does not say how many each has
-_WIDTH = 3840
+WIDTH = 3840
+DISTRICT = round(_PANORAMAS / 4)  # panoramas of one of them, and of a city's district
 _DECODE = 0.25  # seconds of a panorama of that width on a core, assumed
 
 
@@ -74,8 +75,8 @@ class Machines:
         return tuple(Node(str(i), str(i), _CORES * n, n * 2**36, (gpu,) * n) for i, n in enumerate(sizes))
 
 
-_RTX_4090, _H100 = Card("RTX 4090", 23 * 2**30, 1008.0), Card("H100", 78 * 2**30, 3350.0)
-MACHINES = (Machines(_RTX_4090, 1), Machines(_RTX_4090, 8), Machines(_H100, 64))
+RTX_4090, _H100 = Card("RTX 4090", 23 * 2**30, 1008.0), Card("H100", 78 * 2**30, 3350.0)
+MACHINES = (Machines(RTX_4090, 1), Machines(RTX_4090, 8), Machines(_H100, 64))
 
 
 @dataclass(frozen=True)
@@ -117,27 +118,27 @@ def seconds(gaussians: float, pixels: float, card: Card) -> float:
 
 def hours(panoramas: int, machines: Sequence[Machines] = MACHINES) -> Iterator[Hours]:
     """The paper's scenes, then a city of so many panoramas in the recipe that is the default."""
-    each = round(_PANORAMAS / 4)
-    scene = city(each, _WIDTH)
+    each = DISTRICT
+    scene = city(each, WIDTH)
     for name in ("nsc", "nsk", "bax", "nsn"):
         size = next(row.size for row in SCENES[name].rows if row.method == "PanoLOG (paper)") or 0.0
         count = round(size * BYTES / (4 * len(COLUMNS)))
         config = RunConfig.model_validate(
-            {"recipe": "paper", "width": _WIDTH, "device": "cuda", "densify": {"max_gaussians": count}}
+            {"recipe": "paper", "width": WIDTH, "device": "cuda", "densify": {"max_gaussians": count}}
         )
         for on in machines:
             yield _hours(name.upper(), scene, config, on)
-    large = city(panoramas, _WIDTH)
+    large = city(panoramas, WIDTH)
     districts = max(1, panoramas // each)
     blocks = max(2, round(panoramas / PER_BLOCK))
-    config = change(settings(_WIDTH, "cuda"), {"districts": districts})
+    config = change(settings(WIDTH, "cuda"), {"districts": districts})
     config = change(config, balanced(large, config, blocks))
     for on in machines:
         yield _hours(f"a city of {panoramas:,}", large, config, on)
 
 
 def _hours(place: str, scene: Scene, config: RunConfig, machines: Machines) -> Hours:
-    estimate = Estimator(scene, config, _basis(scene, config, machines.card), machines.nodes).estimate()
+    estimate = Estimator(scene, config, basis_on(scene, config, machines.card), machines.nodes).estimate()
     memory = max(stage.device for stage in estimate.stages)
     return Hours(
         place=place,
@@ -158,7 +159,7 @@ def _sum(estimate: Estimate, names: Sequence[Stage]) -> float:
     return sum(stage.seconds or 0.0 for stage in estimate.stages if stage.name in names) / 3600
 
 
-def _basis(scene: Scene, config: RunConfig, card: Card) -> Basis:
+def basis_on(scene: Scene, config: RunConfig, card: Card) -> Basis:
     """What a calibration would have measured if the law held."""
     basis, pixels = assumed(scene, config), scene.width * (scene.width // 2)
     first = basis.measured.initial

@@ -21,7 +21,7 @@ from panolog.orchestrator.resources.watch import Watch
 from panolog.orchestrator.run.records import Leaving
 from panolog.workers import stopping
 
-_UNUSED_S = 60.0  # for which a node has no task of the run before its agent ends
+_UNUSED_S = 5.0  # for which a node has no task of the run before its agent ends
 _ANSWER_S = 600.0  # after which an agent without news answers anyway
 
 

@@ -16,7 +16,7 @@ from ray.exceptions import (
 )
 
 from panolog.orchestrator.resources.pool import Failed, first_line
-from panolog.orchestrator.run.nodes import MACHINE_DIED, MACHINE_GONE
+from panolog.orchestrator.run.machines.nodes import MACHINE_DIED, MACHINE_GONE
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import ClusterLostError
 

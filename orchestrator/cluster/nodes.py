@@ -71,6 +71,11 @@ class RayNodes:
         """Node.id of those that are alive, as of the last query."""
         return self._alive
 
+    @property
+    def joining(self) -> int:
+        """How many machines that are alive have not described themselves yet, as of the last query."""
+        return len(self._alive & self._pending.keys())
+
     def refresh(self) -> None:
         """Queries Ray anew the next time: a machine may be gone."""
         self._queried = float("-inf")

@@ -8,8 +8,9 @@ import os
 import socket
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Set
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Set
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +22,7 @@ from ray.util import register_serializer
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from panolog.orchestrator.cluster.agents import Agents
+from panolog.orchestrator.cluster.autoscaler import Autoscaler
 from panolog.orchestrator.cluster.failures import CUT_OFF, failure_of, reported
 from panolog.orchestrator.cluster.files import FileSharing, RayValue, run_remotely
 from panolog.orchestrator.cluster.nodes import RayNodes
@@ -30,6 +32,7 @@ from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.machine import oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, Message, guarded
+from panolog.orchestrator.resources.scaling import NO_GROWTH, Growth
 from panolog.orchestrator.resources.usage import Usage, with_usage
 from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Failure
@@ -64,20 +67,39 @@ class RayPool:
         self._places = None if sharing is None else Places()
         self._nodes = RayNodes(self._name)
         self._agents = Agents(self._nodes.home)
+        self._autoscaler = None if sharing is None else Autoscaler(self._name)
         self._running: dict[TaskId, _Task] = {}
 
     @reported
     def nodes(self) -> tuple[Node, ...]:
-        """The machines that are there now."""
-        return self._nodes.alive()
+        """The machines that are there now, but those on which nothing runs and nothing is to start."""
+        unused = self._nodes.draining().keys() - self._busy()  # the autoscaler removes them
+        return tuple(node for node in self._nodes.alive() if node.id not in unused)
 
     @reported
     def notices(self) -> dict[str, LeaveNotice]:
         """Which machines have announced that they leave, as of the last look at them."""
-        busy = {running.placement.node for running in self._running.values()}
         draining = self._nodes.draining()
-        self._agents.review(self._nodes.ids, draining, busy)
+        self._agents.review(self._nodes.ids, draining, self._busy())
         return self._agents.notices() | draining
+
+    def _busy(self) -> set[str]:
+        return {running.placement.node for running in self._running.values()}
+
+    @reported
+    def growth(self) -> Growth:
+        """What Ray's autoscaler could start, and does."""
+        if self._autoscaler is None:
+            return NO_GROWTH
+        growth, alive = self._autoscaler.growth(), self._nodes.ids
+        members = {id: group for id, group in growth.members.items() if id in alive}
+        return replace(growth, members=members, joining=self._nodes.joining)
+
+    @reported
+    def request(self, wanted: Mapping[str, int]) -> None:
+        """Requests so many machines more than there are, by the name of their group, and no others."""
+        if self._autoscaler is not None:
+            self._autoscaler.request(wanted, self._nodes.ids)
 
     @reported
     def put(self, value: T) -> RayValue[T]:
@@ -179,7 +201,10 @@ class RayPool:
         return message
 
     def close(self) -> None:
-        """Ends what the pool has on its machines besides tasks."""
+        """Ends what the pool has on its machines besides tasks, and its requests for others."""
+        if self._autoscaler is not None:
+            with suppress(RayError):  # Ray itself has failed, and its requests with it
+                self._autoscaler.close()
         self._agents.close()
 
     def _forget(self, task: TaskId) -> None:

@@ -231,7 +231,7 @@ class _Beginning:
         self._measure(info.config)
         self.journal.record([Preparing("calibrating")])
         prices, local = prices_of(self.journal.state), self.address is None
-        found = _examine(workers, self.scene, info.config, root, self.warn, prices, local=local)
+        found = _examine(workers, self.scene, info.config, root, self.warn, prices, self._doing, local=local)
         found.require()
         info = info.model_copy(update={"config": found.config})
         self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
@@ -245,12 +245,11 @@ class _Beginning:
 
     def _measure(self, config: RunConfig) -> None:
         """Keeps what Stage I begins with, if it is to learn how panoramas were captured."""
-
-        def doing(what: str) -> None:
-            self.journal.record([Preparing(what)])
-
-        found = Measuring(self.scene, config, doing, self.warn).found()
+        found = Measuring(self.scene, config, self._doing, self.warn).found()
         self.journal.until_done(lambda: save_measured(self.folder, found, self.scene))
+
+    def _doing(self, what: str) -> None:
+        self.journal.record([Preparing(what)])
 
     def warn(self, line: str) -> None:
         """Something the user should read once."""
@@ -299,11 +298,12 @@ def _examine(
     root: Path,
     warn: Callable[[str], None],
     prices: PriceList | None,
+    say: Callable[[str], None] = ignore,
     *,
     local: bool,
 ) -> Preflight:
     device = _device(config.device, pool, warn, local=local)
-    return examine(pool, scene, config.model_copy(update={"device": device}), root, prices)
+    return examine(pool, scene, config.model_copy(update={"device": device}), root, prices, say)
 
 
 @contextmanager
@@ -362,7 +362,7 @@ def _device(wanted: str, pool: Pool, warn: Callable[[str], None], *, local: bool
     """The device that "auto" means here. Raises InputError if CUDA is wanted and there is none."""
     if local:
         return choose_device(wanted, warn)
-    gpus = any(node.gpus for node in pool.nodes())
+    gpus = any(node.gpus for node in pool.nodes()) or any(group.gpus for group in pool.growth().groups)
     if wanted == "cuda" and not gpus:
         raise ClusterError("--device cuda: no node of the cluster has a GPU; see `ray status`")
     return "cuda" if wanted != "cpu" and gpus else "cpu"

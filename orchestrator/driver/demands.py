@@ -1,15 +1,24 @@
 """What each task demands of a machine: from the scene, the plan and what the run has measured so far."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.estimates.calibration import basis_of
-from panolog.orchestrator.estimates.costs import CostModel, predictor, seconds_left
+from panolog.orchestrator.estimates.costs import (
+    Estimate,
+    block_times,
+    fit,
+    in_all,
+    predictor,
+    seconds_left,
+    slowness,
+)
 from panolog.orchestrator.estimates.estimate import Estimator
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.placement import USABLE, Demand, Running
+from panolog.orchestrator.resources.scaling import Work
 from panolog.orchestrator.run.records import BlockPlan, Failure
 from panolog.orchestrator.run.state import RunState
 from panolog.scene.ply import ply_header
@@ -18,22 +27,41 @@ from panolog.workers.training.config import CacheConfig
 
 _SMALLER = 1 / 4  # of the image cache, after a shortage of memory
 _FREE = 1 / 2  # of a machine's free memory that its tasks on GPUs fill with decoded panoramas
+_SOME = ""  # a kind of place of which nothing is known: the average one
 _OF_LOST = 0.2  # of an error: whatever ends a process says little about its node
 
 
 class Demands:
     """Makes the demands of tasks at one moment of a run."""
 
-    def __init__(self, sizes: "Sizes", state: RunState, model: CostModel) -> None:
+    def __init__(self, sizes: "Sizes", state: RunState) -> None:
         self._sizes = sizes
         self._state = state
-        self._model = model
+        self._samples = block_times(state)
+        self._model = fit(self._samples)
         kinds, plan = (TaskId.block, TaskId.round), state.plan or ()
         self._blocks = {kind(block.block): block for kind in kinds for block in plan}
 
     def of(self, tasks: Iterable[TaskId]) -> list[Demand]:
         """Those of tasks that wait."""
         return [self._demand(task) for task in tasks]
+
+    def work(self, tasks: Sequence[TaskId]) -> Work:
+        """What of a stage waits, with how long each task and the whole stage are expected to take."""
+        demands, stage = self.of(tasks), tasks[0].stage if tasks else Stage.MERGE
+        each = [demand.seconds(_SOME) for demand in demands]
+        blocks = [(b.cameras, b.gaussians) for b in self._state.plan or () if b.train]
+        if stage is Stage.BLOCK and self._samples:
+            return Work(demands, each, in_all(self._samples, blocks))
+        expected = self._sizes.expected(stage, self._state) if tasks else None
+        if expected is None:
+            return Work(demands, each)
+        seconds, count = expected
+        if stage in (Stage.BLOCK, Stage.ROUND):
+            relative = sum(predictor(self._model, *block)(_SOME) for block in blocks)
+        else:
+            relative = float(count)
+        return Work(demands, [one * seconds / relative for one in each], seconds)
 
     def running(self, placements: Mapping[TaskId, Placement], now: float) -> list[Running]:
         """Where tasks run, and for how long they still do. Args: now, seconds since the epoch."""
@@ -89,9 +117,19 @@ class Sizes:
 
     @cached_property
     def _coarse(self) -> int:
-        estimator = self._estimator
-        stage = estimator.estimate().stages[0]
+        stage = self._estimate.stages[0]
         return stage.device or stage.host
+
+    def expected(self, stage: Stage, state: RunState) -> tuple[float, int] | None:
+        """Seconds of all tasks of a stage, one after another, and how many these are; None if not known."""
+        for found in self._estimate.stages:
+            if found.name is stage and found.seconds:
+                return found.seconds * slowness(state), found.tasks
+        return None
+
+    @cached_property
+    def _estimate(self) -> Estimate:
+        return self._estimator.estimate()
 
     def _of_blocks(self, state: RunState) -> Mapping[int, int]:
         """By block; they are counted once, with the plan."""

@@ -22,8 +22,7 @@ from panolog.orchestrator.driver.requests import Requests, Stop
 from panolog.orchestrator.driver.results import Deliver, OnPlan, Results
 from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save, tidy
 from panolog.orchestrator.driver.writers import Writers
-from panolog.orchestrator.estimates import costs
-from panolog.orchestrator.resources import placement, quarantine
+from panolog.orchestrator.resources import quarantine
 from panolog.orchestrator.resources.delivery import Large, payload
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
@@ -66,6 +65,7 @@ from panolog.workers.training.trainer import TrainSpec
 _WAIT_S = 0.5  # after which the display is refreshed without a message
 _TURN_S = 0.05  # the same while something large is written
 _REVIEW_S = 60.0  # after which it is decided anew whether a task waits for another node than where it failed
+_LOOK_S = 10.0  # the same while machines are on their way
 _ENDS = (Trained, Scored, Ended, Failed)  # after these messages another task may start
 
 
@@ -118,7 +118,7 @@ class Driver:
         self._requests = Requests(job.folder, journal, self._stop)
         journal.patience = Patience(job.folder.root, retry, self._presence, self._requests.poll)
         self._writers = Writers(self._save, journal, retry, clock)
-        self._machines = Machines(pool, journal, job.config, clock)
+        self._machines = Machines(pool, journal, job, clock)
         self._purse = Purse(journal, clock)
         self._nodes: tuple[Node, ...] = ()
         self._usages = Usages(job.folder, journal.database, clock)
@@ -232,6 +232,7 @@ class Driver:
         if len(tasks) != 1 or (make := self._results.maker(tasks[0], self._state)) is None:
             self._place(tasks)
             return
+        self._place(())  # takes requests for machines back
         with self._stop.at_once():
             records = self._journal.until_done(make)
         self._news = True
@@ -239,17 +240,18 @@ class Driver:
 
     def _place(self, tasks: Sequence[TaskId]) -> None:
         """Starts those of the tasks for which there is room now."""
-        demands = Demands(self._sizes, self._state, costs.fit(costs.block_times(self._state)))
+        demands = Demands(self._sizes, self._state)
         placements = {task: attempt.placement for task, attempt in self._attempts.items()}
         running = demands.running(placements, self._clock.time())
         nodes = quarantine.usable(self._state, self._nodes)
-        cuda = self._job.config.device == "cuda"
-        placed = placement.place(demands.of(tasks), nodes, running, cuda=cuda)
+        placed = self._machines.place(demands.work(tasks), running, nodes)
         for task, where in placed:
             self._start(task, where)
         _LOG.debug("%d tasks wait for free resources", len(tasks) - len(placed))
         if any(self._state.task(task).failures and task not in self._attempts for task in tasks):
             self._again = self._clock.monotonic() + _REVIEW_S
+        if self._machines.expecting:
+            self._again = self._clock.monotonic() + _LOOK_S
 
     def _start(self, task: TaskId, where: Placement) -> None:
         spec = self._journal.until_done(lambda: self._specs_at(task.stage).of(task))

@@ -1,24 +1,37 @@
 """The machines of a run, as its driver sees them from turn to turn."""
 
 from collections.abc import Sequence
+from datetime import datetime
 
+from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
+from panolog.orchestrator.estimates.calibration import basis_of
+from panolog.orchestrator.money.prices import of_record, reserved
 from panolog.orchestrator.resources import leaving, placement, quarantine
+from panolog.orchestrator.resources.expected import Coming, Expected
 from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.resources.placement import Placed, Running
 from panolog.orchestrator.resources.pool import Pool
+from panolog.orchestrator.resources.scaling import Growth, Work
 from panolog.orchestrator.run.clock import Clock
-from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.records import NodeLeaving
+from panolog.orchestrator.run.records import NodeLeaving, Noticed, Record, RunContinued, RunWaiting
 
 
 class Machines:
-    """Which there are, which leave, and which are in quarantine."""
+    """Which there are, which leave, which are in quarantine, and which are on their way."""
 
-    def __init__(self, pool: Pool, journal: Journal, config: RunConfig, clock: Clock) -> None:
+    def __init__(self, pool: Pool, journal: Journal, job: Job, clock: Clock) -> None:
         self._pool = pool
         self._journal = journal
-        self._config = config
+        self._config = job.config
         self._clock = clock
+        self._expected = Expected(clock, basis_of(job.folder, job.scene, job.config).joined)
+        self._waits = ""  # why nothing runs, as it was recorded last
+        self._since = 0.0  # Clock.monotonic() of that
+
+    @property
+    def _cuda(self) -> bool:
+        return self._config.device == "cuda"
 
     def review(self) -> tuple[list[Node], bool]:
         """The nodes that can run tasks and do not leave, and whether others may be used than before.
@@ -26,7 +39,7 @@ class Machines:
         Records which nodes have announced that they leave, and quarantines.
         """
         there = self._pool.nodes()
-        able = placement.able(there, cuda=self._config.device == "cuda")
+        able = placement.able(there, cuda=self._cuda)
         left = self._review_leaving(there, able)
         nodes = leaving.staying(self._journal.state, able)
         return nodes, self._review_quarantines(nodes) or left
@@ -36,9 +49,73 @@ class Machines:
         state = self._journal.state
         if not leaving.announced(state, node):
             return ""
-        able = placement.able(self._pool.nodes(), cuda=self._config.device == "cuda")
+        able = placement.able(self._pool.nodes(), cuda=self._cuda)
         stays = any(other.id == node for other in leaving.staying(state, able))
         return "" if stays else state.nodes[node].host
+
+    def place(self, work: Work, running: Sequence[Running], nodes: Sequence[Node]) -> list[Placed]:
+        """The tasks that start now; requests the machines that the others should have.
+
+        Args: work, all tasks that wait; running, what runs; nodes that can be used.
+        """
+        growth = self._pool.growth()
+        come = self._grow(growth, work, running, nodes) if growth.groups else Coming()
+        every, busy = [*nodes, *come.nodes], [*running, *come.fill]
+        placed = placement.place(work.demands, every, busy, cuda=self._cuda)
+        idle = bool(work.demands) and not placed and not running
+        self._explain(self._why(growth) if idle else "")
+        return placed
+
+    @property
+    def expecting(self) -> bool:
+        """Whether machines have been requested that are not there yet, or one is needed."""
+        return bool(self._expected.since or self._waits)
+
+    def _grow(self, growth: Growth, work: Work, running: Sequence[Running], nodes: Sequence[Node]) -> Coming:
+        """Requests what a stage should have besides, and returns what is coming."""
+        budget = self._journal.state.money.budget
+        prices = of_record(budget.prices) if budget else None
+        settings, cuda = self._config.scaling, self._cuda
+
+        def price(node: Node) -> float | None:
+            return reserved(node, prices).price
+
+        scaling = self._expected.scaling(growth, nodes, settings.overhead, price, cuda=cuda)
+        found = self._expected.decide(scaling, work, running, nodes, settings.patience)
+        if found.more:
+            texts = {group.name: group.text() for group in growth.groups}
+            names = ", ".join(f"{count} more of {texts[name]}" for name, count in found.more.items())
+            stage = work.demands[0].task.stage
+            self._journal.record([Noticed(None, f"requested from Ray's autoscaler for {stage}: {names}")])
+        self._pool.request(found.wanted)
+        return found
+
+    def _why(self, growth: Growth) -> str:
+        """Why nothing can start."""
+        what = "GPU" if self._cuda else "core"
+        if not growth.groups:
+            able = placement.able(self._pool.nodes(), cuda=self._cuda)
+            return "" if able else f"waiting for a machine with a {what}: the cluster has none now"
+        trouble = f"; it reports: {growth.trouble}" if growth.trouble else ""
+        since = self._expected.since
+        if not since:
+            return (
+                f"waiting for a machine with a {what}: Ray's autoscaler has started all that it may{trouble}"
+            )
+        when = f"{datetime.fromtimestamp(self._expected.first).astimezone():%H:%M:%S}"
+        texts = {group.name: group.text() for group in growth.groups}
+        names = ", ".join(f"{len(times)} of {texts[name]}" for name, times in since.items())
+        return f"waiting for machines: {names}, requested from Ray's autoscaler at {when}{trouble}"
+
+    def _explain(self, why: str) -> None:
+        """Records that nothing runs, and why, or that something does again."""
+        if why == self._waits:
+            return
+        now = self._clock.monotonic()
+        self._since = self._since if self._waits else now
+        self._waits = why
+        record: Record = RunWaiting(why) if why else RunContinued(now - self._since)
+        self._journal.record([record])
 
     def _review_leaving(self, there: Sequence[Node], able: Sequence[Node]) -> bool:
         records = leaving.changes(self._journal.state, there, self._pool.notices())

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.estimates.costs import whole_seconds
+from panolog.orchestrator.estimates.costs import slowness
 from panolog.orchestrator.money import prices
 from panolog.orchestrator.money.losses import lost_at
 from panolog.orchestrator.resources.nodes import Node
@@ -28,11 +28,10 @@ from panolog.orchestrator.run.records import Record, TaskFailed
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.units import duration
 from panolog.scene.errors import ConfigError
-from panolog.workers.tasks import COARSE, MERGE, Stage
+from panolog.workers.tasks import MERGE, Stage
 
 _AFTER = (Stage.MERGE, Stage.MEASURE, Stage.EVAL, Stage.DELIVER)  # the stages after the training
 _UNSURE = 1.2  # times what is estimated of these: estimates of them were up to a fifth too low
-_SLOWEST = 4.0  # times the estimate: beyond, it was not of this machine
 _TURN_S = 2.0  # in which tasks take note of a stop, and the driver of their end
 _NEAR = 0.8  # of a limit, from which on people are warned
 
@@ -54,12 +53,6 @@ def after_training(estimate: Mapping[str, float | None] | None) -> float:
     Args: estimate, `PreflightSaved.seconds`.
     """
     return sum((estimate or {}).get(stage) or 0.0 for stage in _AFTER)
-
-
-def slowness(state: RunState) -> float:
-    """How much longer Stage I takes than was estimated, at least 1: what follows on the machine does too."""
-    expected, taken = (state.estimate or {}).get(Stage.COARSE), whole_seconds(state.task(COARSE))
-    return min(max(1.0, taken / expected), _SLOWEST) if expected and taken else 1.0
 
 
 def verdict(state: RunState, now: float, saving: float) -> BudgetNear | BudgetReached | None:

@@ -9,6 +9,7 @@ ones, which are larger, find no room: 1.5 to 1.9 kB for each Gaussian were measu
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ from panolog.orchestrator.resources import placement
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.resources.placement import Demand
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
+from panolog.orchestrator.resources.scaling import Scaling
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Failure
@@ -53,6 +55,7 @@ class Basis:
     measured: Calibration
     startup: float  # seconds from the start of a task to its first message
     timed: bool = True  # False: nothing was measured, and times are not known
+    joined: float | None = None  # seconds from the request for a machine until it was there
 
     def as_json(self) -> dict[str, Any]:
         """For `preflight.json`, where the calibration has the name of its task."""
@@ -91,6 +94,32 @@ def basis_of(folder: RunFolder, scene: Scene, config: RunConfig) -> Basis:
         return TypeAdapter(Basis).validate_python(json.loads(folder.preflight.read_bytes())["basis"])
     except (OSError, ValueError, KeyError, TypeError):  # a run can continue without it
         return assumed(scene, config)
+
+
+def await_machine(
+    pool: Pool, need: Callable[[], int], say: Callable[[str], None], *, cuda: bool
+) -> float | None:
+    """Waits until there is a machine for tasks, if Ray's autoscaler can start one, and requests it.
+
+    Returns after how many seconds it came; None if there was one, or none can be started.
+
+    Args: need, returns the bytes of memory that a task should have; say, called with why it waits.
+    """
+    said, began = "", time.monotonic()
+    while not placement.able(pool.nodes(), cuda=cuda):
+        growth = pool.growth()
+        groups = Scaling(growth, cuda, overhead=0.0).preferred(need())
+        if not groups:
+            return None
+        pool.request({groups[0].name: 0 if growth.joining else 1})
+        text = f"waiting for a machine: {groups[0].text()} is requested from Ray's autoscaler"
+        text += f"; it reports: {growth.trouble}" if growth.trouble else ""
+        if text != said:
+            say(text)
+            said = text
+        pool.ready(_WAIT_S)
+    pool.request({})
+    return time.monotonic() - began if said else None
 
 
 def calibrate(pool: Pool, scene: Scene, config: RunConfig) -> Basis:

@@ -19,11 +19,12 @@ from panolog.orchestrator.estimates.calibration import Basis
 from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.scene.images import MOST_THREADS
 from panolog.workers.growth import Period
-from panolog.workers.tasks import Stage, TaskId
+from panolog.workers.tasks import COARSE, Stage, TaskId
 
 _DECODERS = 4  # threads that decode panoramas on the CPU, at most
 EXPECTED = 0.1  # a and b: ten recorded runs had 0.0 to 0.1
 _NOISE = 0.05  # of the logarithm of a measured time: in those it was 0.02 to 0.04
+_SLOWEST = 4.0  # times the estimate: beyond, it was not of this machine
 _SPREAD = 0.5  # of a, b and log(slowness) about what is expected before anything is known
 _VAGUE = 1e3  # of log(c): anything goes
 WELL = 0.05  # of its iterations after which the rate of a running block predicts how long it will take
@@ -155,6 +156,19 @@ def fit(samples: Sequence[BlockTime]) -> CostModel:
     return CostModel(scale, a, b, tuple(zip(kinds, slow, strict=True)))
 
 
+def in_all(samples: Sequence[BlockTime], blocks: Sequence[tuple[int, int]]) -> float:
+    """Seconds of all blocks one after another: what is expected before anything is known, to scale.
+
+    The fitted exponents of few samples may be far off for the blocks that are unlike them.
+
+    Args: samples, at least one; blocks, cameras and Gaussians of each.
+    """
+    expected, kind = CostModel(), samples[0].kind
+    measured = sum(expected.seconds(one.cameras, one.gaussians, kind) for one in samples)
+    scale = sum(one.seconds for one in samples) / measured
+    return scale * sum(expected.seconds(cameras, gaussians, kind) for cameras, gaussians in blocks)
+
+
 def block_times(state: RunState) -> list[BlockTime]:
     """What the run has measured so far, in the order of the blocks."""
     tasks = [(block, state.task(TaskId.block(block.block))) for block in state.plan or ()]
@@ -174,6 +188,12 @@ def whole_seconds(task: TaskState) -> float | None:
         well = progress.iteration - task.begun >= WELL * progress.iterations
         return progress.iterations / progress.rate if well else None
     return None
+
+
+def slowness(state: RunState) -> float:
+    """How much longer Stage I takes than was estimated, at least 1: what follows on the machine does too."""
+    expected, taken = (state.estimate or {}).get(Stage.COARSE), whole_seconds(state.task(COARSE))
+    return min(max(1.0, taken / expected), _SLOWEST) if expected and taken else 1.0
 
 
 def seconds_left(task: TaskState, predicted: float, running: float) -> float:

@@ -2,12 +2,12 @@
 
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from panolog.orchestrator.estimates.calibration import Basis, calibrate
+from panolog.orchestrator.estimates.calibration import Basis, assumed, await_machine, calibrate
 from panolog.orchestrator.estimates.costs import Estimate, StageEstimate
 from panolog.orchestrator.estimates.estimate import Estimator
 from panolog.orchestrator.estimates.parts import districts_of
@@ -19,16 +19,19 @@ from panolog.orchestrator.estimates.suggestions import (
     within_memory,
 )
 from panolog.orchestrator.estimates.workers import Workers, workers
-from panolog.orchestrator.money.prices import PriceList
+from panolog.orchestrator.money.prices import PriceList, reserved
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Pool
+from panolog.orchestrator.resources.scaling import Scaling
 from panolog.orchestrator.run.config import AUTO, RunConfig, change
+from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.units import duration, gib
 from panolog.partition.assignment import OVERLAP
 from panolog.partition.balance import Budget, fewest_blocks
 from panolog.scene.errors import InputError
 from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
+from panolog.workers.tasks import Stage
 
 _CAMERAS = 16  # a block that is only there to keep a machine busy has at least so many
 
@@ -90,14 +93,28 @@ class Preflight:
 
 
 def examine(
-    pool: Pool, scene: Scene, config: RunConfig, root: Path, prices: PriceList | None = None
+    pool: Pool,
+    scene: Scene,
+    config: RunConfig,
+    root: Path,
+    prices: PriceList | None = None,
+    say: Callable[[str], None] = ignore,
 ) -> Preflight:
     """Calibrates and estimates a job whose run folder is to be `root`; refuses nothing yet.
 
-    Args: config with width and device resolved; prices of machines, if they are known. Raises InputError if
-    an image of the scene is wrong.
+    Where there is no machine and an autoscaler can start one, one is requested and waited for. What it could
+    start besides counts.
+
+    Args: config with width and device resolved; prices of machines, if they are known; say, called with why
+    it waits. Raises InputError if an image of the scene is wrong.
     """
-    basis, nodes = calibrate(pool, scene, config), pool.nodes()
+
+    def need() -> int:
+        return _most_memory(_whole(scene, config, assumed(scene, config)))
+
+    joined = await_machine(pool, need, say, cuda=config.device == "cuda")
+    basis = replace(calibrate(pool, scene, config), joined=joined)
+    nodes = _potential(pool, scene, config, basis, prices)
     estimator, free = estimator_of(scene, config, basis, nodes), free_disk(root)
     chosen: Settings = {}
     if config.memory is not None and not config.densify.max_gaussians:
@@ -120,6 +137,35 @@ def examine(
 
     table = workers(on, nodes, prices)
     return Preflight(estimator.config, basis, estimator.estimate(), nodes, free, why, chosen, table)
+
+
+def _whole(scene: Scene, config: RunConfig, basis: Basis) -> Estimate:
+    """Of a job on one machine, one task after another."""
+    one = config if config.decided else change(config, {"blocks": "1x1x1"})
+    return Estimator(scene, one, basis, ()).estimate()
+
+
+def _most_memory(estimate: Estimate) -> int:
+    """Bytes of the largest task."""
+    return max(stage.device or stage.host for stage in estimate.stages)
+
+
+def _potential(
+    pool: Pool, scene: Scene, config: RunConfig, basis: Basis, prices: PriceList | None
+) -> tuple[Node, ...]:
+    """The machines that a job may have: those that are there, and those that an autoscaler would start."""
+    growth, nodes = pool.growth(), pool.nodes()
+    if not growth.groups:
+        return nodes
+    known = {growth.members[node.id]: node for node in nodes if node.id in growth.members}
+
+    def price(node: Node) -> float | None:
+        return reserved(node, prices).price
+
+    scaling = Scaling(growth, config.device == "cuda", config.scaling.overhead, known=known, price=price)
+    estimate = _whole(scene, config, basis)
+    refining = [stage.seconds for stage in estimate.stages if stage.name is Stage.BLOCK]
+    return tuple(scaling.potential(_most_memory(estimate), sum(filter(None, refining)), nodes))
 
 
 def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[Node]) -> Estimator:

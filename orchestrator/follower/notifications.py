@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from panolog.orchestrator.run.machines.nodes import MACHINE_DIED, MACHINE_GONE, leave_text
 from panolog.orchestrator.run.money.records import BudgetNear
-from panolog.orchestrator.run.nodes import MACHINE_DIED, MACHINE_GONE, leave_text
 from panolog.orchestrator.run.records import (
     Failure,
     Leaving,

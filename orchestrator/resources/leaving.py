@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from panolog.orchestrator.resources.nodes import Node
-from panolog.orchestrator.run.nodes import Leave
+from panolog.orchestrator.run.machines.nodes import Leave
 from panolog.orchestrator.run.records import Failure, Leaving, NodeLeaving, NodeLeft, NodeStaying, Noticed
 from panolog.orchestrator.run.state import RunState
 

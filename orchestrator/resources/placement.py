@@ -108,6 +108,19 @@ def largest(nodes: Sequence[Node], *, cuda: bool) -> int:
     return max((device.memory for device in _devices(nodes, (), cuda=cuda)), default=0)
 
 
+def free_times(
+    demands: Sequence[Demand], nodes: Sequence[Node], running: Sequence[Running], *, cuda: bool
+) -> list[float]:
+    """Seconds until each place for one of such tasks is free, 0 for those that are."""
+    times = list[float]()
+    for number, device in enumerate(_devices(nodes, running, cuda=cuda)):
+        if cuda:
+            times += [slot.free_in for slot in _slots(number, device, _shares(device.memory, demands))]
+        else:  # tasks share a node's cores, and take longer by as much: as one place for one after another
+            times.append(sum(t.left * t.placement.cpus for t in device.tasks) / device.node.cpus)
+    return times
+
+
 def _devices(nodes: Sequence[Node], running: Sequence[Running], *, cuda: bool) -> list[_Device]:
     """All GPUs, or all nodes that have cores."""
 

@@ -14,6 +14,7 @@ import torch
 from panolog.orchestrator.resources.delivery import Large
 from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.resources.scaling import NO_GROWTH, Growth
 from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import DeviceError, InputError, PanologError, RunError
@@ -83,6 +84,12 @@ class Pool(Sharing, Protocol):
     def notices(self) -> Mapping[str, LeaveNotice]:
         """Which machines have announced that they leave, by Node.id."""
 
+    def growth(self) -> Growth:
+        """What an autoscaler could start, and does."""
+
+    def request(self, wanted: Mapping[str, int]) -> None:
+        """Requests so many machines more than there are, by the name of their group, and no others."""
+
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         """Runs a spec there."""
 
@@ -129,7 +136,7 @@ def first_line(text: str) -> str:
 
 
 class InProcess:
-    """`Sharing` with this process itself."""
+    """`Sharing` with this process itself, on machines that are all there."""
 
     def put(self, value: T) -> Value[T]:
         """The value."""
@@ -138,3 +145,10 @@ class InProcess:
     def share_files(self, _scene: Iterable[Path], _run: Iterable[Path]) -> Locate:
         """Every file is where it is."""
         return here
+
+    def growth(self) -> Growth:
+        """No machine can be started."""
+        return NO_GROWTH
+
+    def request(self, _wanted: Mapping[str, int]) -> None:
+        """Nothing."""

@@ -11,8 +11,8 @@ If all nodes are in quarantine, the cause is hardly a node: a mount, a switch, t
 from collections.abc import Iterable, Sequence
 
 from panolog.orchestrator.resources.nodes import Node
-from panolog.orchestrator.run.config import QuarantineConfig
-from panolog.orchestrator.run.nodes import NodeState
+from panolog.orchestrator.run.machines.config import QuarantineConfig
+from panolog.orchestrator.run.machines.nodes import NodeState
 from panolog.orchestrator.run.records import Failure, NodeQuarantined, NodeReleased, Noticed
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.run.units import duration

@@ -10,6 +10,7 @@ from typing import Any, Literal, cast
 import yaml
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from panolog.orchestrator.run.machines.config import DeadlinesConfig, QuarantineConfig, ScalingConfig
 from panolog.partition.cells import MOST_BLOCKS, Cells, Cuts, Grid
 from panolog.partition.plan import PartitionConfig
 from panolog.scene.errors import ConfigError
@@ -68,34 +69,6 @@ class PassesConfig(Group):
         """Those that there are, in order."""
         parts = {Stage.ROUND: self.round, Stage.REPAIR: self.repair}
         return tuple(stage for stage, part in parts.items() if part)
-
-
-class DeadlinesConfig(Group):
-    """From when on a silent worker counts as hung: it is ended and its task is tried again."""
-
-    hello: float = Field(
-        default=600.0,
-        gt=0,
-        description="seconds from the start of a worker to its first message; on a shared cluster those in"
-        " which it waits for its place do not count",
-    )
-    message: float = Field(
-        default=600.0,
-        gt=0,
-        description="seconds between two messages of a worker, if ten times its usual interval is less",
-    )
-
-
-class QuarantineConfig(Group):
-    """When nothing more is placed on a node."""
-
-    failures: int = Field(
-        default=3,
-        ge=1,
-        description="failures of different tasks on a node, without a success there in between, after which"
-        " nothing is placed on it",
-    )
-    seconds: float = Field(default=3600.0, gt=0, description="seconds after which it is used again")
 
 
 class RetentionConfig(Group):
@@ -189,6 +162,7 @@ class RunConfig(TrainConfig):
     eval: EvalConfig = EvalConfig()
     deadlines: DeadlinesConfig = DeadlinesConfig()
     quarantine: QuarantineConfig = QuarantineConfig()
+    scaling: ScalingConfig = ScalingConfig()
     disk: DiskConfig = DiskConfig()
     retention: RetentionConfig = RetentionConfig()
 

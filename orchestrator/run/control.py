@@ -21,7 +21,7 @@ from typing_extensions import assert_never
 
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.nodes import NodeState
+from panolog.orchestrator.run.machines.nodes import NodeState
 from panolog.orchestrator.run.records import (
     NodeReleased,
     Noticed,

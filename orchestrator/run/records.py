@@ -300,7 +300,7 @@ class TaskYielded:
 
 @dataclass(frozen=True)
 class RunWaiting:
-    """The disk of the run takes nothing for now: it is full or cannot be reached."""
+    """The run waits: its disk is full or cannot be reached, or there is no machine for its tasks."""
 
     reason: str  # for people: what is wrong, and what to do about it
     task: None = None
@@ -308,7 +308,7 @@ class RunWaiting:
 
 @dataclass(frozen=True)
 class RunContinued:
-    """The disk of the run takes data again."""
+    """The run does not wait any more."""
 
     seconds: float  # that the run has waited
     task: None = None

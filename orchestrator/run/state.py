@@ -6,9 +6,9 @@ from typing import Any
 
 from typing_extensions import assert_never
 
+from panolog.orchestrator.run.machines.nodes import Nodes, NodeState, by_host, follow, leave_text, take_over
 from panolog.orchestrator.run.money.records import BudgetReached, BudgetSet
 from panolog.orchestrator.run.money.spending import Spending, spend
-from panolog.orchestrator.run.nodes import Nodes, NodeState, by_host, follow, leave_text, take_over
 from panolog.orchestrator.run.records import (
     BlockPlan,
     CheckpointSaved,
@@ -119,7 +119,7 @@ class RunState:
     away: tuple[tuple[float, float], ...] = ()  # when no driver was at work on it, between two
     step: str = ""  # what the driver does before its first task
     preparing: bool = False  # whether that is a part of making the scene
-    waiting: str = ""  # why the run waits for its disk; "" if it does not
+    waiting: str = ""  # why the run waits for its disk or a machine; "" if it does not
     estimate: dict[str, float | None] | None = None  # `PreflightSaved.seconds`
     nodes: Nodes = field(default_factory=dict)
     money: Spending = field(default_factory=Spending)

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, SkipValidation
 
 from panolog.orchestrator.money.account import MoneyView, view_money
 from panolog.orchestrator.run.folder import command_line
-from panolog.orchestrator.run.nodes import Leave, NodeState, why_leaving
+from panolog.orchestrator.run.machines.nodes import Leave, NodeState, why_leaving
 from panolog.orchestrator.run.records import Leaving, task_name
 from panolog.orchestrator.run.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.views.timing import eta_of, run_eta, seconds_of, share_of, tasks_of
@@ -142,7 +142,7 @@ class SummaryHead(ViewModel):
     stage: str
     step: Text | None  # what the driver does before its first task
     reason: Text | None  # why the run has failed, or that its driver is lost
-    waiting: Text  # why it waits for its disk, and what to do about it; "" if it does not
+    waiting: Text  # why it waits for its disk or a machine; "" if it does not
     resume: Text | None  # the command that resumes it
     seconds: float | None
     eta: float | None

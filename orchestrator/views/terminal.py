@@ -13,8 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from panolog.orchestrator.run.folder import RunFolder, command_line, read_json
+from panolog.orchestrator.run.machines.nodes import leave_text
 from panolog.orchestrator.run.money.records import BudgetNear, BudgetReached
-from panolog.orchestrator.run.nodes import leave_text
 from panolog.orchestrator.run.records import (
     Delivered,
     EvaluationSaved,
@@ -276,9 +276,9 @@ class _Lines:
         if state.preparing and not news and time.monotonic() - self._step >= _LINES:
             self._step = time.monotonic()
             self._console.print(state.step, highlight=False, markup=False, soft_wrap=True)
-        if state.waiting != self._waiting:  # a full disk takes no record of it
+        if state.waiting != self._waiting:  # also if a full disk takes no record of it
             self._waiting = state.waiting
-            line = state.waiting or "the disk takes data again: the run continues"
+            line = state.waiting or "the run continues"
             self._console.print(line, highlight=False, markup=False, soft_wrap=True)
         for stored in news:
             record = stored.record

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 import torch
 
-from panolog.orchestrator.driver.purse import require_enough, slowness, verdict
+from panolog.orchestrator.driver.purse import require_enough, verdict
+from panolog.orchestrator.estimates.costs import slowness
 from panolog.orchestrator.money.losses import lost_with_driver
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.run.money.records import BudgetNear, BudgetReached, BudgetSet, WorkLost

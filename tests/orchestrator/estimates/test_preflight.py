@@ -13,7 +13,8 @@ from panolog.orchestrator.estimates.preflight import Preflight, choose_blocks, e
 from panolog.orchestrator.estimates.suggestions import DETAIL, problem
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import NONE, Failed
-from panolog.orchestrator.run.config import DeadlinesConfig, RunConfig, change
+from panolog.orchestrator.run.config import RunConfig, change
+from panolog.orchestrator.run.machines.config import DeadlinesConfig
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene

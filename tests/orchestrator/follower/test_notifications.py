@@ -12,8 +12,8 @@ from panolog.orchestrator.follower.watcher import Watcher
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.machines.nodes import MACHINE_DIED
 from panolog.orchestrator.run.money.records import BudgetNear, BudgetReached
-from panolog.orchestrator.run.nodes import MACHINE_DIED
 from panolog.orchestrator.run.presence import Presence
 from panolog.orchestrator.run.records import (
     CheckpointSaved,

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from panolog.orchestrator.run.nodes import why_leaving
+from panolog.orchestrator.run.machines.nodes import why_leaving
 from panolog.orchestrator.run.records import (
     Leaving,
     NodeLeaving,
@@ -157,7 +157,7 @@ def test_plain_lines_say_it_also_where_no_record_can_be_stored() -> None:
             show(replace(RunState(), waiting=text), ())
     assert isinstance(console.file, StringIO)
     lines = console.file.getvalue().splitlines()
-    assert lines == ["disk full", "the disk takes data again: the run continues"]
+    assert lines == ["disk full", "the run continues"]
 
 
 def test_commands_have_the_path_of_the_run() -> None:

@@ -8,7 +8,7 @@ import pytest
 from panolog.orchestrator.resources import quarantine
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Failed
-from panolog.orchestrator.run.config import QuarantineConfig
+from panolog.orchestrator.run.machines.config import QuarantineConfig
 from panolog.orchestrator.run.records import (
     BlockPlan,
     CheckpointSaved,
