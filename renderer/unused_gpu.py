@@ -1,28 +1,14 @@
 """Why torch uses no GPU of this machine, where nvidia-smi lists one. Does not need the compiled core."""
 
 import os
-import shutil
-import subprocess
 
 import torch
+
+from panolog.renderer.nvidia_smi import nvidia_smi
 
 # The oldest driver by major version of CUDA: "CUDA Compatibility" of NVIDIA, minor version compatibility.
 _DRIVERS = {11: 450, 12: 525, 13: 580}
 _HIDDEN = ("", "-1")  # CUDA_VISIBLE_DEVICES of a user, or of Ray, who wants no GPU
-_TIMEOUT_S = 30.0  # a machine without persistence mode wakes its GPUs first
-
-
-def nvidia_smi(fields: str) -> list[list[str]]:
-    """The rows that nvidia-smi prints of all GPUs, with these fields; none where it is missing or fails."""
-    program = shutil.which("nvidia-smi")
-    if program is None:
-        return []
-    command = [program, f"--query-gpu={fields}", "--format=csv,noheader,nounits"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return []
-    return [[cell.strip() for cell in line.split(",")] for line in done.stdout.splitlines()]
 
 
 def unused_gpu() -> str | None:

@@ -4,7 +4,7 @@ import inspect
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,6 +13,9 @@ from panolog.orchestrator.cli.console import command, print_result, progress_bar
 from panolog.orchestrator.cli.options import JsonOption, preparation, run_config, wanted
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import QueueError
+
+if TYPE_CHECKING:
+    from panolog.orchestrator.queue.entries import Needs
 
 _KEPT = {"prices", "max_cost", "deadline", "local", "force"}  # the run itself has them, or a queue has none
 app = typer.Typer(
@@ -25,6 +28,38 @@ QueueOption = Annotated[
         metavar="DIR",
         help="Folder of the queue, on a disk of this machine. Default: PANOLOG_QUEUE, or"
         " ~/.local/state/panolog/queue.",
+    ),
+]
+_SHARE = "Share of the machine (docs/queue.md)"  # the panel of these options in the help
+GpusOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        min=0,
+        max=1024,
+        help="GPUs that the run has for itself. Default: an even part; 0 with --device cpu.",
+        rich_help_panel=_SHARE,
+    ),
+]
+CoresOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        min=1,
+        max=65_536,
+        help="CPU cores that the run has for itself. Default: an even part.",
+        rich_help_panel=_SHARE,
+    ),
+]
+RamOption = Annotated[
+    float | None,
+    typer.Option(
+        "--ram",
+        metavar="GIB",
+        min=0.1,
+        max=1e6,
+        help="Main memory of this machine that the run may use. Default: an even part.",
+        rich_help_panel=_SHARE,
     ),
 ]
 IdArg = Annotated[int, typer.Argument(metavar="ID", min=1, help="Number of an entry; see `queue list`.")]
@@ -48,19 +83,29 @@ def _as_run(command: Callable[..., None]) -> Callable[..., None]:
 
 @app.command(cls=Command)
 @_as_run
-def add(context: typer.Context, queue: QueueOption = None, **given: Any) -> None:
-    """Add a run to the queue: the arguments and options of `panolog run`."""
+def add(
+    context: typer.Context,
+    queue: QueueOption = None,
+    gpus: GpusOption = None,
+    cores: CoresOption = None,
+    ram: RamOption = None,
+    **given: Any,
+) -> None:
+    """Add a run to the queue: the arguments and options of `panolog run`.
+
+    A --deadline such as 6h counts from the start of the run, one such as 2026-12-24T08:00 is what it says.
+    """
     from panolog.orchestrator.queue.entries import Command as Words
     from panolog.orchestrator.queue.store import opened
 
     given |= _absolute(given)
     root = Path(given["output"])
-    _check(given)
+    needs = _needs(_check(given), given["address"], {"--gpus": gpus, "--cores": cores, "--ram": ram})
     first = tuple(_words(context, given, inspect.signature(runs.run).parameters))
     resumes = inspect.signature(runs.resume).parameters.keys() - _KEPT
     later = tuple(_words(context, given, resumes))
     with opened(_folder(queue)) as found:
-        print(found.add(Words(root, first, later, Path.cwd())))
+        print(found.add(Words(root, first, later, Path.cwd(), needs)))
 
 
 @app.command("list", cls=Command)
@@ -119,7 +164,12 @@ def retry(id: IdArg, queue: QueueOption = None) -> None:
 
 @app.command(cls=Command)
 def run(
-    at_once: Annotated[int, typer.Option(metavar="N", min=1, max=64, help="Runs side by side.")] = 1,
+    at_once: Annotated[
+        int,
+        typer.Option(
+            metavar="N", min=1, max=64, help="Runs side by side at most; each has its share of the machine."
+        ),
+    ] = 1,
     wait: Annotated[
         bool, typer.Option("--wait", help="Wait for new entries when none is left, until a signal.")
     ] = False,
@@ -149,8 +199,31 @@ def _absolute(given: dict[str, Any]) -> dict[str, str]:
     return {name: str(Path(given[name]).resolve()) for name in names}
 
 
-def _check(given: dict[str, Any]) -> None:
-    """Everything that `panolog run` checks before it trains. Raises InputError as it does."""
+def _needs(device: str, address: str | None, given: dict[str, Any]) -> "Needs | None":
+    """What the run is to get of this machine; None if it is on a cluster.
+
+    Args: given, by option. Raises QueueError for options that contradict the run's own.
+    """
+    from panolog.orchestrator.queue.entries import Needs
+
+    gpus, cores, ram = given.values()
+    if address is not None:
+        for name, value in given.items():
+            if value is not None:
+                raise QueueError(f"{name} {value}: with --address Ray divides the cluster; leave it out")
+        return None
+    if device == "cpu" and gpus:
+        raise QueueError(f"--gpus {gpus}: the run computes on the CPU (device=cpu); leave it out")
+    if device == "cuda" and gpus == 0:
+        raise QueueError("--gpus 0: the run computes on a GPU (device=cuda); give 1 or more")
+    return Needs(0 if device == "cpu" else gpus, cores, None if ram is None else int(ram * 2**30))
+
+
+def _check(given: dict[str, Any]) -> str:
+    """Everything that `panolog run` checks before it trains. Returns the device of the settings.
+
+    Raises InputError as it does.
+    """
     from panolog.orchestrator.follower.plan import read_plan
 
     def made(make: Callable[..., Any]) -> Any:
@@ -168,6 +241,7 @@ def _check(given: dict[str, Any]) -> None:
         from panolog.orchestrator.commands import session
 
         session.check(given["source"], output, config, options)
+    return str(config.device)
 
 
 def _words(context: typer.Context, given: dict[str, Any], wanted: Any) -> Iterator[str]:

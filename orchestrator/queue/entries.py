@@ -27,6 +27,24 @@ class Identity:
 
 
 @dataclass(frozen=True)
+class Needs:
+    """What a run is to get of the machine; None: as `shares.Machine.wanted` chooses."""
+
+    gpus: int | None = None
+    cores: int | None = None
+    memory: int | None = None  # bytes of main memory
+
+
+@dataclass(frozen=True)
+class Share:
+    """What a run has of the machine while it works; None: all, undivided."""
+
+    gpus: tuple[str, ...] | None = None  # as CUDA_VISIBLE_DEVICES calls them
+    cores: tuple[int, ...] | None = None
+    memory: int | None = None  # bytes of main memory
+
+
+@dataclass(frozen=True)
 class Command:
     """What `queue add` was given."""
 
@@ -34,6 +52,7 @@ class Command:
     first: tuple[str, ...]  # words that follow `panolog run`
     later: tuple[str, ...]  # words that follow `panolog resume RUN`
     folder: Path  # in which both are executed
+    needs: Needs | None = Needs()  # None: nothing of this machine, the run is on a cluster
 
 
 @dataclass(frozen=True)
@@ -51,7 +70,8 @@ class Entry:
     starts: int = 0
     losses: int = 0  # supervisors in a row that were soon killed, while the runner lived
     code: int | None = None  # exit code of its end
-    reason: str = ""  # why it has failed or was stopped, one line
+    reason: str = ""  # why it has failed or was stopped, or what it waits for; one line
+    share: Share | None = None  # what it has while it works; None: nothing, or it has not begun
 
     @property
     def interrupted(self) -> bool:

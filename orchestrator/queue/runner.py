@@ -8,6 +8,9 @@ next runner resumes it first. It begins a run only when nothing of an earlier st
   ends at the gate, and nothing of the run has begun.
 - A process counts as that of an entry only with the same boot of the machine, number and moment of its start.
 - While a driver has the lock of the run folder, the run is alive, however it was started.
+
+Runs start strictly in order: one that waits for its share of the machine keeps those after it waiting, so
+that a large one gets its turn. One that needs more than the machine has fails, and keeps none waiting.
 """
 
 import os
@@ -17,12 +20,13 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from panolog.orchestrator.queue.entries import Entry, State
+from panolog.orchestrator.queue.entries import Entry, Share, State
 from panolog.orchestrator.queue.processes import Processes
+from panolog.orchestrator.queue.shares import Machine, NeverFitsError, environment
 from panolog.orchestrator.queue.store import Queue
 from panolog.orchestrator.resources.children import bound_to_parent, signals_blocked
 from panolog.orchestrator.run import lock
@@ -52,6 +56,7 @@ class Limits:
     forever: bool = False  # wait for new entries when none is left
     program: tuple[str, ...] = PROGRAM  # that takes the words of an entry
     processes: Processes = field(default_factory=Processes)
+    machine: Machine = field(default_factory=Machine.own)
 
 
 @contextmanager
@@ -117,7 +122,7 @@ class _Runner:
             self._end_ended()
             if not self.stopping:
                 self._start()
-            idle = not self.live and not self.resumed and not self._written(self.queue.waits)
+            idle = not self.live and not self.resumed and self._written(self.queue.next) is None
             if (self.stopping and not self.live) or (idle and not self.limits.forever):
                 break
             self._take(_POLL_S)
@@ -141,12 +146,42 @@ class _Runner:
     def _start(self) -> None:
         """Starts what there is room for: first what is to be resumed, then what waits, each in order."""
         while len(self.live) < self.limits.at_once:
-            entry = self.resumed.pop(0) if self.resumed else self._written(self.queue.claim)
+            entry = self.resumed[0] if self.resumed else self._written(self.queue.next)
             if entry is None:
                 return
-            self._launch(entry)
+            try:
+                share = self._share(entry)
+            except NeverFitsError as error:
+                if claimed := self._claimed(entry):
+                    self._end(claimed, State.FAILED, None, str(error))
+                continue
+            if isinstance(share, str):
+                self._wait(entry, share)
+                return
+            if claimed := self._claimed(entry):
+                self._launch(claimed, share)
 
-    def _launch(self, entry: Entry) -> None:
+    def _share(self, entry: Entry) -> Share | str | None:
+        """What of the machine an entry gets now, or what it waits for; None for one on a cluster."""
+        machine, at_once = self.limits.machine, self.limits.at_once
+        held = [it.entry.share for it in self.live.values() if it.entry.share is not None]
+        wanted = machine.wanted(entry, at_once)
+        return None if wanted is None else machine.share(wanted, held, at_once)
+
+    def _claimed(self, entry: Entry) -> Entry | None:
+        """An entry that is to start or to fail, as running; None if it was moved away meanwhile."""
+        if self.resumed and self.resumed[0] is entry:
+            return self.resumed.pop(0)
+        return self._written(lambda: self.queue.claim(entry.id))
+
+    def _wait(self, entry: Entry, reason: str) -> None:
+        if entry.reason != reason:
+            self._written(lambda: self.queue.note(entry.id, reason))
+            self.say(f"{entry.id}: {reason}")
+            if self.resumed:
+                self.resumed[0] = replace(entry, reason=reason)
+
+    def _launch(self, entry: Entry, share: Share | None) -> None:
         root = entry.command.run
         resumes = entry.interrupted and RunFolder(root).info.exists()
         words = ("resume", str(root), *entry.command.later) if resumes else ("run", *entry.command.first)
@@ -159,6 +194,7 @@ class _Runner:
                     stdout=log,
                     stderr=log,
                     cwd=entry.command.folder,
+                    env={**os.environ, **environment(share)},
                     start_new_session=True,  # a terminal's Ctrl-C reaches it through the runner alone
                     preexec_fn=bound_to_parent(self.before),  # noqa: PLW1509  # there are no other threads
                 )
@@ -168,7 +204,9 @@ class _Runner:
         assert child.stdin is not None  # a pipe
         with suppress(ProcessLookupError, BrokenPipeError):  # it was killed at the gate
             identity = self.limits.processes.identity(child.pid)
-            self._written(lambda: self.queue.launched(entry.id, identity))
+            if share is not None and share.cores is not None:
+                os.sched_setaffinity(child.pid, share.cores)  # which all that it starts has too
+            self._written(lambda: self.queue.launched(entry.id, identity, share))
             child.stdin.write(b"\n")
             child.stdin.flush()
         with suppress(BrokenPipeError):

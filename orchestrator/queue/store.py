@@ -10,22 +10,23 @@ import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from panolog.orchestrator.queue.entries import Command, Entry, Identity, State
+from panolog.orchestrator.queue.entries import Command, Entry, Identity, Needs, Share, State
 from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.scene.errors import QueueError
 from panolog.scene.files import user_folder
 
 DATABASE = "queue.db"
-_VERSION = 1  # of the schema
+_VERSION = 2  # of the schema
 _MOST = 10_000  # entries that are not removed
 _LASTING_S = 600.0  # after which the kill of a process is none in a row with those before
 _TIMEOUT_S = 10.0  # to wait for other commands
 _COLUMNS = (
     "id, position, state, run, first, later, folder, added, began, ended, boot, pid, started, starts, losses,"
-    " code, reason"
+    " code, reason, needs, share"
 )
 _STATES = ", ".join(f"'{state}'" for state in State)
 _SCHEMA = f"""
@@ -37,8 +38,12 @@ CREATE TABLE entries (
     starts INTEGER NOT NULL DEFAULT 0, losses INTEGER NOT NULL DEFAULT 0, code INTEGER,
     reason TEXT NOT NULL DEFAULT '');
 CREATE INDEX by_position ON entries (position) WHERE state != 'removed';
-PRAGMA user_version = {_VERSION};
 """
+# By the version that they make. Rows of version 1 have no needs.
+_CHANGES = {
+    1: _SCHEMA,
+    2: "ALTER TABLE entries ADD COLUMN needs TEXT; ALTER TABLE entries ADD COLUMN share TEXT",
+}
 
 
 def default_folder() -> Path:
@@ -82,11 +87,12 @@ class Queue:
         self._connection.execute("PRAGMA journal_mode = WAL")
         self._connection.execute("PRAGMA synchronous = FULL")  # a start is on disk before the run begins
         version = self._version()
-        if version == 0:
+        if version < _VERSION:
             with self._transaction():
-                if self._version() == 0:  # another command may have been quicker
-                    for statement in filter(str.strip, _SCHEMA.split(";")):
+                for made in range(self._version() + 1, _VERSION + 1):  # another command may have been quicker
+                    for statement in filter(str.strip, _CHANGES[made].split(";")):
                         self._connection.execute(statement)
+                    self._connection.execute(f"PRAGMA user_version = {made}")
         if version > _VERSION:
             raise QueueError(
                 f"{self.folder}: the queue is of a newer PanoLOG (version {version}, this one knows"
@@ -121,10 +127,11 @@ class Queue:
                 )
             words = (json.dumps(command.first), json.dumps(command.later))
             row = (last + 1, State.WAITING, str(command.run), *words, str(command.folder), self._clock.time())
+            needs = json.dumps(command.needs and asdict(command.needs))
             number = self._connection.execute(
-                "INSERT INTO entries (position, state, run, first, later, folder, added)"
-                " VALUES (?, ?, ?, ?, ?, ?, ?)",
-                row,
+                "INSERT INTO entries (position, state, run, first, later, folder, added, needs)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                (*row, needs),
             ).lastrowid
         assert number is not None  # of an INSERT
         return number
@@ -143,9 +150,9 @@ class Queue:
         """Those that have begun and whose end is not known, in order."""
         return self._select("state = 'running'")
 
-    def waits(self) -> bool:
-        """Whether any entry waits."""
-        return bool(self._select("state = 'waiting' LIMIT 1", order=False))
+    def next(self) -> Entry | None:
+        """The first that waits; None if none does."""
+        return next(iter(self._select("state = 'waiting' ORDER BY position, id LIMIT 1", order=False)), None)
 
     def move(self, id: int, before: int | None) -> None:
         """Moves a waiting entry before another one, or to the end. Raises QueueError if one does not wait."""
@@ -181,26 +188,33 @@ class Queue:
             changes = {"position": last + 1, "ended": None, "code": None, "reason": "", "losses": 0}
             self._update(id, state=State.WAITING, **changes)
 
-    def claim(self) -> Entry | None:
-        """The first waiting entry, which is running from now on; None if none waits."""
+    def claim(self, id: int) -> Entry | None:
+        """A waiting entry, which is running from now on; None if it does not wait any more."""
         with self._transaction():
-            for entry in self._select("state = 'waiting'"):
-                self._update(entry.id, state=State.RUNNING, began=self._clock.time())
-                return self.entry(entry.id)
+            for _ in self._select("id = ? AND state = 'waiting'", (id,)):
+                self._update(id, state=State.RUNNING, began=self._clock.time(), reason="")
+                return self.entry(id)
         return None
 
-    def launched(self, id: int, process: Identity) -> None:
-        """Notes the process of a running entry, before anything of the run begins."""
+    def note(self, id: int, reason: str) -> None:
+        """Notes what an entry waits for; does nothing for one that has ended or was removed meanwhile."""
+        with self._transaction():
+            for _ in self._select("id = ? AND state IN ('waiting', 'running')", (id,)):
+                self._update(id, reason=reason)
+
+    def launched(self, id: int, process: Identity, share: Share | None = None) -> None:
+        """Notes process and share of a running entry, before anything of the run begins."""
         with self._transaction():
             starts = self._require(id, State.RUNNING, doing="started").starts + 1
-            changes = {"boot": process.boot, "pid": process.pid, "started": process.started}
-            self._update(id, starts=starts, began=self._clock.time(), **changes)
+            changes = {"boot": process.boot, "pid": process.pid, "started": process.started, "reason": ""}
+            held = None if share is None else json.dumps(asdict(share))
+            self._update(id, starts=starts, began=self._clock.time(), share=held, **changes)
 
     def end(self, id: int, state: State, code: int | None, reason: str) -> None:
         """Notes how a running entry has ended."""
         with self._transaction():
             self._require(id, State.RUNNING, doing="ended")
-            self._update(id, state=state, code=code, reason=reason, ended=self._clock.time())
+            self._update(id, state=state, code=code, reason=reason, ended=self._clock.time(), share=None)
 
     def lose(self, id: int) -> int:
         """Counts that the process of a running entry was killed; returns how often in a row, each soon."""
@@ -226,7 +240,7 @@ class Queue:
         sql = f"SELECT {_COLUMNS} FROM entries WHERE {condition}" + " ORDER BY position, id" * order
         try:
             return [_entry(row) for row in self._connection.execute(sql, values).fetchall()]
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, KeyError) as error:
             raise QueueError(f"{self.folder / DATABASE}: is damaged: {error}; move it away") from error
 
     @contextmanager
@@ -259,9 +273,24 @@ def _unusable(path: Path, error: sqlite3.Error) -> QueueError:
 
 def _entry(row: Sequence[Any]) -> Entry:
     id, position, state, run, first, later, folder, added, began, ended, boot, pid, started, *rest = row
-    starts, losses, code, reason = rest
-    command = Command(Path(run), tuple(json.loads(first)), tuple(json.loads(later)), Path(folder))
+    starts, losses, code, reason, needs, share = rest
+    words = tuple(json.loads(first))
+    command = Command(Path(run), words, tuple(json.loads(later)), Path(folder), _needs(needs, words))
     process = None if boot is None else Identity(boot, pid, started)
+    held = None if share is None else _share(json.loads(share))
     return Entry(
-        id, position, State(state), command, added, began, ended, process, starts, losses, code, reason
+        *(id, position, State(state), command, added, began, ended, process, starts, losses, code, reason),
+        share=held,
     )
+
+
+def _needs(text: str | None, words: tuple[str, ...]) -> Needs | None:
+    if text is None:  # version 1
+        return None if "--address" in words else Needs()
+    values = json.loads(text)
+    return None if values is None else Needs(**values)
+
+
+def _share(values: dict[str, Any]) -> Share:
+    lists = {name: None if values[name] is None else tuple(values[name]) for name in ("gpus", "cores")}
+    return Share(**lists, memory=values["memory"])

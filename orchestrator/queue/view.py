@@ -2,13 +2,14 @@
 
 import shlex
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.queue.entries import Entry, State
 from panolog.orchestrator.queue.processes import Processes
 from panolog.orchestrator.queue.runner import lock_of, log_of, sole_runner
+from panolog.orchestrator.queue.shares import describe
 from panolog.orchestrator.queue.store import Queue
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
@@ -54,6 +55,8 @@ class QueueView:
             "starts": entry.starts,
             "exit_code": entry.code,
             "reason": entry.reason,
+            "needs": None if command.needs is None else asdict(command.needs),
+            "share": None if entry.share is None else asdict(entry.share),
         }
 
     def lines(self) -> Iterator[str]:
@@ -61,7 +64,8 @@ class QueueView:
         rows = [(str(entry.id), self.label(entry), str(entry.command.run)) for entry in self.entries]
         width = max((len(id) for id, _, _ in rows), default=0)
         for (id, label, run), entry in zip(rows, self.entries, strict=True):
-            yield f"{id:>{width}}  {label:<11}  {run}" + (f"  ({entry.reason})" if entry.reason else "")
+            more = "; ".join(filter(None, (describe(entry), entry.reason)))
+            yield f"{id:>{width}}  {label:<11}  {run}" + (f"  ({more})" if more else "")
         if not rows:
             yield f"the queue {self.folder} is empty"
         elif not self.runner and any(_open(entry) for entry in self.entries):

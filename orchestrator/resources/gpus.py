@@ -5,7 +5,7 @@ import time
 from dataclasses import dataclass
 
 from panolog.orchestrator.resources.nodes import Gpu
-from panolog.renderer.unused_gpu import nvidia_smi
+from panolog.renderer.nvidia_smi import nvidia_smi
 
 _FREE = "index,uuid,name,memory.free,memory.total"
 _USAGE = "name,utilization.gpu,memory.used,memory.total"
@@ -42,6 +42,16 @@ def _mebi(text: str) -> int | None:
 def _number(text: str) -> int | None:
     """A whole number; None for "[N/A]", as of a GPU that is divided."""
     return int(text) if text.isdecimal() else None
+
+
+def gpus_to_share() -> tuple[str, ...]:
+    """What CUDA_VISIBLE_DEVICES calls the GPUs that this process may use, in its order.
+
+    None are known where nvidia-smi is missing, or lists them divided (MIG).
+    """
+    if os.environ.get("CUDA_VISIBLE_DEVICES") == "":  # a user wants none
+        return ()
+    return tuple(gpu.uuid for gpu in _visible(_parse(nvidia_smi(_FREE))))
 
 
 def describe_gpus(count: int) -> tuple[Gpu, ...]:

@@ -8,12 +8,15 @@ from pathlib import Path, PurePosixPath
 
 import psutil
 
+from panolog.orchestrator.run.units import positive
+
 _MOUNT = Path("/sys/fs/cgroup")  # of control groups: containers and services limit what their processes use
 _OWN = Path("/proc/self/cgroup")  # lines "0::/group", of version 1 "4:memory:/group"
 _VMSTAT = Path("/proc/vmstat")
 _PRODUCT = Path("/sys/class/dmi/id/product_name")  # on AWS the instance type
 _TYPE = re.compile(r"[a-z][a-z0-9-]*\.[a-z0-9-]+")  # other product names say nothing: "Standard PC", "KVM"
 _INSTANCE = "PANOLOG_INSTANCE"  # the variable that names it where that does not
+SHARE = "PANOLOG_MEMORY"  # the variable with the memory, in GiB, that a run may use of this machine
 
 
 def groups(controller: str, mount: Path = _MOUNT, own: Path = _OWN) -> Iterator[Path]:
@@ -45,7 +48,25 @@ def cores(mount: Path = _MOUNT, own: Path = _OWN) -> int:
 
 
 def memory(mount: Path = _MOUNT, own: Path = _OWN) -> int:
-    """Bytes of memory that are free: the machine's, and within the limits of control groups."""
+    """Bytes of memory that are free: the machine's, and within the limits of control groups.
+
+    At most this run's share. Raises ConfigError if PANOLOG_MEMORY is no number.
+    """
+    return min([_free(mount, own), *_share()])
+
+
+def memory_total(mount: Path = _MOUNT, own: Path = _OWN) -> int:
+    """Bytes of memory that this process's machine has, or its control groups may use; else as `memory`."""
+    return min([_total(mount, own), *_share()])
+
+
+def memory_usage(mount: Path = _MOUNT, own: Path = _OWN) -> tuple[int, int]:
+    """Bytes of memory in use on this machine or in its control groups, by all runs, and all there are."""
+    total = _total(mount, own)
+    return max(0, total - _free(mount, own)), total
+
+
+def _free(mount: Path, own: Path) -> int:
     free = [int(psutil.virtual_memory().available)]
     for group, limit in _limits(mount, own):
         stat = _counts(group / "memory.stat")
@@ -55,9 +76,14 @@ def memory(mount: Path = _MOUNT, own: Path = _OWN) -> int:
     return max(0, min(free))
 
 
-def memory_total(mount: Path = _MOUNT, own: Path = _OWN) -> int:
-    """Bytes of memory that this process's machine has, or its control groups may use."""
+def _total(mount: Path, own: Path) -> int:
     return min([int(psutil.virtual_memory().total), *(limit for _, limit in _limits(mount, own))])
+
+
+def _share() -> Iterator[int]:
+    """The bytes that a run may use of this machine, if that is limited."""
+    if os.environ.get(SHARE):
+        yield int(positive(SHARE, os.environ, 1.0, "a number of GiB, such as 12.5") * 2**30)
 
 
 def _limits(mount: Path, own: Path) -> Iterator[tuple[Path, int]]:

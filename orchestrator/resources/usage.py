@@ -14,7 +14,7 @@ from typing import TypeVar
 import psutil
 
 from panolog.orchestrator.resources.gpus import GpuUsage, measure_gpus
-from panolog.orchestrator.resources.machine import memory, memory_total
+from panolog.orchestrator.resources.machine import memory_usage
 
 _FIRST_S, INTERVAL_S = 2.0, 10.0  # seconds until the first measurement, and between two
 T = TypeVar("T")
@@ -60,13 +60,13 @@ def with_usage(events: Iterable[T], first: float = _FIRST_S) -> Iterator[T | Usa
 
 def measure() -> Usage:
     """This machine now; the CPU since the last call. Raises OSError if the kernel does not say."""
-    cores, total = psutil.cpu_percent(percpu=True), memory_total()
+    cores, (used, total) = psutil.cpu_percent(percpu=True), memory_usage()
     mine = [cores[core] for core in os.sched_getaffinity(0) if core < len(cores)]
     disk = shutil.disk_usage(tempfile.gettempdir())
     return Usage(
         node=socket.gethostname(),
         cpu=sum(mine) / (100 * max(1, len(mine))),
-        memory_used=max(0, total - memory()),
+        memory_used=used,
         memory_total=total,
         disk_used=disk.used,
         disk_total=disk.total,

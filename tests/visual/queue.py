@@ -25,10 +25,10 @@ def queue_at_work(root: Path, runs: Path, clock: Clock) -> Iterator[Path]:
         for name in ("depot", NAMES["live"], "canal", "north-gate", "station-2026-03-14-second-visit"):
             run = runs / name
             queue.add(Command(run, (f"/data/scenes/{name}", "--output", str(run)), (), root))
-        queue.claim()
+        queue.claim(1)
         clock.now = now - 8_400
         queue.end(1, State.FAILED, 2, _FAILED)
-        queue.claim()
+        queue.claim(2)
         queue.launched(2, Processes().identity(os.getpid()))
     clock.now = now
     with lock.hold(lock_of(folder)):

@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app
+from panolog.orchestrator.queue.entries import Needs
 from panolog.orchestrator.queue.store import opened
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import RunBegan
@@ -80,9 +81,31 @@ def test_limits_are_given_to_the_start_alone(here: Path, scene: Path) -> None:
     assert command.later == ()  # the run itself has them
 
 
+def test_a_share_is_given_or_follows_from_the_device(here: Path, scene: Path) -> None:
+    given = {
+        "a": ([], Needs()),
+        "b": (["--gpus", "2", "--cores", "3", "--ram", "1.5"], Needs(2, 3, 3 * 2**29)),
+        "c": (["--device", "cpu"], Needs(gpus=0)),
+        "d": (["--set", "device=cpu", "--cores", "1"], Needs(0, 1)),
+        "e": (["--address", "auto"], None),
+    }
+    for number, (name, (words, needs)) in enumerate(given.items(), 1):
+        assert panolog("queue", "add", scene, "-o", here / name, *words)[0] == 0
+        with opened(here / "queue", make=False) as queue:
+            assert queue.entry(number).command.needs == needs
+            assert not {"--gpus", "--cores", "--ram"} & {*queue.entry(number).command.first}
+    assert "waiting      " + f"{here}/b  (2 GPUs, 3 cores, 1.5 GiB)" in panolog("queue", "list")[1]
+    rows = json.loads(panolog("queue", "list", "--json")[1])["entries"]
+    assert rows[1]["needs"] == {"gpus": 2, "cores": 3, "memory": 3 * 2**29}
+    assert (rows[4]["needs"], rows[1]["share"]) == (None, None)
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
+        (["town", "-o", "{}/run", "--address", "auto", "--ram", "2"], "--ram 2.0: with --address Ray"),
+        (["town", "-o", "{}/run", "--device", "cpu", "--gpus", "1"], "--gpus 1: the run computes on the CPU"),
+        (["town", "-o", "{}/run", "--device", "cuda", "--gpus", "0"], "--gpus 0: the run computes on a GPU"),
         (
             ["town", "-o", "{}/run", "--set", "sky.cuont=1"],
             "unknown setting sky.cuont; did you mean sky.count?",

@@ -1,5 +1,6 @@
 """A queue of stand-ins, and a runner of it as a process of its own that may be killed."""
 
+import json
 import os
 import signal
 import subprocess
@@ -7,11 +8,13 @@ import sys
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from panolog.orchestrator.queue.entries import Command, Entry, State
+from panolog.orchestrator.queue.entries import Command, Entry, Needs, State
 from panolog.orchestrator.queue.store import Queue
 from tests.ray_head import wait_until
 
+ANY = Needs()  # an even part
 STAND_IN = Path(__file__).with_name("stand_in.py")
 RUNNER = """
 import sys
@@ -46,11 +49,20 @@ class Scripted:
         """What the stand-ins did, in order."""
         return self.root / "log"
 
-    def add(self, name: str, scene: str = "scene") -> int:
-        """Adds a run."""
+    def add(self, name: str, scene: str = "scene", needs: Needs | None = ANY, *, held: bool = False) -> int:
+        """Adds a run. Args: held, it works until its file `wait` is removed."""
         run = self.root / name
+        if held:
+            run.mkdir()
+            (run / "wait").touch()
         with closing(Queue(self.folder)) as queue:
-            return queue.add(Command(run, (scene, "--output", str(run)), (), self.root))
+            return queue.add(Command(run, (scene, "--output", str(run)), (), self.root, needs))
+
+    def share(self, name: str) -> dict[str, Any]:
+        """What a run has seen of the machine; {} before it has begun."""
+        path = self.root / name / "share"
+        found: dict[str, Any] = json.loads(path.read_text() or "{}") if path.exists() else {}
+        return found
 
     def entries(self) -> list[Entry]:
         """All of them."""

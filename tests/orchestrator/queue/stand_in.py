@@ -3,9 +3,11 @@
 python -S stand_in.py LOG run SCENE --output RUN … | resume RUN …
 It imports nothing of PanoLOG, so that it starts at once. The scene "refused" is wrong input, "fragile" kills
 its first attempt. A file RUN/wait holds it at its work, and RUN/stop is the request of a user to stop.
+It writes its share of the machine to RUN/share.
 """
 
 import fcntl
+import json
 import os
 import signal
 import struct
@@ -39,6 +41,8 @@ def main(log: str, words: list[str]) -> int:
         note("locked-out")
         return 2
     (run / "run.json").touch()
+    share = {name: os.environ.get(name) for name in ("CUDA_VISIBLE_DEVICES", "PANOLOG_MEMORY")}
+    (run / "share").write_text(json.dumps({**share, "cores": sorted(os.sched_getaffinity(0))}))
     stopping: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda number, _: stopping.append(number))

@@ -10,10 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.queue.entries import Command, State
+from panolog.orchestrator.queue.entries import Command, Needs, Share, State
 from panolog.orchestrator.queue.processes import Processes
 from panolog.orchestrator.queue.store import DATABASE, Queue, default_folder, opened
 from panolog.scene.errors import QueueError
+
+VERSION_1 = """
+CREATE TABLE entries (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, position INTEGER NOT NULL, state TEXT NOT NULL,
+    run TEXT NOT NULL, first TEXT NOT NULL, later TEXT NOT NULL, folder TEXT NOT NULL,
+    added REAL NOT NULL, began REAL, ended REAL, boot TEXT, pid INTEGER, started INTEGER,
+    starts INTEGER NOT NULL DEFAULT 0, losses INTEGER NOT NULL DEFAULT 0, code INTEGER,
+    reason TEXT NOT NULL DEFAULT '');
+PRAGMA user_version = 1;
+"""
 
 
 @dataclass
@@ -70,8 +80,8 @@ def test_what_is_added_comes_back(queue: Queue) -> None:
 
 
 def test_each_state_allows_what_makes_sense(queue: Queue) -> None:
-    claimed = queue.claim()
-    assert claimed is not None and claimed.id == 1
+    claimed = queue.claim(1)
+    assert claimed is not None and claimed.state == State.RUNNING
     with pytest.raises(QueueError, match="entry 1 is running: only what is waiting can be moved"):
         queue.move(1, None)
     with pytest.raises(QueueError, match="only what is waiting can be a place to move to"):
@@ -97,12 +107,13 @@ def test_each_state_allows_what_makes_sense(queue: Queue) -> None:
 
 def test_an_entry_is_claimed_once(queue: Queue, tmp_path: Path) -> None:
     with closing(Queue(tmp_path / "queue")) as other:
-        claimed = [one.claim() for one in (queue, other, queue, other, queue)]
-    assert [entry and entry.id for entry in claimed] == [1, 2, 3, 4, None]
+        claimed = [one.claim(id) for one, id in ((queue, 1), (other, 1), (other, 3), (queue, 3), (queue, 9))]
+        assert [entry and entry.id for entry in claimed] == [1, None, 3, None, None]
+        assert [one.next() for one in (queue, other)] == [queue.entry(2)] * 2
 
 
 def test_a_start_is_on_disk_with_its_process(queue: Queue, tmp_path: Path) -> None:
-    queue.claim()
+    queue.claim(1)
     me = Processes().identity(1)
     queue.launched(1, me)
     with opened(tmp_path / "queue", make=False) as other:
@@ -115,13 +126,49 @@ def test_kills_count_in_a_row_only_if_they_come_soon(tmp_path: Path) -> None:
     clock = Clock(1e9)
     with closing(Queue(tmp_path / "queue", clock)) as queue:
         queue.add(command("a"))
-        queue.claim()
+        queue.claim(1)
         counts = []
         for seconds in (5.0, 5.0, 700.0, 5.0):
             queue.launched(1, Processes().identity(1))
             clock.now += seconds
             counts.append(queue.lose(1))
     assert counts == [1, 2, 1, 2]
+
+
+def test_needs_and_shares_come_back(queue: Queue) -> None:
+    for needs in (Needs(gpus=2, memory=2**34), Needs(0, 3, None), None):
+        run = command("e")
+        number = queue.add(Command(run.run, run.first, run.later, run.folder, needs))
+        assert queue.entry(number).command.needs == needs
+        queue.remove(number)
+    assert queue.entry(2).command.needs == Needs()
+    queue.claim(1)
+    share = Share(("GPU-a",), (0, 2), 2**33)
+    queue.note(1, "waits for memory")
+    assert queue.entry(1).reason == "waits for memory"
+    queue.launched(1, Processes().identity(1), share)
+    assert (queue.entry(1).share, queue.entry(1).reason) == (share, "")
+    queue.end(1, State.DONE, 0, "")
+    queue.note(1, "too late")
+    assert (queue.entry(1).share, queue.entry(1).reason) == (None, "")
+
+
+def test_a_queue_of_version_1_is_taken_over(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / DATABASE)) as database:
+        database.executescript(VERSION_1)
+        for number, words in enumerate(['["/s", "--output", "/r"]', '["/s", "--address", "auto"]'], 1):
+            row = (number, "waiting", f"/r{number}", words, "[]", "/", 1.0)
+            database.execute(
+                "INSERT INTO entries (position, state, run, first, later, folder, added)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?)",
+                row,
+            )
+        database.commit()
+    with closing(Queue(tmp_path)) as queue:
+        assert [entry.command.needs for entry in queue.entries()] == [Needs(), None]
+        assert queue.add(command("new")) == 3
+    with closing(Queue(tmp_path)) as queue:  # which is not changed again
+        assert len(queue.entries()) == 3
 
 
 def test_many_commands_at_once_lose_nothing(tmp_path: Path) -> None:
@@ -155,8 +202,8 @@ def test_what_is_no_queue_is_one_clear_line(tmp_path: Path) -> None:
         Queue(tmp_path)
     other = tmp_path / "newer"
     with closing(Queue(other)), closing(sqlite3.connect(other / DATABASE)) as database:
-        database.execute("PRAGMA user_version = 2")
-    with pytest.raises(QueueError, match=r"is of a newer PanoLOG \(version 2, this one knows 1\)"):
+        database.execute("PRAGMA user_version = 3")
+    with pytest.raises(QueueError, match=r"is of a newer PanoLOG \(version 3, this one knows 2\)"):
         Queue(other)
     (tmp_path / "file").touch()
     with pytest.raises(QueueError, match="cannot be created: "):

@@ -31,7 +31,7 @@ def queued(root: Path, names: Sequence[str]) -> Iterator[tuple[Served, Queue]]:
         for name in names:
             run = root / "runs" / name
             queue.add(Command(run, ("/scene", "--output", str(run)), (), root))
-        queue.claim()
+        queue.claim(1)
         queue.launched(1, Processes().identity(os.getpid()))
         with lock.hold(lock_of(queue.folder)), serving(root / "runs", queue=queue.folder) as served:
             yield served, queue
@@ -164,7 +164,7 @@ def test_an_entry_that_started_meanwhile_is_not_removed(browser: Browser, tmp_pa
         opened(browser, served.url, tolerate=refused) as page,
     ):
         page.get_by_role("button", name="Remove b").click()
-        queue.claim()
+        queue.claim(2)
         page.locator("#confirm-yes").click()
         expect(page.locator("#confirm-error")).to_contain_text("entry 2 is running; stop it first")
         assert order(queue) == [1, 2]
