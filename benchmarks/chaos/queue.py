@@ -3,10 +3,11 @@
     python -m benchmarks.chaos.queue [--runs 50] [--at-once 1] [--kills 25] [--seed 0] [--folder FOLDER]
     python -m benchmarks.chaos.queue --quick
 
-Runs of a small town are queued. At random times the runner, a supervisor, a driver or everything at once is
-killed with SIGKILL, in turn; after "everything" the machine has another boot id. The next runner starts at
-once. Every run must be done, begun in the order of the queue, with the bytes of the first. With N at once,
-those that begin together may do so in either order: each is less than N places from its own.
+Runs of a small town are queued. At random times, spread over the runs, the runner, a supervisor, a driver or
+everything at once is killed with SIGKILL, in turn; after "everything" the machine has another boot id. The
+next runner starts at once. Every run must be done, begun in the order of the queue, with the bytes of the
+first. With N at once, those that begin together may do so in either order: each is less than N places from
+its own.
 """
 
 import hashlib
@@ -49,7 +50,8 @@ _SETTINGS = (
     *("--set", "refine=false", "--set", "deliver=false"),
 )
 _KINDS = ("runner", "driver", "supervisor", "everything")
-_FIRST_S, _LAST_S = 2.0, 25.0  # after the start of a runner or the last kill; a run takes some 15 s
+_FIRST_S, _LAST_S = 2.0, 25.0  # after a kill is due; a run takes some 15 s
+_POLL_S = 0.5  # between two looks at whether the next kill is due
 _MOST_RECORDS = 100_000
 
 
@@ -78,13 +80,21 @@ class Queued:
             command = [sys.executable, "-c", _RUNNER, str(self.root / "queue"), str(boot), str(self.at_once)]
             runner = subprocess.Popen(command, stdout=sys.stderr, start_new_session=True)
             while len(self.kills) < kills and runner.poll() is None:
+                due = self._due(kills)
                 with suppress(subprocess.TimeoutExpired):
-                    runner.wait(self.chance.uniform(_FIRST_S, _LAST_S))
-                if runner.poll() is None and self._kill(runner.pid) in ("runner", "everything"):
+                    runner.wait(self.chance.uniform(_FIRST_S, _LAST_S) if due else _POLL_S)
+                if due and runner.poll() is None and self._kill(runner.pid) in ("runner", "everything"):
                     break
             code = runner.wait()
             if code >= 0:
                 return code
+
+    def _due(self, kills: int) -> bool:
+        """Whether as large a part of the runs is done as of the kills."""
+        with closing(Queue(self.root / "queue")) as queue:
+            entries = queue.entries()
+        done = sum(entry.state == State.DONE for entry in entries)
+        return done * kills >= len(self.kills) * len(entries)
 
     def _kill(self, runner: int) -> str:
         """Kills what is next in turn; returns what that was."""
