@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
+from panolog.orchestrator.run.money.records import BudgetReached, BudgetSet
 from panolog.orchestrator.run.records import (
     Delivered,
     EvaluationSaved,
@@ -32,6 +33,8 @@ _RESULTS = (
     EvaluationSaved,
     Delivered,
 )
+# What follows the training, also one that a limit has ended.
+_FOLLOWING = (Stage.MERGE, Stage.MEASURE, Stage.EVAL, Stage.DELIVER)
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,7 @@ class History:
     spans: dict[Stage, Span] = field(default_factory=dict)
     starts: dict[TaskId, TaskStarted] = field(default_factory=dict)  # the latest of each task
     last: int = 0  # id of the last record
+    limited: float | None = None  # when a limit has ended the training early, in seconds since the epoch
 
     @staticmethod
     def of(records: Iterable[Stored]) -> "History":
@@ -84,6 +88,12 @@ class History:
         elif isinstance(record, _RESULTS) or (isinstance(record, TaskFailed) and record.final):
             span = self.spans.get(record.task.stage) or Span(self._latest_end() or stored.time)
             self.spans[record.task.stage] = replace(span, ended=stored.time)
+        elif isinstance(record, BudgetReached):
+            self.limited = stored.time
+        elif isinstance(record, BudgetSet) and self.limited is not None:  # all that followed is made anew
+            self.limited = None
+            for stage in _FOLLOWING:
+                self.spans.pop(stage, None)
 
     def _note_preparing(self, stage: Stage, time: float) -> None:
         """The scene is being made, or the preflight begins."""
@@ -93,4 +103,10 @@ class History:
 
     def _latest_end(self) -> float | None:
         """When the latest stage ended: plan and merge have no start record, they begin with that."""
-        return max((span.ended for span in self.spans.values() if span.ended is not None), default=None)
+        ends = (self.limited, *(span.ended for span in self.spans.values()))
+        return max((end for end in ends if end is not None), default=None)
+
+    def cut(self, stage: Stage) -> float | None:
+        """When a limit has ended a stage early; None of one that it has not, or that follows."""
+        span = self.spans.get(stage)
+        return None if span is None or stage in _FOLLOWING else self.limited

@@ -177,7 +177,9 @@ def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: fl
         known = span is not None or name is not Stage.CALIBRATE or not older
         if known and name not in left_out:
             tasks = [task for task in tasks_of(state) if task.id.stage is name]
-            yield _stage(name, tasks, state, span, running=running, now=now)
+            cut = history.cut(name)
+            at_end = state if cut is None else replace(state, ended=cut)
+            yield _stage(name, tasks, at_end, span, running=running and cut is None, now=now)
 
 
 def _with_share(stage: StageView, preparation: PreparationView | None) -> StageView:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from panolog.orchestrator.run.money.records import BudgetReached, BudgetSet
 from panolog.orchestrator.run.records import (
     BlockPlan,
     EvaluationSaved,
@@ -136,6 +137,37 @@ def test_a_run_that_failed_is_at_rest() -> None:
     coarse_failed = [*STAGE_ONE[:-1], (70, TaskFailed(COARSE, 3, "NaN", final=True))]
     coarse = stage(view([*coarse_failed, (71, RunEnded(Outcome.FAILED, "NaN"))], running=False), "coarse")
     assert (coarse.status, coarse.ended, coarse.seconds) == ("failed", 70, 58)
+
+
+def test_a_stage_that_a_limit_ended_has_ended_at_that_moment() -> None:
+    """The times of all stages add up: none is in two of them."""
+    cut = [*STAGE_TWO, (152, model(ONE, 27.0)), (155, TaskYielded(ZERO)), (156, BudgetReached("max_cost"))]
+    block = stage(view(cut, running=True), "block")
+    assert (block.status, block.ended, block.seconds, block.done) == ("stopped", 156, 31, 1)
+    rest: list[Timed] = [(160, MERGED), (161, started(EVAL)), (170, EvaluationSaved("eval/metrics.json", {}))]
+    over = [*cut, *rest, (171, RunEnded(Outcome.LIMITED, "max_cost"))]
+    shown = view(over, running=False)
+    assert stage(shown, "block") == block
+    spans = [(stage.began, stage.ended) for stage in shown.stages[-3:]]
+    assert spans == [(125, 156), (156, 160), (161, 170)]
+    reached: list[Timed] = [(80, TaskYielded(COARSE)), (80, BudgetReached("deadline")), (84, MERGED)]
+    early = view([*STAGE_ONE[:-1], *reached], running=True)
+    assert [(stage(early, name).began, stage(early, name).ended) for name in ("coarse", "merge")] == [
+        (12, 80),
+        (80, 84),
+    ]
+
+
+def test_after_a_higher_limit_what_follows_begins_anew() -> None:
+    cut = [*STAGE_TWO, (156, BudgetReached("max_cost")), (160, MERGED), (161, started(EVAL))]
+    again = [*cut, (162, RunEnded(Outcome.LIMITED, "max_cost")), (300, began(162)), (300, BudgetSet())]
+    resumed = [*again, (305, started(ZERO, 20)), (306, started(ONE, 25))]
+    block, merge = (stage(view(resumed, running=True), name) for name in ("block", "merge"))
+    assert (block.status, block.began, block.ended) == ("running", 125, None)
+    assert (merge.began, merge.ended) == (None, None)
+    done = [*resumed, (350, model(ZERO, 80)), (352, model(ONE, 75)), (356, MERGED)]
+    block, merge = (stage(view(done, running=True), name) for name in ("block", "merge"))
+    assert (block.began, block.ended, merge.began, merge.ended) == (125, 352, 352, 356)
 
 
 def test_an_interrupted_preflight_is_stopped() -> None:
