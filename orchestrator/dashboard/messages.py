@@ -112,8 +112,9 @@ def _epoch(moment: Any) -> float | None:
 class QueueRow(ViewModel):
     """An entry of the queue. `run` is the id of its run, if that is below the dashboard's folder.
 
-    `label` is its state, or "interrupted" where no process of a running one is alive; `time`, in epoch
-    seconds, that of its end, else of its start, else of its addition.
+    `label` is its state, or "interrupted" where no process of a running one is alive; `share`, what it has of
+    the machine, or is to get as stated, "" if neither is known; `time`, in epoch seconds, that of its end,
+    else of its start, else of its addition.
     """
 
     id: int
@@ -122,6 +123,7 @@ class QueueRow(ViewModel):
     state: str
     label: str
     reason: Text
+    share: str
     time: float
 
 

@@ -64,7 +64,7 @@ class QueueView:
         rows = [(str(entry.id), self.label(entry), str(entry.command.run)) for entry in self.entries]
         width = max((len(id) for id, _, _ in rows), default=0)
         for (id, label, run), entry in zip(rows, self.entries, strict=True):
-            more = "; ".join(filter(None, (describe(entry), entry.reason)))
+            more = entry.reason or (describe(entry) if _open(entry) else "")
             yield f"{id:>{width}}  {label:<11}  {run}" + (f"  ({more})" if more else "")
         if not rows:
             yield f"the queue {self.folder} is empty"

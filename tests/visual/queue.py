@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from panolog.orchestrator.queue.entries import Command, State
+from panolog.orchestrator.queue.entries import Command, Needs, Share, State
 from panolog.orchestrator.queue.processes import Processes
 from panolog.orchestrator.queue.runner import lock_of
 from panolog.orchestrator.queue.store import Queue
@@ -24,12 +24,15 @@ def queue_at_work(root: Path, runs: Path, clock: Clock) -> Iterator[Path]:
         clock.now = now - 9_000
         for name in ("depot", NAMES["live"], "canal", "north-gate", "station-2026-03-14-second-visit"):
             run = runs / name
-            queue.add(Command(run, (f"/data/scenes/{name}", "--output", str(run)), (), root))
+            needs = Needs(gpus=4 if name == "canal" else None)
+            queue.add(Command(run, (f"/data/scenes/{name}", "--output", str(run)), (), root, needs))
         queue.claim(1)
         clock.now = now - 8_400
         queue.end(1, State.FAILED, 2, _FAILED)
         queue.claim(2)
-        queue.launched(2, Processes().identity(os.getpid()))
+        share = Share(("GPU-5a", "GPU-5b"), tuple(range(16)), 56 * 2**30)
+        queue.launched(2, Processes().identity(os.getpid()), share)
+        queue.note(3, "waits for 4 GPUs: 2 of 4 free")
     clock.now = now
     with lock.hold(lock_of(folder)):
         yield folder

@@ -8,6 +8,7 @@ from typing import Literal
 from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.dashboard.messages import QueueList, QueueRow
 from panolog.orchestrator.queue.entries import Entry, State
+from panolog.orchestrator.queue.shares import describe
 from panolog.orchestrator.queue.store import DATABASE, opened
 from panolog.orchestrator.queue.view import QueueView, remove_entry, view_queue
 from panolog.scene.errors import QueueError
@@ -71,6 +72,7 @@ class QueuePanel:
             state=entry.state,
             label=view.label(entry),
             reason=entry.reason,
+            share=describe(entry) if entry.state in (State.WAITING, State.RUNNING) else "",
             time=entry.ended or entry.began or entry.added,
         )
 

@@ -1,10 +1,12 @@
-// The queue above the list of runs: in its order, with buttons that move, remove and retry entries.
+// The queue above the list of runs: in its order, with buttons that move, remove and retry entries, and handles
+// by which those that wait are dragged.
 
 /** @import { QueueList, QueueRow } from "../shared/messages.js" */
 import { messageOf, post } from "../shared/api.js";
 import { confirm } from "../shared/confirm.js";
 import { byId, el, first, pill, reconcile, setMessage, setPill, setText } from "../shared/dom.js";
 import { ago } from "../shared/format.js";
+import { draggable } from "./drag.js";
 
 /** @typedef {"up" | "down" | "retry" | "remove"} Button */
 /** What each button shows, and what screen readers say; {} is the run. @type {Record<Button, [string, string]>} */
@@ -52,30 +54,51 @@ async function act(button, id) {
   const order = waiting().map((one) => one.id);
   const at = order.indexOf(id);
   const before = button === "up" ? order[at - 1] : button === "down" ? order[at + 2] ?? null : null;
+  if (button === "retry") await attempt(row, "retry", null, `${row.name} waits again`);
+  else await attempt(row, "move", before, `${row.name} is moved ${button}`);
+}
+
+/** Requests it, and shows why it is not possible. @type {typeof request} */
+async function attempt(row, action, before, said) {
   try {
-    await request(row, button === "retry" ? "retry" : "move", before, button === "retry" ? `${row.name} waits again` : `${row.name} is moved ${button}`);
+    await request(row, action, before, said);
     setMessage(byId("queue-error"), "");
   } catch (error) {
     setMessage(byId("queue-error"), `Not possible: ${messageOf(error)}`);
   }
 }
 
+/** What follows when a row was dragged to a place among those that wait. @param {string} key @param {number} place */
+function drop(key, place) {
+  const order = waiting();
+  const row = order.find((one) => String(one.id) === key);
+  if (!row || order[place] === row) return;
+  const others = order.filter((one) => one !== row);
+  attempt(row, "move", others[place]?.id ?? null, `${row.name} is moved to place ${place + 1}`);
+}
+
 /** @param {QueueRow} row */
 function makeRow(row) {
+  const place = el("span", { class: "queue-place", "aria-hidden": "true" });
   const name = el("div", { class: "queue-name" }, el("a", { class: "run-name" }), el("span", { class: "scene" }));
-  return el("li", {}, el("span", { class: "queue-place", "aria-hidden": "true" }), name, pill(row.state), el("div", { class: "queue-buttons" }));
+  const node = el("li", {}, place, name, pill(row.state), el("div", { class: "queue-buttons" }));
+  draggable(place, node, drop);
+  return node;
 }
 
 /** @param {HTMLElement} node @param {QueueRow} row */
 function fillRow(node, row) {
   const place = waiting().findIndex((one) => one.id === row.id);
-  setText(first(".queue-place", node), place < 0 ? "" : `${place + 1}`);
+  const handle = first(".queue-place", node);
+  setText(handle, place < 0 ? "" : `${place + 1}`);
+  handle.title = place < 0 ? "" : "Drag to move it";
+  node.classList.toggle("waits", place >= 0);
   const link = first(".run-name", node);
   setText(link, row.name);
   if (row.run) link.setAttribute("href", `/runs/${row.run}`);
   else link.removeAttribute("href");
   const verb = row.state === "waiting" ? "added" : row.state === "running" ? "started" : "ended";
-  setText(first(".scene", node), row.reason || `${verb} ${ago(row.time)}`);
+  setText(first(".scene", node), row.reason || [`${verb} ${ago(row.time)}`, row.share].filter(Boolean).join(" · "));
   setPill(first(".pill", node), row.label);
   const wanted = buttonsOf(row);
   reconcile(first(".queue-buttons", node), wanted, String, (button) => {

@@ -1,7 +1,18 @@
 // The dialog in which an action is confirmed, on every page that has actions.
 
 import { messageOf } from "./api.js";
-import { byId, setText } from "./dom.js";
+import { byId, el, setText } from "./dom.js";
+
+/** The dialog, which the first call makes. */
+function made() {
+  const known = byId("confirm", HTMLDialogElement);
+  if (known) return known;
+  const menu = el("menu", {}, el("button", { value: "cancel" }, "Cancel"), el("button", { id: "confirm-yes", value: "yes", type: "button" }));
+  const text = [el("h2", { id: "confirm-title" }), el("p", { id: "confirm-text" }), el("p", { id: "confirm-error", class: "error", role: "alert" })];
+  const dialog = el("dialog", { id: "confirm", "aria-labelledby": "confirm-title" }, el("form", { method: "dialog" }, text, menu));
+  document.body.append(dialog);
+  return dialog;
+}
 
 /**
  * Requests a confirmation in the dialog, which also shows errors of the action.
@@ -10,7 +21,8 @@ import { byId, setText } from "./dom.js";
  * @param {() => Promise<void>} act
  */
 export function confirm([title, text, yes], danger, act) {
-  const [dialog, button, error] = [byId("confirm", HTMLDialogElement), byId("confirm-yes"), byId("confirm-error")];
+  const dialog = made();
+  const [button, error] = [byId("confirm-yes"), byId("confirm-error")];
   setText(byId("confirm-title"), title);
   setText(byId("confirm-text"), text);
   setText(button, yes);

@@ -290,6 +290,7 @@ export interface QueueRow {
   state: string;
   label: string;
   reason: string;
+  share: string;
   time: number;
 }
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from panolog.orchestrator.dashboard.messages import QueueList
-from panolog.orchestrator.queue.entries import Command, State
+from panolog.orchestrator.queue.entries import Command, Needs, Share, State
 from panolog.orchestrator.queue.processes import Processes
 from panolog.orchestrator.queue.runner import lock_of
 from panolog.orchestrator.queue.store import DATABASE, Queue
@@ -28,11 +29,13 @@ def queued(root: Path, names: Sequence[str]) -> Iterator[tuple[Served, Queue]]:
     root = root.resolve()
     write_run(root / "runs" / names[0])
     with closing(Queue(root / "queue")) as queue:
-        for name in names:
+        for number, name in enumerate(names):
             run = root / "runs" / name
-            queue.add(Command(run, ("/scene", "--output", str(run)), (), root))
+            needs = Needs(gpus=2 if number == 2 else None)
+            queue.add(Command(run, ("/scene", "--output", str(run)), (), root, needs))
         queue.claim(1)
-        queue.launched(1, Processes().identity(os.getpid()))
+        share = Share(("GPU-a",), (0, 1), 3 * 2**30)
+        queue.launched(1, Processes().identity(os.getpid()), share)
         with lock.hold(lock_of(queue.folder)), serving(root / "runs", queue=queue.folder) as served:
             yield served, queue
 
@@ -56,6 +59,7 @@ def test_the_list_has_the_queue_and_follows_it(tmp_path: Path) -> None:
             (3, "c", "waiting", False),
         ]
         assert shown.entries[0].run == served.id("a")
+        assert [row.share for row in shown.entries] == ["1 GPU, 2 cores, 3.0 GiB", "", "2 GPUs"]
         queue.end(1, State.FAILED, 1, "out of memory")
         row = next(messages)[1]["queue"]["entries"][-1]
         assert (row["id"], row["state"], row["reason"]) == (1, "failed", "out of memory")
@@ -152,6 +156,63 @@ def test_entries_are_moved_and_removed_by_keyboard(browser: Browser, tmp_path: P
         expect(page.get_by_role("button", name="Retry a")).to_have_count(0)
         expect(page.locator("#queue-entries .run-name").nth(2)).to_have_text("a")
         assert queue.entry(1).state == State.WAITING
+
+
+def drag(page: Page, name: str, onto: str, *, above: bool, release: bool = True) -> None:
+    """Drags the handle of an entry to the upper or lower half of another one."""
+    rows = page.locator("#queue-entries li")
+    box = rows.filter(has_text=name).locator(".queue-place").bounding_box()
+    other = rows.filter(has_text=onto).bounding_box()
+    assert box is not None and other is not None
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 30, other["y"] + other["height"] * (0.25 if above else 0.75), steps=4)
+    if release:
+        page.mouse.up()
+
+
+@pytest.mark.system
+def test_entries_are_dragged(browser: Browser, tmp_path: Path) -> None:
+    names = ("one", "two", "three", "four")
+    with queued(tmp_path, names) as (served, queue), opened(browser, served.url) as page:
+        rows = page.locator("#queue-entries .run-name")
+        expect(rows).to_have_count(4)
+        drag(page, "four", "two", above=True)
+        expect(rows.nth(1)).to_have_text("four")
+        assert order(queue) == [1, 4, 2, 3]
+        expect(page.locator("#queue-said")).to_have_text("four is moved to place 1")
+        drag(page, "four", "three", above=False)
+        expect(rows.nth(3)).to_have_text("four")
+        drag(page, "two", "one", above=True)  # before what runs: it stays the first that waits
+        drag(page, "four", "three", above=True, release=False)
+        expect(page.locator("li.drop-above")).to_have_text(re.compile("three"))
+        page.keyboard.press("Escape")
+        page.mouse.up()
+        expect(page.locator(".dragged, .drop-above, .drop-below")).to_have_count(0)
+        drag(page, "one", "four", above=False)  # it is running
+        assert order(queue) == [1, 2, 3, 4]
+        expect(page.locator("#queue-error")).to_be_hidden()
+
+
+@pytest.mark.system
+def test_entries_are_dragged_by_a_finger(browser: Browser, tmp_path: Path) -> None:
+    with (
+        queued(tmp_path, ("one", "two", "three")) as (served, queue),
+        opened(browser, served.url, width=PHONE) as page,
+    ):
+        rows = page.locator("#queue-entries li")
+        expect(rows).to_have_count(3)
+        handle, goal = rows.nth(2).locator(".queue-place").bounding_box(), rows.nth(1).bounding_box()
+        assert handle is not None and goal is not None
+        touch = page.context.new_cdp_session(page)
+        x, y = handle["x"] + 8, handle["y"] + handle["height"] / 2
+        for kind, height in (("Start", y), ("Move", y - 9), ("Move", goal["y"] + 3)):
+            touch.send(
+                "Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": [{"x": x, "y": height}]}
+            )
+        touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        expect(page.locator("#queue-entries .run-name").nth(1)).to_have_text("three")
+        assert order(queue) == [1, 3, 2]
 
 
 @pytest.mark.system
