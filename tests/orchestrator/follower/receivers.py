@@ -1,13 +1,10 @@
-"""Servers that receive notifications in a test: HTTP and SMTP."""
+"""A server that receives notifications by HTTP in a test."""
 
 import json
-import socketserver
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from email import message_from_string
-from email.message import Message
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -72,58 +69,5 @@ def receiver(answers: Sequence[int] = (), *, hangs: bool = False) -> Iterator[Re
         yield made
     finally:
         made.hang.set()
-        server.shutdown()
-        server.server_close()
-
-
-@dataclass
-class Mailbox:
-    """A mail server and what it has got."""
-
-    port: int = 0
-    messages: list[Message] = field(default_factory=list)
-    logins: list[str] = field(default_factory=list)
-
-
-@contextmanager
-def mailbox(refuse: str = "") -> Iterator[Mailbox]:
-    """A mail server on this machine while the context lasts. Args: refuse, its answer to recipients."""
-    box = Mailbox()
-
-    class Handler(socketserver.StreamRequestHandler):
-        def say(self, line: str) -> None:
-            self.wfile.write(f"{line}\r\n".encode())
-
-        def handle(self) -> None:
-            self.say("220 test")
-            while line := self.rfile.readline().decode().strip():
-                word = line.split()[0].upper()
-                if word == "EHLO":
-                    self.say("250-test\r\n250 AUTH PLAIN")
-                elif word == "AUTH":
-                    box.logins.append(line)
-                    self.say("235 welcome")
-                elif word == "RCPT" and refuse:
-                    self.say(refuse)
-                elif word == "DATA":
-                    self.say("354 go on")
-                    text = ""
-                    while (more := self.rfile.readline().decode()) != ".\r\n":
-                        text += more
-                    box.messages.append(message_from_string(text))
-                    self.say("250 taken")
-                elif word == "QUIT":
-                    self.say("221 bye")
-                    return
-                else:
-                    self.say("250 fine")
-
-    server = socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler)
-    server.daemon_threads = True
-    box.port = server.server_address[1]
-    threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
-    try:
-        yield box
-    finally:
         server.shutdown()
         server.server_close()

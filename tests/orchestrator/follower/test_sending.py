@@ -11,7 +11,8 @@ from panolog.orchestrator.follower.notifications import Kind, Notification
 from panolog.orchestrator.follower.sending import send
 from panolog.orchestrator.follower.shapes import signature
 from panolog.orchestrator.follower.targets import Target
-from tests.orchestrator.follower.receivers import mailbox, receiver
+from tests.orchestrator.follower.mail_server import mailbox
+from tests.orchestrator.follower.receivers import receiver
 
 SECRET = "T0PSECRET"
 DONE = Notification(
@@ -67,7 +68,7 @@ def test_mail_has_the_id_and_all_facts() -> None:
     text, _, facts = str(message.get_payload()).replace("\r\n", "\n").partition("\n\n")
     assert text.strip() == "the model is ready"
     assert json.loads(facts)["data"] == DONE.facts
-    assert len(box.logins) == 1
+    assert box.logins == [("me@b.c", SECRET)]
 
 
 @pytest.mark.parametrize(

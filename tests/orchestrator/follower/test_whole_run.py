@@ -16,7 +16,8 @@ from panolog.orchestrator.run.records import TaskStarted
 from panolog.orchestrator.run.store import read_records
 from panolog.orchestrator.views.queries import series
 from panolog.synthetic.make import make_town
-from tests.orchestrator.follower.receivers import Receiver, mailbox, receiver
+from tests.orchestrator.follower.mail_server import mailbox
+from tests.orchestrator.follower.receivers import Receiver, receiver
 from tests.orchestrator.whole_runs.test_whole_runs import (
     IN_STAGE_ONE,
     SETTINGS,
