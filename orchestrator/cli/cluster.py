@@ -12,7 +12,9 @@ from panolog.orchestrator.cli.console import command, print_json, progress_bar, 
 from panolog.orchestrator.cli.options import (
     DeadlineOption,
     JsonOption,
+    LogOption,
     MaxCostOption,
+    NotifyOption,
     PricesOption,
     wanted,
     with_preparation,
@@ -72,13 +74,19 @@ def submit(
     config: "RunConfig",
     options: "Options",
     address: ServerOption = _LOCAL,
+    notify: NotifyOption = None,
+    log: LogOption = None,
     prices: PricesOption = None,
     max_cost: MaxCostOption = None,
     deadline: DeadlineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Start a run on the cluster, with the options of `panolog run`; F.yaml and prices are read here."""
+    """Start a run on the cluster, with the options of `panolog run`; F.yaml and prices are read here.
+
+    What --notify names by @FILE or env:NAME is a file or a variable of the head node.
+    """
     from panolog.orchestrator.cluster.jobs import on_head
+    from panolog.orchestrator.follower.plan import words_elsewhere
     from panolog.orchestrator.preparation.settings import as_arguments
     from panolog.orchestrator.run.config import as_settings
 
@@ -91,6 +99,7 @@ def submit(
             on_head(path, what)
     budget = wanted(prices, max_cost, deadline).options()
     words = ["run", source, "-o", run, *as_settings(config), *as_arguments(options), *budget]
+    words += words_elsewhere(notify or (), log or ())
     _start(address, run, words, as_json=as_json)
 
 
@@ -98,6 +107,8 @@ def submit(
 def resume(
     run: HeadRunArg,
     address: ServerOption = _LOCAL,
+    notify: NotifyOption = None,
+    log: LogOption = None,
     prices: PricesOption = None,
     max_cost: MaxCostOption = None,
     deadline: DeadlineOption = None,
@@ -105,9 +116,11 @@ def resume(
 ) -> None:
     """Resume a run on the cluster from its last checkpoints."""
     from panolog.orchestrator.cluster.jobs import on_head
+    from panolog.orchestrator.follower.plan import words_elsewhere
 
     run = on_head(run, "RUN")
     words = ["resume", run, *wanted(prices, max_cost, deadline).options()]
+    words += words_elsewhere(notify or (), log or ())
     _start(address, run, words, as_json=as_json)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from panolog.orchestrator.follower.references import References
-from panolog.orchestrator.follower.targets import Target, read_targets
+from panolog.orchestrator.follower.targets import Target, check_elsewhere, read_targets
 from panolog.orchestrator.run.units import positive
 from panolog.scene.errors import ConfigError
 
@@ -52,11 +52,27 @@ def read_plan(
     """
     references = References(environment)
     targets = read_targets(notify, references)
-    choices = tuple(_sink(text, environment) for text in log)
-    kinds = [choice.kind for choice in choices]
-    if len(set(kinds)) < len(kinds):
-        raise ConfigError("--log: a sink is given twice; give each once")
+    choices = _once([_sink(text, environment) for text in log])
     return Plan(targets, choices, _stalled(environment)), references.used
+
+
+def words_elsewhere(notify: Sequence[str], log: Sequence[str]) -> list[str]:
+    """The options of a command on another machine, whose files and variables references name.
+
+    Checked as far as that is possible here. Raises ConfigError for what is no target or sink, or has a
+    secret: what a command line has, every user of that machine can read.
+    """
+    for text in notify:
+        check_elsewhere(text)
+    for choice in _once([_choice(text) for text in log]):
+        if choice.kind == "tensorboard" and choice.place and not Path(choice.place).is_absolute():
+            raise ConfigError(f"--log tensorboard:{choice.place}: is on another machine; write it from / on")
+    return [
+        word
+        for name, texts in (("--notify", notify), ("--log", log))
+        for text in texts
+        for word in (name, text)
+    ]
 
 
 def to_json(plan: Plan, root: Path) -> str:
@@ -73,30 +89,52 @@ def from_json(text: str) -> tuple[Path, int, Plan]:
     return Path(content["root"]), content["parent"], Plan(targets, sinks, plan["stalled"])
 
 
-def _sink(text: str, environment: Mapping[str, str]) -> SinkChoice:
+def _once(choices: Sequence[SinkChoice]) -> tuple[SinkChoice, ...]:
+    """The sinks. Raises ConfigError if one is given twice."""
+    kinds = [choice.kind for choice in choices]
+    if len(set(kinds)) < len(kinds):
+        raise ConfigError("--log: a sink is given twice; give each once")
+    return tuple(choices)
+
+
+def _choice(text: str) -> SinkChoice:
+    """What a text names. Raises ConfigError for no sink, or a password in its URI."""
     kind, _, place = text.partition(":")
     if kind not in _PACKAGES:
         raise ConfigError(f"--log {kind}: there is no such sink; choose one of {', '.join(_PACKAGES)}")
-    module, package = _PACKAGES[kind]
+    if kind == "mlflow":
+        _require_no_user(place)
+    return SinkChoice(kind, place)
+
+
+def _require_no_user(uri: str) -> None:
+    try:
+        user = urlsplit(uri).username
+    except ValueError as error:
+        raise ConfigError("--log mlflow: its URI is none; write http://HOST:PORT") from error
+    if user is not None:
+        raise ConfigError(
+            "--log mlflow: user and password belong into MLFLOW_TRACKING_USERNAME and _PASSWORD"
+        )
+
+
+def _sink(text: str, environment: Mapping[str, str]) -> SinkChoice:
+    choice = _choice(text)
+    module, package = _PACKAGES[choice.kind]
     if find_spec(module) is None:
         raise ConfigError(
-            f"--log {kind}: the package {package} is missing; install it: pip install {package}"
+            f"--log {choice.kind}: the package {package} is missing; install it: pip install {package}"
         )
-    if kind == "mlflow":
-        place = place or environment.get("MLFLOW_TRACKING_URI", "")
+    place = choice.place
+    if choice.kind == "mlflow" and not place:
+        place = environment.get("MLFLOW_TRACKING_URI", "")
+        _require_no_user(place)
         if not place:
             raise ConfigError(
                 "--log mlflow: no server is named; give --log mlflow:URI or set MLFLOW_TRACKING_URI"
             )
-        try:
-            user = urlsplit(place).username
-        except ValueError as error:
-            raise ConfigError("--log mlflow: its URI is none; write http://HOST:PORT") from error
-        if user is not None:
-            raise ConfigError(
-                "--log mlflow: user and password belong into MLFLOW_TRACKING_USERNAME and _PASSWORD"
-            )
-    return SinkChoice(kind, str(Path(place).absolute()) if kind == "tensorboard" and place else place)
+    local = choice.kind == "tensorboard" and place
+    return SinkChoice(choice.kind, str(Path(place).absolute()) if local else place)
 
 
 def _stalled(environment: Mapping[str, str]) -> float:

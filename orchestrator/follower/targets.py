@@ -5,6 +5,8 @@ to read along: both are refused on a command line. Messages name a target by its
 """
 
 import netrc
+import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,6 +56,26 @@ def read_targets(given: Sequence[str], references: References) -> tuple[Target, 
     if twice := next((label for label in labels if labels.count(label) > 1), None):
         raise ConfigError(f"--notify: the target {twice} is given twice; give it once, or use @FILE for each")
     return tuple(found)
+
+
+def check_elsewhere(text: str) -> None:
+    """Checks a target of `--notify` for a command on another machine, which alone can read references.
+
+    Raises ConfigError for what is no target, has a secret in the wrong place, or names a file that depends on
+    where that command begins.
+    """
+    what, (kind, _, rest) = f"--notify {_shown(text)}", text.partition(":")
+    reference = next((it for it in (text, rest) if it.startswith(("@", "env:"))), None)
+    if reference is None:
+        _read(text, what, References({"NETRC": os.devnull}))
+        return
+    if reference != text and kind not in KINDS:
+        raise ConfigError(f"{what}: write KIND:URL, with one of the kinds {', '.join(KINDS)}")
+    name = reference.removeprefix("env:")
+    if name == reference and not reference.startswith(("@/", "@~")):
+        raise ConfigError(f"{what}: the file is on the machine of the run; write it from / on")
+    if name != reference and not re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII):
+        raise ConfigError(f"{what}: write env:NAME, with the name of a variable on the machine of the run")
 
 
 def _read(text: str, what: str, references: References) -> list[Target]:

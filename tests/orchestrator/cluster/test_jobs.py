@@ -23,6 +23,7 @@ from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
+from tests.orchestrator.follower.receivers import receiver
 from tests.orchestrator.messages import without_progress
 from tests.ray_head import BIN, Head, ray_head, read, wait_until
 
@@ -61,13 +62,19 @@ def cluster(head: Head, *arguments: object, **other: str) -> subprocess.Complete
     )
 
 
-def over(head: Head, job: str) -> bool:
-    """Whether the job server says that a job has ended; requested without a process, which takes a second."""
+def described(head: Head, job: str) -> str:
+    """All that the job server says of a job; requested without a process, which takes a second."""
     request = urllib.request.Request(
         f"{head.address}/api/jobs/{job}", headers={"Authorization": f"Bearer {head.token}"}
     )
     with urllib.request.urlopen(request, timeout=10) as reply:
-        return json.load(reply)["status"] not in ("PENDING", "RUNNING")
+        text: str = reply.read().decode()
+    return text
+
+
+def over(head: Head, job: str) -> bool:
+    """Whether the job server says that a job has ended."""
+    return json.loads(described(head, job))["status"] not in ("PENDING", "RUNNING")
 
 
 def shown(ended: subprocess.CompletedProcess[str]) -> Any:
@@ -81,6 +88,21 @@ def one_line(ended: subprocess.CompletedProcess[str]) -> str:
     lines = without_progress(ended.stderr)
     assert len(lines) == 1, ended.stderr
     return lines[0]
+
+
+def recorded(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[str]]:
+    """The commands that a cluster is to begin, which begins none."""
+    begun = list[Sequence[str]]()
+
+    class Recorder:
+        guarded, address = True, "http://head"
+
+        def begin(self, run: str, words: Sequence[str]) -> ClusterJob:
+            begun.append(words)
+            return ClusterJob(run, "waiting")
+
+    monkeypatch.setattr("panolog.orchestrator.cluster.jobs.connect", lambda _: Recorder())
+    return begun
 
 
 def state_of(root: Path) -> RunState:
@@ -128,15 +150,62 @@ def test_a_run_to_its_end(head: Head, scene: Path, tmp_path: Path) -> None:
     root = tmp_path / "run"
     settings = tmp_path / "settings.yaml"  # of this machine: the head receives its content
     settings.write_text("iterations: 10\nrefine: false\n")
-    ended = cluster(head, "submit", scene, "-o", root, *SMALL, "--config", settings)
-    assert re.fullmatch(r"raysubmit_\w+\n", ended.stdout), ended.stderr
-    assert "panolog cluster status" in ended.stderr
-    wait_until(lambda: over(head, ended.stdout.strip()), "the job has ended")
+    hook = tmp_path / "hook"
+    with receiver() as server:
+        hook.write_text(f"{server.url}/T0PSECRET")
+        hook.chmod(0o600)
+        passing = ("--notify", f"webhook:@{hook}", "--log", "tensorboard")
+        ended = cluster(head, "submit", scene, "-o", root, *SMALL, *passing, "--config", settings)
+        assert re.fullmatch(r"raysubmit_\w+\n", ended.stdout), ended.stderr
+        assert "panolog cluster status" in ended.stderr
+        wait_until(lambda: over(head, ended.stdout.strip()), "the job has ended")
+    assert [(it.path, it.json["type"]) for it in server.received] == [("/T0PSECRET", "run.done")]
+    assert "T0PSECRET" not in described(head, ended.stdout.strip())
+    assert list((root / "tensorboard").rglob("events.out.tfevents.*"))
     shown = cluster(head, "status", root)
     assert shown.returncode == 0, shown.stderr
     assert shown.stdout.startswith(f"job {ended.stdout.strip()} · done\ndone"), shown.stdout
     coarse = state_of(root).task(COARSE).progress
     assert coarse and coarse.iterations == 10
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "line"),
+    [
+        ("--notify", "slack:https://hooks.example/T0PSECRET", "its URL is a secret"),
+        ("--notify", "webhook:https://h.example/?key=T0PSECRET", "may hold a secret"),
+        ("--notify", "mail:smtp://me:T0PSECRET@h.example/a@b.c", "user, password and #"),
+        ("--notify", "slack:@slack.url", "the file is on the machine of the run; write it from / on"),
+        ("--notify", "@targets", "the file is on the machine of the run; write it from / on"),
+        ("--notify", "slack:env:T0P-SECRET", "write env:NAME, with the name of a variable"),
+        ("--notify", "paper:@/slack.url", "with one of the kinds webhook, slack, ntfy, mail"),
+        ("--log", "paper", "there is no such sink"),
+        ("--log", "mlflow:http://me:T0PSECRET@h.example", "user and password belong into"),
+        ("--log", "tensorboard:curves", "is on another machine; write it from / on"),
+    ],
+)
+def test_no_secret_becomes_a_word_of_a_job(option: str, value: str, line: str) -> None:
+    for command in (("submit", "/scene", "-o", "/runs/a"), ("resume", "/runs/a")):
+        said = refused(*command, option, value)
+        assert line in said
+        assert "T0PSECRET" not in said
+
+
+def test_notifications_and_sinks_are_words_of_the_job(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """References are those of the head: nothing is read here, and they come there as they are."""
+    begun = recorded(monkeypatch)
+    monkeypatch.setenv("PANOLOG_NOTIFY", "slack:https://hooks.example/T0PSECRET")
+    monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
+    (tmp_path / "netrc").write_text("not its format")
+    given = ["--notify", "slack:@/etc/panolog/slack.url", "--notify", "env:TARGETS", "--notify", "@~/more"]
+    given += ["--notify", "webhook:https://h.example/hook", "--notify", "mail:smtp://h.example/a@b.c"]
+    given += ["--log", "mlflow", "--log", "tensorboard:/curves", "--log", "wandb:place"]
+    for command in (("submit", "/data/town", "-o", "/runs/a"), ("resume", "/runs/a")):
+        ended = CliRunner().invoke(app.app, ["cluster", *command, *given])
+        assert ended.exit_code == 0, ended.output
+        assert list(begun.pop()[-len(given) - 3 : -3]) == given
 
 
 def test_a_job_that_fails_says_why(head: Head, tmp_path: Path) -> None:
@@ -204,16 +273,7 @@ def test_settings_survive_the_way_to_the_head() -> None:
 
 
 def test_a_run_of_panoramas_is_submitted_with_how_its_scene_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    begun = list[Sequence[str]]()
-
-    class Recorder:
-        guarded, address = True, "http://head"
-
-        def begin(self, run: str, words: Sequence[str]) -> ClusterJob:
-            begun.append(words)
-            return ClusterJob(run, "waiting")
-
-    monkeypatch.setattr("panolog.orchestrator.cluster.jobs.connect", lambda _: Recorder())
+    begun = recorded(monkeypatch)
     given = ["--trajectory", "/data/walk.tum", "--nadir", "12.0", "--no-static", "--partial"]
     given += ["--depth-model", "/data/m.onnx"]
     ended = CliRunner().invoke(app.app, ["cluster", "submit", "/data/walk.mp4", "-o", "/runs/a", *given])
