@@ -50,6 +50,11 @@ class Board:
             self._changed.wait_for(lambda: self._news is not known, seconds)
             return self._news
 
+    def wait_for_end(self, seconds: float) -> None:
+        """Waits until the run has ended, or for so many seconds."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._news.ended, seconds)
+
     @property
     def left(self) -> float:
         """Seconds that are left to work, once the run has ended."""

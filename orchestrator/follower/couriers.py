@@ -83,13 +83,8 @@ class Courier(threading.Thread):
 
     def _pause(self, seconds: float) -> bool:
         """Waits so long; less once the run has ended. Returns whether there is time for another try."""
-        news = self._board.news
-        if not news.ended:
-            stop = threading.Event()
-            waited = 0.0
-            while waited < seconds and not self._board.news.ended:
-                stop.wait(min(0.5, seconds - waited))
-                waited += 0.5
+        if not self._board.news.ended:
+            self._board.wait_for_end(seconds)
             return True
         left = self._board.left
         threading.Event().wait(max(0.0, min(seconds, _LAST_S, left)))

@@ -1,5 +1,6 @@
 """Delivery to one target: tries again, gives up, goes on after a kill, and holds nothing up."""
 
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -69,6 +70,28 @@ def test_what_is_refused_for_good_is_given_up_and_said(tmp_path: Path) -> None:
     again = Post()
     deliver(tmp_path, again, notice(1), notice(2, Kind.DONE))
     assert again.tried == []
+
+
+def test_the_end_of_the_run_ends_a_pause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A target that was refused for five minutes is tried again at once: little time is left."""
+    monkeypatch.setattr("panolog.orchestrator.follower.couriers._FIRST_S", 300.0)
+    refused, board = threading.Event(), Board()
+
+    def post(_: Target, notification: Notification) -> Refusal | None:
+        if refused.is_set():
+            return None
+        refused.set()
+        return LATER
+
+    board.publish(News("run", 0, (notice(1),)))
+    courier = Courier(TARGET, board, tmp_path / "ledger.json", post)
+    courier.start()
+    assert refused.wait(60)
+    board.publish(News("run", 0, (notice(1),), ended=True), 30.0)
+    courier.join(60)
+    assert not courier.is_alive()
+    assert courier.problem == ""
+    assert Ledger(tmp_path / "ledger.json", "run").get("delivered", []) == ["r-preempted-1"]
 
 
 def test_tries_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
