@@ -96,13 +96,13 @@ LogOption = Annotated[
         metavar="mlflow|tensorboard|wandb", help="Pass the curves on to a sink; may be given several times."
     ),
 ]
-_BUDGET = "Cost and time (docs/money.md)"  # the panel of these options in the help
+BUDGET = "Cost and time (docs/money.md)"  # the panel of these options in the help
 PricesOption = Annotated[
     str | None,
     typer.Option(
         metavar="FILE",
         help="Prices of machines. Default: ~/.config/panolog/prices.toml, if there is one.",
-        rich_help_panel=_BUDGET,
+        rich_help_panel=BUDGET,
     ),
 ]
 MaxCostOption = Annotated[
@@ -110,7 +110,7 @@ MaxCostOption = Annotated[
     typer.Option(
         metavar="AMOUNT|none",
         help="End the training in time for the whole run to cost at most so much, and deliver what there is.",
-        rich_help_panel=_BUDGET,
+        rich_help_panel=BUDGET,
     ),
 ]
 DeadlineOption = Annotated[
@@ -118,7 +118,7 @@ DeadlineOption = Annotated[
     typer.Option(
         metavar="6h|08:00|none",
         help="The same, so that all is done at a time, or so long from now.",
-        rich_help_panel=_BUDGET,
+        rich_help_panel=BUDGET,
     ),
 ]
 DeviceOption = Annotated[

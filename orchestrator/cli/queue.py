@@ -10,7 +10,7 @@ import typer
 
 from panolog.orchestrator.cli import run as runs
 from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
-from panolog.orchestrator.cli.options import JsonOption, preparation, run_config, wanted
+from panolog.orchestrator.cli.options import BUDGET, JsonOption, preparation, run_config, wanted
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import QueueError
 
@@ -62,6 +62,16 @@ RamOption = Annotated[
         rich_help_panel=_SHARE,
     ),
 ]
+LaterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--deadline",
+        metavar="6h|08:00",
+        help="The same, so that all is done at a time, or so long from the start of the run, not from now;"
+        " 08:00 is the next one after its start.",
+        rich_help_panel=BUDGET,
+    ),
+]
 IdArg = Annotated[int, typer.Argument(metavar="ID", min=1, help="Number of an entry; see `queue list`.")]
 
 
@@ -76,6 +86,7 @@ def _as_run(command: Callable[..., None]) -> Callable[..., None]:
     fixed = [parameter for parameter in own.values() if parameter.kind != inspect.Parameter.VAR_KEYWORD]
     parameters = [*fixed[:1], *inspect.signature(runs.run).parameters.values(), *fixed[1:]]
     parameters = [it.replace(kind=inspect.Parameter.KEYWORD_ONLY) for it in parameters]
+    parameters = [it.replace(annotation=LaterOption) if it.name == "deadline" else it for it in parameters]
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # read by typer
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command
@@ -91,10 +102,7 @@ def add(
     ram: RamOption = None,
     **given: Any,
 ) -> None:
-    """Add a run to the queue: the arguments and options of `panolog run`.
-
-    A --deadline such as 6h counts from the start of the run, one such as 2026-12-24T08:00 is what it says.
-    """
+    """Add a run to the queue: the arguments and options of `panolog run`."""
     from panolog.orchestrator.queue.entries import Command as Words
     from panolog.orchestrator.queue.store import opened
 

@@ -79,6 +79,8 @@ def test_limits_are_given_to_the_start_alone(here: Path, scene: Path) -> None:
         command = queue.entry(1).command
     assert command.first[-6:] == ("--prices", str(PRICES), "--max-cost", "9", "--deadline", "3h")
     assert command.later == ()  # the run itself has them
+    said = " ".join(panolog("queue", "add", "--help")[1].replace("│", " ").split())
+    assert "so long from the start of the run, not from now" in said
 
 
 def test_a_share_is_given_or_follows_from_the_device(here: Path, scene: Path) -> None:
