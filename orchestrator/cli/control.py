@@ -93,7 +93,7 @@ def clean(
     ] = False,
     older_than: Annotated[
         str | None,
-        typer.Option(metavar="30d", help="Only runs whose last record is older: hours, days or weeks."),
+        typer.Option(metavar="30d", help="Only runs whose last record is older, such as 12h, 30d or 8w."),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be removed, with its bytes; remove nothing.")

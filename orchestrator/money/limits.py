@@ -10,11 +10,10 @@ from datetime import datetime, timedelta
 from panolog.orchestrator.money.prices import PriceList, of_record
 from panolog.orchestrator.run.money.records import BudgetSet
 from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.run.units import DURATION, seconds_of
 from panolog.scene.errors import ConfigError
 
 NONE = "none"  # removes a limit
-_PART = re.compile(r"(\d+(?:\.\d+)?)\s*([dhms])")
-_UNITS = {"d": 86_400.0, "h": 3600.0, "m": 60.0, "s": 1.0}
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2})")
 _MOST_S = 10 * 365 * 86_400.0  # a deadline beyond is a typing error
 
@@ -99,21 +98,14 @@ def parse_deadline(text: str, now: float) -> float:
     Args: now, seconds since the epoch. A time without a zone is of this machine's; one without a day is the
     next. Raises ConfigError for what is none, or is over.
     """
-    found = _duration(text)
+    found = seconds_of(text)
     when = now + found if found is not None else _time(text, now)
     if when is None:
-        raise ConfigError(f"--deadline {text}: write 6h, 1h30m, 08:00, 2026-12-24T08:00, or none")
+        raise ConfigError(f"--deadline {text}: write {DURATION}, 08:00, 2026-12-24T08:00, or none")
     if not now < when < now + _MOST_S:
         over = "is over" if when <= now else "is more than ten years away"
         raise ConfigError(f"--deadline {text}: {over}")
     return when
-
-
-def _duration(text: str) -> float | None:
-    """Seconds of "1d2h3m4s"; None if it is no duration."""
-    parts = _PART.findall(text)
-    whole = "".join(f"{number}{unit}" for number, unit in parts) == "".join(text.split())
-    return sum(float(number) * _UNITS[unit] for number, unit in parts) if parts and whole else None
 
 
 def _time(text: str, now: float) -> float | None:

@@ -1,6 +1,5 @@
 """`panolog clean`: removes what of runs is superseded, under the lock of each, and says so in its history."""
 
-import re
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -22,10 +21,8 @@ from panolog.orchestrator.run.folder import RunFolder, removed_models, write_jso
 from panolog.orchestrator.run.records import Noticed
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.run.store import Database
-from panolog.orchestrator.run.units import gib
+from panolog.orchestrator.run.units import DURATION, gib, seconds_of
 from panolog.scene.errors import ConfigError, PanologError, RunLockedError
-
-_UNITS = {"h": 3_600.0, "d": 86_400.0, "w": 604_800.0}  # seconds
 
 
 @dataclass(frozen=True)
@@ -73,10 +70,10 @@ class Cleaned:
 
 def age(text: str) -> float:
     """Seconds of an age such as 12h, 30d or 8w. Raises ConfigError for anything else."""
-    found = re.fullmatch(r"([0-9]{1,6})([hdw])", text.strip())
+    found = seconds_of(text)
     if found is None:
-        raise ConfigError(f"--older-than {text}: write hours, days or weeks, such as 12h, 30d or 8w")
-    return int(found[1]) * _UNITS[found[2]]
+        raise ConfigError(f"--older-than {text}: write {DURATION}")
+    return found
 
 
 def clean(roots: Sequence[Path], wanted: Wanted, *, dry: bool) -> Cleaned:

@@ -1,9 +1,14 @@
 """Numbers for people, and from them."""
 
 import math
+import re
 from collections.abc import Mapping
 
 from panolog.scene.errors import ConfigError
+
+DURATION = "a duration such as 90m, 12h, 1h30m, 30d or 8w"  # what people are to write
+_PART = re.compile(r"(\d{1,9}(?:\.\d{1,9})?)([wdhms])")
+_SECONDS = {"w": 604_800.0, "d": 86_400.0, "h": 3600.0, "m": 60.0, "s": 1.0}
 
 
 def gib(size: float) -> str:
@@ -16,6 +21,15 @@ def duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def seconds_of(text: str) -> float | None:
+    """Seconds of a duration that people write, such as "8w", "1d 2h" or "1.5h"; None if it is none."""
+    packed = "".join(text.split())
+    parts = _PART.findall(packed)
+    if not parts or "".join(map("".join, parts)) != packed:
+        return None
+    return sum(float(number) * _SECONDS[unit] for number, unit in parts)
 
 
 def positive(name: str, environment: Mapping[str, str], default: float, hint: str) -> float:

@@ -15,7 +15,15 @@ PRICES = PriceList.model_validate({"currency": "USD", "machine": [{"name": "a", 
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("6h", 21_600), ("1h30m", 5400), ("1d 2h", 93_600), ("90s", 90), ("23:30", 1800), ("22:00", 23 * 3600)],
+    [
+        ("6h", 21_600),
+        ("1h30m", 5400),
+        ("1d 2h", 93_600),
+        ("90s", 90),
+        ("1w", 604_800),
+        ("23:30", 1800),
+        ("22:00", 23 * 3600),
+    ],
 )
 def test_a_deadline_is_a_duration_or_the_next_time_of_day(text: str, seconds: float) -> None:
     assert parse_deadline(text, NOW) == NOW + seconds
