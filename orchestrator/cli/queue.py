@@ -62,7 +62,7 @@ RamOption = Annotated[
         rich_help_panel=_SHARE,
     ),
 ]
-LaterOption = Annotated[
+QueuedDeadlineOption = Annotated[
     str | None,
     typer.Option(
         "--deadline",
@@ -86,7 +86,9 @@ def _as_run(command: Callable[..., None]) -> Callable[..., None]:
     fixed = [parameter for parameter in own.values() if parameter.kind != inspect.Parameter.VAR_KEYWORD]
     parameters = [*fixed[:1], *inspect.signature(runs.run).parameters.values(), *fixed[1:]]
     parameters = [it.replace(kind=inspect.Parameter.KEYWORD_ONLY) for it in parameters]
-    parameters = [it.replace(annotation=LaterOption) if it.name == "deadline" else it for it in parameters]
+    parameters = [
+        it.replace(annotation=QueuedDeadlineOption) if it.name == "deadline" else it for it in parameters
+    ]
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # read by typer
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command

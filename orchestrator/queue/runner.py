@@ -111,11 +111,13 @@ class _Runner:
     before: set[Any]  # what is blocked in the runs
     live: dict[int, _Live] = field(default_factory=dict)
     resumed: list[Entry] = field(default_factory=list)  # to be resumed, before any that waits
+    noted: Entry | None = None  # the one that waits for its share, as the database says
     stopping: bool = False
     failed: bool = False  # a run has
 
     def run(self) -> int:
         """As the function."""
+        self._written(self.queue.forget_waits)  # of a runner before
         for entry in self._written(self.queue.running):
             self.live[entry.id] = _Live(entry, None)  # until it is seen that it is not
         while True:
@@ -158,6 +160,9 @@ class _Runner:
             if isinstance(share, str):
                 self._wait(entry, share)
                 return
+            if self.noted is not None:
+                self._written(self.queue.forget_waits)
+                self.noted = None
             if claimed := self._claimed(entry):
                 self._launch(claimed, share)
 
@@ -175,11 +180,13 @@ class _Runner:
         return self._written(lambda: self.queue.claim(entry.id))
 
     def _wait(self, entry: Entry, reason: str) -> None:
-        if entry.reason != reason:
-            self._written(lambda: self.queue.note(entry.id, reason))
-            self.say(f"{entry.id}: {reason}")
-            if self.resumed:
-                self.resumed[0] = replace(entry, reason=reason)
+        if self.noted is not None and (self.noted.id, self.noted.reason) == (entry.id, reason):
+            return
+        if self.noted is not None and self.noted.id != entry.id:  # it was moved
+            self._written(self.queue.forget_waits)
+        self.noted = replace(entry, reason=reason)
+        self._written(lambda: self.queue.note(entry.id, reason))
+        self.say(f"{entry.id}: {reason}")
 
     def _launch(self, entry: Entry, share: Share | None) -> None:
         root = entry.command.run

@@ -88,7 +88,7 @@ def environment(share: Share | None) -> dict[str, str]:
     if share is None:
         return {}
     values = {} if share.gpus is None else {"CUDA_VISIBLE_DEVICES": ",".join(share.gpus)}
-    return values | ({} if share.memory is None else {machine.SHARE: repr(share.memory / 2**30)})
+    return values | ({} if share.memory is None else {machine.MEMORY_VARIABLE: repr(share.memory / 2**30)})
 
 
 def describe(entry: Entry) -> str:

@@ -202,6 +202,11 @@ class Queue:
             for _ in self._select("id = ? AND state IN ('waiting', 'running')", (id,)):
                 self._update(id, reason=reason)
 
+    def forget_waits(self) -> None:
+        """Removes all notes of what entries wait for."""
+        with self._transaction():
+            self._connection.execute("UPDATE entries SET reason = '' WHERE state IN ('waiting', 'running')")
+
     def launched(self, id: int, process: Identity, share: Share | None = None) -> None:
         """Notes process and share of a running entry, before anything of the run begins."""
         with self._transaction():

@@ -31,6 +31,10 @@ class QueueView:
         left = entry.state == State.RUNNING and not self.runner and entry.id not in self.alive
         return _LEFT if left else str(entry.state)
 
+    def reason(self, entry: Entry) -> str:
+        """Why it has failed or was stopped; what it waits for, while a runner is at work."""
+        return entry.reason if self.runner or not _open(entry) else ""
+
     def as_json(self) -> dict[str, Any]:
         """All of it."""
         return {
@@ -54,7 +58,7 @@ class QueueView:
             "ended": entry.ended,
             "starts": entry.starts,
             "exit_code": entry.code,
-            "reason": entry.reason,
+            "reason": self.reason(entry),
             "needs": None if command.needs is None else asdict(command.needs),
             "share": None if entry.share is None else asdict(entry.share),
         }
@@ -64,7 +68,7 @@ class QueueView:
         rows = [(str(entry.id), self.label(entry), str(entry.command.run)) for entry in self.entries]
         width = max((len(id) for id, _, _ in rows), default=0)
         for (id, label, run), entry in zip(rows, self.entries, strict=True):
-            more = entry.reason or (describe(entry) if _open(entry) else "")
+            more = self.reason(entry) or (describe(entry) if _open(entry) else "")
             yield f"{id:>{width}}  {label:<11}  {run}" + (f"  ({more})" if more else "")
         if not rows:
             yield f"the queue {self.folder} is empty"

@@ -16,7 +16,7 @@ _VMSTAT = Path("/proc/vmstat")
 _PRODUCT = Path("/sys/class/dmi/id/product_name")  # on AWS the instance type
 _TYPE = re.compile(r"[a-z][a-z0-9-]*\.[a-z0-9-]+")  # other product names say nothing: "Standard PC", "KVM"
 _INSTANCE = "PANOLOG_INSTANCE"  # the variable that names it where that does not
-SHARE = "PANOLOG_MEMORY"  # the variable with the memory, in GiB, that a run may use of this machine
+MEMORY_VARIABLE = "PANOLOG_MEMORY"  # GiB of this machine that a run may use
 
 
 def groups(controller: str, mount: Path = _MOUNT, own: Path = _OWN) -> Iterator[Path]:
@@ -82,8 +82,8 @@ def _total(mount: Path, own: Path) -> int:
 
 def _share() -> Iterator[int]:
     """The bytes that a run may use of this machine, if that is limited."""
-    if os.environ.get(SHARE):
-        yield int(positive(SHARE, os.environ, 1.0, "a number of GiB, such as 12.5") * 2**30)
+    if os.environ.get(MEMORY_VARIABLE):
+        yield int(positive(MEMORY_VARIABLE, os.environ, 1.0, "a number of GiB, such as 12.5") * 2**30)
 
 
 def _limits(mount: Path, own: Path) -> Iterator[tuple[Path, int]]:

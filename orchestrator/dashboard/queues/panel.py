@@ -71,7 +71,7 @@ class QueuePanel:
             run=id,
             state=entry.state,
             label=view.label(entry),
-            reason=entry.reason,
+            reason=view.reason(entry),
             share=describe(entry) if entry.state in (State.WAITING, State.RUNNING) else "",
             time=entry.ended or entry.began or entry.added,
         )
