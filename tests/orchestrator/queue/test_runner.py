@@ -97,8 +97,12 @@ def test_a_run_that_is_killed_again_and_again_has_failed(tmp_path: Path) -> None
 def test_side_by_side_within_the_limit(tmp_path: Path) -> None:
     queue = Scripted(tmp_path, at_once=3)
     for number in range(7):
-        queue.add(str(number))
-    assert ended(queue.start())[0] == 0
+        queue.add(str(number), held=True)
+    runner = queue.start()
+    wait_until(lambda: len(queue.lines()) == 3, "three runs at work")
+    for number in range(7):
+        (tmp_path / str(number) / "wait").unlink()
+    assert ended(runner)[0] == 0
     active, most = 0, 0
     for word, _, _ in queue.lines():
         active += 1 if word == "begins" else -1
