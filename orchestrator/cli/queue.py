@@ -164,12 +164,26 @@ def remove(id: IdArg, queue: QueueOption = None) -> None:
 
 
 @app.command(cls=Command)
-def retry(id: IdArg, queue: QueueOption = None) -> None:
-    """Let a run that has failed or was stopped wait again; it is resumed."""
+def retry(
+    id: IdArg,
+    queue: QueueOption = None,
+    gpus: GpusOption = None,
+    cores: CoresOption = None,
+    ram: RamOption = None,
+) -> None:
+    """Let a run that has failed or was stopped wait again; it is resumed. Options replace its share."""
+    from dataclasses import replace
+
     from panolog.orchestrator.queue.store import opened
 
+    memory = None if ram is None else int(ram * 2**30)
+    values = {"gpus": gpus, "cores": cores, "memory": memory}
+    changes: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     with opened(_folder(queue), make=False) as found:
-        found.retry(id)
+        needs = found.entry(id).command.needs
+        if changes and needs is None:
+            raise QueueError(f"entry {id} is a run on a cluster, which Ray divides; leave the options out")
+        found.retry(id, replace(needs, **changes) if changes and needs is not None else None)
 
 
 @app.command(cls=Command)

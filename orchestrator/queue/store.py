@@ -180,10 +180,15 @@ class Queue:
                 raise QueueError(f"entry {id} is running; stop it first: `panolog stop {run}`")
             self._update(id, state=State.REMOVED)
 
-    def retry(self, id: int) -> None:
-        """Lets an entry that has failed or was stopped wait again, last. Raises QueueError for any other."""
+    def retry(self, id: int, needs: Needs | None = None) -> None:
+        """Lets an entry that has failed or was stopped wait again, last. Raises QueueError for any other.
+
+        Args: needs, instead of those that it had.
+        """
         with self._transaction():
             self._require(id, State.FAILED, State.STOPPED, doing="tried again")
+            if needs is not None:
+                self._update(id, needs=json.dumps(asdict(needs)))
             (last,) = self._connection.execute("SELECT MAX(position) FROM entries").fetchone()
             changes = {"position": last + 1, "ended": None, "code": None, "reason": "", "losses": 0}
             self._update(id, state=State.WAITING, **changes)

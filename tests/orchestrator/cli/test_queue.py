@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app
-from panolog.orchestrator.queue.entries import Needs
+from panolog.orchestrator.queue.entries import Needs, State
 from panolog.orchestrator.queue.store import opened
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import RunBegan
@@ -100,6 +100,23 @@ def test_a_share_is_given_or_follows_from_the_device(here: Path, scene: Path) ->
     rows = json.loads(panolog("queue", "list", "--json")[1])["entries"]
     assert rows[1]["needs"] == {"gpus": 2, "cores": 3, "memory": 3 * 2**29}
     assert (rows[4]["needs"], rows[1]["share"]) == (None, None)
+
+
+def test_a_run_that_found_no_room_is_given_more(here: Path, scene: Path) -> None:
+    for name, words in (("a", ["--gpus", "1", "--ram", "2"]), ("b", ["--address", "auto"])):
+        assert panolog("queue", "add", scene, "-o", here / name, *words)[0] == 0
+    with opened(here / "queue", make=False) as queue:
+        for number in (1, 2):
+            queue.claim(number)
+            queue.end(number, State.FAILED, 2, "needs about 6.8 GiB of memory, and 2.0 GiB are free")
+        assert panolog("queue", "retry", 1, "--ram", 8, "--cores", 2)[0] == 0
+        assert (queue.entry(1).command.needs, queue.entry(1).state) == (Needs(1, 2, 2**33), State.WAITING)
+        code, _, line = panolog("queue", "retry", 2, "--ram", 8)
+        assert (code, line.partition(": ")[2]) == (
+            2,
+            "entry 2 is a run on a cluster, which Ray divides; leave the options out",
+        )
+        assert panolog("queue", "retry", 2)[0] == 0
 
 
 @pytest.mark.parametrize(
