@@ -128,7 +128,9 @@ def calibrate(pool: Pool, scene: Scene, config: RunConfig) -> Basis:
     Raises InputError if the input is wrong.
     """
     cuda = config.device == "cuda"
-    placed = placement.place([Demand(CALIBRATE, 0)], pool.nodes(), (), cuda=cuda)
+    leave = pool.notices()  # of nodes that announce their end
+    nodes = [node for node in pool.nodes() if node.id not in leave] or pool.nodes()
+    placed = placement.place([Demand(CALIBRATE, 0)], nodes, (), cuda=cuda)
     if not placed:
         return assumed(scene, config)
     _, where = placed[0]

@@ -3,6 +3,8 @@
 import hashlib
 import json
 import shutil
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +22,10 @@ from panolog.scene.image_files import read_info
 
 _KEY = "key.json"
 _WEBP = ".webp"
+
+if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is not None:
+    # pycolmap's log replaces, below Python, what the process does at SIGTERM: it prints a trace and ends it.
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 
 @contextmanager
