@@ -175,9 +175,8 @@ class Driver:
             if self._stop.requested:
                 self._wind_down()
                 raise KeyboardInterrupt
-            if (
-                reached := self._purse.reached(self._writers.expected(self._state, self._attempts))
-            ) is not None:
+            saving = self._writers.expected(self._state, self._attempts)
+            if (reached := self._purse.reached(saving, self._machines.idle)) is not None:
                 self._end_training(reached)
         return end
 

@@ -12,7 +12,7 @@ from panolog.orchestrator.resources.expected import Coming, Expected
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.placement import Placed, Running
 from panolog.orchestrator.resources.pool import Pool
-from panolog.orchestrator.resources.scaling import Growth, Work
+from panolog.orchestrator.resources.scaling import IDLE_S, Growth, Work
 from panolog.orchestrator.run.clock import Clock
 from panolog.orchestrator.run.records import NodeLeaving, Noticed, Record, RunContinued, RunWaiting
 
@@ -65,6 +65,11 @@ class Machines:
         idle = bool(work.demands) and not placed and not running
         self._explain(self._why(growth) if idle else "")
         return placed
+
+    @property
+    def idle(self) -> float | None:
+        """Seconds after which a machine goes on which nothing runs; None if all stay."""
+        return IDLE_S if self._pool.growth().groups else None
 
     @property
     def expecting(self) -> bool:

@@ -16,6 +16,7 @@ from panolog.orchestrator.estimates.costs import slowness
 from panolog.orchestrator.money import prices
 from panolog.orchestrator.money.losses import lost_at
 from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.resources.scaling import STARTUP_S
 from panolog.orchestrator.run.clock import Clock
 from panolog.orchestrator.run.money.records import (
     BudgetNear,
@@ -55,10 +56,13 @@ def after_training(estimate: Mapping[str, float | None] | None) -> float:
     return sum((estimate or {}).get(stage) or 0.0 for stage in _AFTER)
 
 
-def verdict(state: RunState, now: float, saving: float) -> BudgetNear | BudgetReached | None:
+def verdict(
+    state: RunState, now: float, saving: float, idle: float | None = None
+) -> BudgetNear | BudgetReached | None:
     """Whether a limit ends the training now, or is near; None if neither is new.
 
-    Args: now, seconds since the epoch; saving, seconds in which the tasks that train save a checkpoint.
+    Args: now, seconds since the epoch; saving, seconds in which the tasks that train save a checkpoint; idle,
+    as `Spending.ahead`: then a machine has to start again after the merge.
     """
     money = state.money
     if money.budget is None or money.reached is not None or state.status(MERGE) == Status.DONE:
@@ -68,6 +72,7 @@ def verdict(state: RunState, now: float, saving: float) -> BudgetNear | BudgetRe
         money.budget,
         now,
         _UNSURE * slowness(state) * after_training(state.estimate) + saving + _TURN_S,
+        idle,
     )
     for limit in limits:
         if limit.used + limit.needed >= limit.allowed:
@@ -78,12 +83,15 @@ def verdict(state: RunState, now: float, saving: float) -> BudgetNear | BudgetRe
     return None
 
 
-def _limits(state: RunState, budget: BudgetSet, now: float, needed: float) -> list[_Limit]:
-    """Args: needed, seconds for what follows the training."""
+def _limits(
+    state: RunState, budget: BudgetSet, now: float, needed: float, idle: float | None
+) -> list[_Limit]:
+    """Args: needed, seconds for what follows the training, on machines that are there; idle, as `verdict`."""
+    needed += 0.0 if idle is None else STARTUP_S
     found, money = list[_Limit](), state.money.until(now)
     later = "saving, merge, evaluation and delivery need about"
     if budget.max_cost is not None:
-        used, cost = money.used.cost, money.rate * needed
+        used, cost = money.used.cost, money.ahead(needed, idle)
         name = f"the limit of {budget.max_cost:g} {money.currency}"
         text = f"{used:.2f} {money.currency} are used, and {later} {cost:.2f}"
         found.append(_Limit(name, budget.max_cost, used, cost, text))
@@ -135,9 +143,9 @@ class Purse:
         self._seen = nodes
         self._journal.record(records)
 
-    def reached(self, saving: float) -> BudgetReached | None:
-        """The limit that ends the training now; records that one is near. Args: saving, as `verdict`."""
-        found = verdict(self._journal.state, self._clock.time(), saving)
+    def reached(self, saving: float, idle: float | None = None) -> BudgetReached | None:
+        """The limit that ends the training now; records that one is near. Args: as `verdict`."""
+        found = verdict(self._journal.state, self._clock.time(), saving, idle)
         if isinstance(found, BudgetNear):
             self._journal.record([found])
             return None

@@ -77,7 +77,7 @@ def view_money(state: RunState, end: float, *, running: bool) -> MoneyView | Non
         used=_used(money.used, priced=priced),
         idle=_used(money.idle, priced=priced),
         lost=_used(money.lost, priced=priced),
-        rate=3600 * money.rate if priced else None,
+        rate=money.ahead(3600.0) if priced else None,
         max_cost=budget.max_cost if budget else None,
         deadline=budget.deadline if budget else None,
         reached=money.reached.reason if money.reached else None,

@@ -121,11 +121,14 @@ class Spending:
         """What had to be done again."""
         return _sum(machine.lost for machine in self.machines.values())
 
-    @property
-    def rate(self) -> float:
-        """Currency units per second of the machines that are there."""
-        there = (machine for machine in self.machines.values() if machine.open)
-        return sum(machine.priced(1.0).cost for machine in there)
+    def ahead(self, seconds: float, idle: float | None = None) -> float:
+        """What so many seconds more cost, in currency units.
+
+        Args: idle, seconds after which the machines that are not needed go, all but one; None = they stay.
+        """
+        there = [machine.priced(1.0).cost for machine in self.machines.values() if machine.open]
+        together = seconds if idle is None else min(idle, seconds)
+        return sum(there) * together + max(there, default=0.0) * (seconds - together)
 
     @property
     def priced(self) -> bool:

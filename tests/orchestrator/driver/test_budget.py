@@ -13,13 +13,22 @@ from panolog.orchestrator.driver.purse import require_enough, verdict
 from panolog.orchestrator.estimates.costs import slowness
 from panolog.orchestrator.money.losses import lost_with_driver
 from panolog.orchestrator.resources.nodes import Node
-from panolog.orchestrator.run.money.records import BudgetNear, BudgetReached, BudgetSet, WorkLost
+from panolog.orchestrator.resources.scaling import STARTUP_S
+from panolog.orchestrator.run.money.records import (
+    BudgetNear,
+    BudgetReached,
+    BudgetSet,
+    NodeReserved,
+    WorkLost,
+)
 from panolog.orchestrator.run.records import (
     Outcome,
     PreflightSaved,
+    Record,
     RunBegan,
+    Stored,
 )
-from panolog.orchestrator.run.state import RunState, Status
+from panolog.orchestrator.run.state import RunState, Status, replay
 from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import ConfigError
 from panolog.scene.ply import read_ply
@@ -258,3 +267,24 @@ def test_where_stage_one_was_slower_than_estimated_more_is_kept_for_what_follows
     assert isinstance(verdict(replace(state, money=money), 1e9, 1.0), BudgetReached)  # 36 + 1 + 2 seconds
     money = replace(money, budget=BudgetSet(deadline=1e9 + 40))
     assert isinstance(verdict(replace(state, money=money), 1e9, 1.0), BudgetNear)
+
+
+def test_where_idle_machines_go_less_is_reserved_in_cost_and_more_in_time() -> None:
+    """Of ten machines nine end a minute after the training, and one has to start again after the merge."""
+    at = 1e9
+    records: list[Record] = [RunBegan("host", 1, False), PreflightSaved("preflight.json", dict(AFTER))]
+    machines = [NodeReserved(str(i), "host", "small", 3600.0) for i in range(10)]
+
+    def found(now: float, idle: float | None, **limits: Any) -> BudgetNear | BudgetReached | None:
+        budget = BudgetSet(prices=PRICES, **limits)
+        all_of: list[Record] = [*records, budget, *machines]
+        state = replay(Stored(i, at, record) for i, record in enumerate(all_of, 1))
+        return verdict(state, at + now, 1.0, idle)
+
+    needed = 1.2 * sum(AFTER.values()) + 3
+    cost = 1000 + 10 * 60 + needed + STARTUP_S - 60  # 100 seconds of ten machines, and what follows
+    assert isinstance(found(100, 60, max_cost=cost - 20), BudgetReached)
+    assert not isinstance(found(100, 60, max_cost=cost + 20), BudgetReached)
+    assert isinstance(found(100, None, deadline=at + 100 + needed - 1), BudgetReached)
+    assert not isinstance(found(100, None, deadline=at + 100 + needed + 1), BudgetReached)
+    assert isinstance(found(100, 60, deadline=at + 100 + needed + STARTUP_S - 1), BudgetReached)

@@ -40,7 +40,15 @@ def test_a_machine_costs_from_when_it_comes_until_it_goes() -> None:
     state = after((0, BEGAN), (0, A), (5, B), (9, NodeReturned("b")), (20, RunEnded(Outcome.DONE)))
     assert parts(state.money) == pytest.approx((24, 24, 0))
     assert parts(state.money.until(100)) == pytest.approx((24, 24, 0))
-    assert state.money.rate == 0
+    assert state.money.ahead(10) == 0
+
+
+def test_what_follows_costs_all_machines_or_one_of_them_once_the_others_are_gone() -> None:
+    money = after((0, BEGAN), (0, A), (0, B)).money
+    each, other = (money.machines[name].priced(1.0).cost for name in ("a", "b"))
+    assert money.ahead(100) == pytest.approx(100 * (each + other))
+    assert money.ahead(100, idle=30) == pytest.approx(30 * (each + other) + 70 * max(each, other))
+    assert money.ahead(20, idle=30) == pytest.approx(20 * (each + other))
 
 
 def test_it_is_idle_while_no_task_runs_there() -> None:
