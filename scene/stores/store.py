@@ -1,13 +1,15 @@
 """One place in an object store: its objects by names relative to it, with retries.
 
 What a store may fail with for a moment (throttling, 5xx, resets, truncated answers) is tried again with
-growing pauses, after the provider's own library has done the same for less than a minute. What needs the user
+growing pauses, after the provider's own library has done the same for up to 90 seconds. What needs the user
 (no credentials, no access, no bucket) is a StoreError at once.
 """
 
 import asyncio
 import errno
 import importlib
+import logging
+import os
 import random
 import time
 from collections.abc import Callable, Mapping
@@ -25,26 +27,55 @@ T = TypeVar("T")
 PATIENCE_S = 300.0  # for which something is tried
 _FIRST_S, _LONGEST_S = 0.5, 30.0  # pauses, each twice as long as the one before, half of it at random
 _PACKAGES = {"s3": "s3fs", "gcs": "gcsfs", "azure": "adlfs"}
-# Errors of the providers' libraries that are no OSError, by extra: module and class. The first of each can be
-# cured only by the user.
-_ERRORS: dict[str, tuple[tuple[str, str], ...]] = {
-    "s3": (
-        ("botocore.exceptions", "NoCredentialsError"),
-        ("botocore.exceptions", "BotoCoreError"),
-        ("botocore.exceptions", "ClientError"),
-        ("botocore.parsers", "ResponseParserError"),  # of an answer that is half there
-        ("aiohttp", "ClientError"),
+_LOGGERS = {"gcs": ("gcsfs",), "azure": ("azure", "adlfs")}
+# gcsfs requests by gRPC of which kind a bucket is, unless this says false. Objects are alike in all kinds.
+_GCS_KINDS = "GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT"
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Errors of a provider's library, by what they mean; as "module:class", or as the classes."""
+
+    absent: tuple[Any, ...] = ()  # there is no such object or bucket
+    final: tuple[Any, ...] = ()  # only the user can cure it
+    passing: tuple[Any, ...] = ()  # may be over in a moment, unless the answer refuses access
+
+    def loaded(self) -> "_Errors":
+        """The classes, with those that all file systems share."""
+        absent, final, passing = (
+            tuple(map(_loaded, names)) for names in (self.absent, self.final, self.passing)
+        )
+        return _Errors(
+            (FileNotFoundError, *absent),
+            (PermissionError, *final),
+            (OSError, asyncio.TimeoutError, *passing),
+        )
+
+
+_ERRORS = {
+    "": _Errors(),
+    "s3": _Errors(
+        final=("botocore.exceptions:NoCredentialsError",),
+        passing=(
+            "botocore.exceptions:BotoCoreError",
+            "botocore.exceptions:ClientError",
+            "botocore.parsers:ResponseParserError",  # of an answer that is half there
+            "aiohttp:ClientError",
+        ),
     ),
-    "gcs": (
-        ("google.auth.exceptions", "DefaultCredentialsError"),
-        ("google.auth.exceptions", "GoogleAuthError"),
-        ("gcsfs.retry", "HttpError"),
-        ("aiohttp", "ClientError"),
+    "gcs": _Errors(
+        final=("google.auth.exceptions:DefaultCredentialsError", "builtins:ValueError"),  # "Bad Request"
+        passing=(
+            "google.auth.exceptions:GoogleAuthError",
+            "gcsfs.retry:HttpError",
+            "gcsfs.retry:ChecksumError",
+            "aiohttp:ClientError",
+        ),
     ),
-    "azure": (
-        ("azure.core.exceptions", "ClientAuthenticationError"),
-        ("azure.core.exceptions", "AzureError"),
-        ("aiohttp", "ClientError"),
+    "azure": _Errors(
+        absent=("azure.core.exceptions:ResourceNotFoundError",),
+        final=("azure.core.exceptions:ClientAuthenticationError",),
+        passing=("azure.core.exceptions:AzureError", "aiohttp:ClientError"),
     ),
 }
 _TAGS = ("ETag", "etag", "generation", "mtime", "created")
@@ -71,7 +102,7 @@ class Store:
         """Opens it, without a request. Args: patience, seconds. Raises StoreError without its package."""
         self.url = url
         self._patience = patience
-        self._files, self._final, self._passing = _opened(url)
+        self._errors, self._files = _opened(url)
 
     def list(self, prefix: str = "") -> dict[str, Version]:
         """All objects whose names begin with a folder's, "" for all; none if there is no such folder."""
@@ -79,7 +110,9 @@ class Store:
         top = f"{base}/{prefix}".rstrip("/")
 
         def find() -> dict[str, Version]:
-            found: Mapping[str, Any] = self._files.find(top, detail=True)
+            found = self._files.find(top, detail=True)
+            if not isinstance(found, dict):  # adlfs, of a name that is an object
+                return {}
             root = self._files._strip_protocol(base).rstrip("/") + "/"
             return {
                 name.removeprefix(root): _version(info)
@@ -143,6 +176,8 @@ class Store:
     def copy(self, name: str, other: str) -> None:
         """Stores an object under another name too, within the store."""
         self._try(name, lambda: self._files.cp_file(self._key(name), self._made(other)))
+        if PROTOCOLS[self.url.protocol] == "azure":  # it may answer before it has copied
+            self._try(other, lambda: self._require_copied(name, other))
 
     def remove(self, name: str) -> None:
         """Removes an object, if there is one."""
@@ -171,6 +206,12 @@ class Store:
         if size != version.size:
             raise ConnectionError(f"{size:,} of {version.size:,} bytes have arrived")
 
+    def _require_copied(self, name: str, other: str) -> None:
+        """Raises ConnectionError while a copy has not all bytes yet: it is empty until then."""
+        wanted, found = (int(self._files.info(self._key(it))["size"] or 0) for it in (name, other))
+        if found != wanted:
+            raise ConnectionError(f"{found:,} of {wanted:,} bytes are copied")
+
     def _try(self, name: str, call: Callable[[], T], **missing: Any) -> T:
         """Calls until it succeeds. Args: missing, what is returned if there is no such object."""
         end, pause, where = time.monotonic() + self._patience, _FIRST_S, f"{self.url}/{name}".rstrip("/")
@@ -179,19 +220,18 @@ class Store:
                 return call()
             except (FileExistsError, StoreError):
                 raise
-            except FileNotFoundError as error:
+            except self._errors.absent as error:
                 if "missing" in missing:
                     value: T = missing["missing"]
                     return value
                 raise StoreError(f"{where}: there is no such object; check the URL") from error
-            except self._final as error:
-                raise StoreError(
-                    f"{where}: no access ({_reason(error)}); set the provider's credentials, by its"
-                    " environment variables, a profile or the role of the machine"
-                ) from error
-            except self._passing as error:
+            except self._errors.final as error:
+                raise _no_access(where, error) from error
+            except self._errors.passing as error:
                 if _own_disk(error):
                     raise
+                if _refuses(error):
+                    raise _no_access(where, error) from error
                 if time.monotonic() + pause > end:
                     raise StoreLostError(f"{where}: the store fails ({_reason(error)})") from error
                 time.sleep(pause * random.uniform(0.5, 1.0))
@@ -210,15 +250,52 @@ def require_package(url: StoreUrl) -> None:
         raise StoreError(f"{url}: needs the package {package}; install it: pip install {package}")
 
 
-def _opened(url: StoreUrl) -> tuple[Any, tuple[type[Exception], ...], tuple[type[Exception], ...]]:
-    """The file system, errors that only the user can cure, and those that may pass."""
+def _opened(url: StoreUrl) -> tuple[_Errors, Any]:
+    """What a store's file system may raise, and the file system. Raises StoreError without an account."""
     require_package(url)
     import fsspec  # noqa: PLC0415  # only runs in stores need it
 
     extra = PROTOCOLS[url.protocol]
-    files = fsspec.filesystem(url.protocol, **({"use_listings_cache": False} if extra else {}))
-    errors = [getattr(importlib.import_module(module), name) for module, name in _ERRORS.get(extra, ())]
-    return files, (PermissionError, *errors[:1]), (OSError, asyncio.TimeoutError, *errors[1:])
+    if extra == "gcs":
+        os.environ.setdefault(_GCS_KINDS, "false")
+    for name in _LOGGERS.get(extra, ()):  # without a handler, Python would print what `_try` reports
+        logging.getLogger(name).addHandler(logging.NullHandler())
+    errors = _ERRORS[extra].loaded()
+    try:
+        files, _ = fsspec.url_to_fs(str(url), **({"use_listings_cache": False} if extra else {}))
+    except (ValueError, *errors.final, *errors.passing) as error:
+        raise _no_access(str(url), error) from error
+    account = url.account
+    if account and account != files.service_client.account_name:
+        raise StoreError(
+            f"{url}: the environment's credentials are of the account {files.service_client.account_name};"
+            f" set those of {account}"
+        )
+    return errors, files
+
+
+def _loaded(named: str) -> type[Exception]:
+    module, _, name = named.partition(":")
+    found: type[Exception] = getattr(importlib.import_module(module), name)
+    return found
+
+
+def _no_access(where: str, error: Exception) -> StoreError:
+    return StoreError(
+        f"{where}: no access ({_reason(error)}); set the provider's credentials, by its"
+        " environment variables, a profile or the role of the machine"
+    )
+
+
+def _refuses(error: Exception) -> bool:
+    """Whether an answer refuses access, by an error that its library has for other things too."""
+    return _status(error) in (401, 403) or str(error).startswith("Forbidden")  # gcsfs, as an OSError
+
+
+def _status(error: BaseException) -> int:
+    """The status of an answer by HTTP; 0 if the error is of no answer."""
+    found = str(getattr(error, "status_code", None) or getattr(error, "code", None))
+    return int(found) if found.isdecimal() else 0
 
 
 def _version(info: Mapping[str, Any]) -> Version:
@@ -239,4 +316,7 @@ def _own_disk(error: Exception) -> bool:
 def _reason(error: BaseException) -> str:
     """An error in few words. Texts of the providers' libraries may quote requests, which are left out."""
     text = (str(error).strip().splitlines() or [""])[0]
-    return type(error).__name__ if not text or "://" in text or len(text) > 120 else text
+    if text and "://" not in text and len(text) <= 120:
+        return text
+    status = _status(error)
+    return f"{type(error).__name__}, status {status}" if status else type(error).__name__

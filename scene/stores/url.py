@@ -28,6 +28,12 @@ class StoreUrl:
         """The last part of the path."""
         return PurePosixPath(self.path).name
 
+    @property
+    def account(self) -> str:
+        """The account of CONTAINER@ACCOUNT.dfs.core.windows.net; "" if the URL names none."""
+        host = self.path.partition("/")[0] if self.protocol in _CONTAINERS else ""
+        return host.partition("@")[2].partition(".")[0]
+
 
 def is_url(text: str) -> bool:
     """Whether a text is meant as a URL, of whatever protocol, and not as a path."""
