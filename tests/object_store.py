@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -84,15 +84,19 @@ def object_store() -> Iterator[ObjectStore]:
 
 @contextmanager
 def _moto() -> Iterator[int]:
+    arguments = ("-m", "moto.server", "-H", "127.0.0.1", "-p")
+    with served(lambda port: [sys.executable, *arguments, str(port)], {"AWS_ACCESS_KEY_ID": "x"}) as port:
+        yield port
+
+
+@contextmanager
+def served(command: Callable[[int], list[str]], environment: dict[str, str]) -> Iterator[int]:
+    """Runs a server while the context lasts, which begins when it listens. Args: command, for a free port."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port: int = free.getsockname()[1]
-    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
     process = subprocess.Popen(
-        command,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env=os.environ | {"AWS_ACCESS_KEY_ID": "x"},
+        command(port), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | environment
     )
     try:
         end = time.monotonic() + 60

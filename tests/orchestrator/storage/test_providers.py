@@ -1,0 +1,249 @@
+"""Scenes and runs in stores of each provider's protocol: what our code relies on holds in all of them."""
+
+import json
+import os
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from adlfs import AzureBlobFileSystem
+from gcsfs import GCSFileSystem
+
+from panolog.orchestrator.run.records import Outcome
+from panolog.orchestrator.storage.layout import OBJECTS, current
+from panolog.orchestrator.storage.lease import holder, take
+from panolog.scene.errors import RunLockedError, StoreError
+from panolog.scene.image_files import decode_panorama
+from panolog.scene.read import read_scene
+from panolog.scene.stores.cache import FOLDER, cache_folder
+from panolog.scene.stores.store import open_store
+from panolog.scene.stores.url import parse_url
+from tests.cloud_stores import PROTOCOLS, SECRET, CloudStore, cloud_store
+from tests.orchestrator.storage.stored_runs import Driver, fetched, mirror_of, rounds
+from tests.scene.stores.test_outline import large_scene
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(scope="module", params=PROTOCOLS)
+def server(request: pytest.FixtureRequest) -> Iterator[CloudStore]:
+    with cloud_store(request.param) as found:
+        yield found
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FOLDER, str(tmp_path / "cache"))
+
+
+def test_objects_are_stored_listed_read_copied_and_removed(server: CloudStore, tmp_path: Path) -> None:
+    store = open_store(server.url("basic"), 5.0)
+    assert (store.list(), store.version("a"), store.read("a"), store.read("a", 2, 5)) == (
+        {},
+        None,
+        None,
+        None,
+    )
+    large = tmp_path / "large"
+    large.write_bytes(os.urandom(6 * 2**20))  # in several parts, where a provider has them
+    store.put(large, "folder/large")
+    store.write("odd/ä b+c%20#1.jpg", b"0123456789")
+    store.write("empty", b"")
+    found = store.list()
+    assert {name: version.size for name, version in found.items()} == {
+        "folder/large": 6 * 2**20,
+        "odd/ä b+c%20#1.jpg": 10,
+        "empty": 0,
+    }
+    assert all(version == store.version(name) for name, version in found.items())
+    assert all(version.tag and version.modified > 1e9 for version in found.values())
+    assert store.list("folder") == {"folder/large": found["folder/large"]}
+    assert (store.list("fold"), open_store(server.url("basic/empty"), 5.0).list()) == ({}, {})
+    assert store.read("odd/ä b+c%20#1.jpg", 2, 5) == b"234"
+    assert store.read_whole("folder/large", found["folder/large"]) == large.read_bytes()
+    store.copy("folder/large", "copy")
+    store.get("copy", tmp_path / "got", store.version("copy"))
+    assert (tmp_path / "got").read_bytes() == large.read_bytes()
+    for _ in range(2):
+        store.remove("copy")
+    assert store.read("copy") is None
+
+
+def test_an_object_that_has_changed_or_is_gone_is_noticed(server: CloudStore) -> None:
+    store = open_store(server.url("changes"), 5.0)
+    store.write("a", b"before")
+    version = store.version("a")
+    assert version is not None
+    store.write("a", b"after!")  # of the same size
+    with pytest.raises(StoreError, match="has changed in the store"):
+        store.read_whole("a", version)
+    store.remove("a")
+    with pytest.raises(StoreError, match="there is no such object"):
+        store.read_whole("a", version)
+
+
+def test_of_many_that_make_an_object_one_succeeds(server: CloudStore) -> None:
+    store, ready = open_store(server.url("exclusive"), 5.0), threading.Barrier(8)
+
+    def make(number: int) -> bool:
+        ready.wait()
+        return store.write("lease", b"%d" % number, new=True)
+
+    with ThreadPoolExecutor(8) as threads:
+        made = list(threads.map(make, range(8)))
+    assert made.count(True) == 1
+    assert store.read("lease") == b"%d" % made.index(True)
+
+
+def test_a_missing_bucket_is_the_users_at_once(server: CloudStore) -> None:
+    with pytest.raises(StoreError, match="there is no such object"):
+        open_store(f"{server.protocol}://no-such-bucket/x").write("a", b"")
+    assert open_store(f"{server.protocol}://no-such-bucket/x").list() == {}
+
+
+def test_a_scene_is_read_through_the_cache(server: CloudStore, tmp_path: Path) -> None:
+    root, place = large_scene(tmp_path / "place"), open_store(server.url("place"), 5.0)
+    for path in root.rglob("*"):
+        if path.is_file():
+            place.put(path, path.relative_to(root).as_posix())
+    plain, stored = read_scene(root), read_scene(str(place.url))
+    assert stored.fingerprint == plain.fingerprint
+    for ours, theirs in zip(stored.panoramas, plain.panoramas, strict=True):
+        assert ours.image.stat().st_blocks * 512 < theirs.image.stat().st_size / 3  # its two ends
+        assert np.array_equal(decode_panorama(ours.image), decode_panorama(theirs.image))
+    kept = list((cache_folder(os.environ) / "objects").iterdir())
+    assert len(kept) == len(plain.panoramas)
+    for name in place.list():
+        place.remove(name)
+    assert np.array_equal(
+        decode_panorama(stored.panoramas[0].image), decode_panorama(plain.panoramas[0].image)
+    )
+
+
+def test_a_run_is_mirrored_resumed_on_a_fresh_folder_and_has_one_driver(
+    server: CloudStore, tmp_path: Path
+) -> None:
+    store = open_store(server.url("run"), 5.0)
+    first = Driver(tmp_path / "run")
+    mirror, lease = mirror_of(first, store)
+    for _ in range(3):
+        first.save()
+        mirror.round()
+    with pytest.raises(RunLockedError, match="is at work on it"):
+        take(store, tmp_path / "other", force=False)
+    fresh = fetched(store, tmp_path / "fresh")  # the head is lost with its disk, and replaced by force
+    second_lease = take(store, fresh.root, force=True)
+    first.save()
+    with pytest.raises(RunLockedError, match="has taken the run over"):
+        mirror.round()
+    assert lease.lost
+    second_lease.release()
+    first.end(Outcome.DONE)
+    last, lease = mirror_of(first, store)
+    rounds(last)
+    lease.release()
+    assert (last.state.complete, holder(store)) == (True, "")
+    assert store.read("point_cloud.ply") == first.folder.point_cloud.read_bytes()
+    named = current(store)
+    assert named is not None
+    keys = {entry.key for entry in named.files.values()}
+    assert {name for name in store.list(OBJECTS) if "checkpoint" in name} & keys
+    assert SECRET.encode() not in b"".join(store.read(name) or b"" for name in store.list())
+
+
+@pytest.mark.parametrize("server", ["az"], indirect=True)
+def test_the_account_of_an_azure_url_is_the_one_that_is_used(server: CloudStore) -> None:
+    named = open_store("abfs://places@account.dfs.core.windows.net/named", 5.0)
+    named.write("a", b"x")
+    assert open_store(server.url("named"), 5.0).read("a") == b"x"
+    with pytest.raises(StoreError, match="are of the account account; set those of other"):
+        open_store("abfs://places@other.dfs.core.windows.net/named")
+
+
+@pytest.mark.parametrize("server", ["az"], indirect=True)
+def test_an_azure_copy_that_is_answered_before_it_is_made_is_awaited(
+    server: CloudStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = open_store(server.url("late"), 5.0)
+    store.write("a", b"0123456789")
+    files: Any = store._files
+    looks, info = [0], files.info
+
+    def late(key: str) -> dict[str, Any]:
+        if key.endswith("/b"):
+            looks[0] += 1
+            return {**info(key), "size": 0} if looks[0] < 3 else info(key)
+        found: dict[str, Any] = info(key)
+        return found
+
+    monkeypatch.setattr(files, "info", late)
+    store.copy("a", "b")
+    assert looks == [3]
+
+
+@pytest.mark.parametrize("server", ["az"], indirect=True)
+@pytest.mark.parametrize("key", ["b3RoZXI=", ""])
+def test_credentials_that_azure_refuses_are_the_users_at_once(
+    server: CloudStore, key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = server.environment["AZURE_STORAGE_CONNECTION_STRING"]
+    monkeypatch.setenv("AZURE_STORAGE_CONNECTION_STRING", words.replace(SECRET, key))
+    AzureBlobFileSystem.clear_instance_cache()
+    with pytest.raises(StoreError, match=r"no access .*; set the provider's credentials"):
+        open_store(server.url("refused")).read("a")
+    AzureBlobFileSystem.clear_instance_cache()
+
+
+@pytest.mark.parametrize("server", ["gs"], indirect=True)
+@pytest.mark.parametrize("status", [401, 403])
+def test_an_answer_of_google_that_refuses_access_is_the_users_at_once(
+    server: CloudStore, status: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with refusing(status) as port:
+        monkeypatch.setenv("STORAGE_EMULATOR_HOST", f"http://127.0.0.1:{port}")
+        GCSFileSystem.clear_instance_cache()
+        with pytest.raises(StoreError, match=r"no access .*; set the provider's credentials"):
+            open_store(server.url("refused")).list()
+        GCSFileSystem.clear_instance_cache()
+    assert capfd.readouterr().err == ""
+
+
+@contextmanager
+def refusing(status: int) -> Iterator[int]:
+    """A server that answers as Google does without a permission; its port."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            answer = json.dumps({"error": {"code": status, "message": "caller has no access"}}).encode()
+            self.send_response(status)
+            self.send_header("Content-Length", str(len(answer)))
+            self.end_headers()
+            self.wfile.write(answer)
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as found:
+        thread = threading.Thread(target=found.serve_forever, args=(0.05,))
+        thread.start()
+        yield found.server_port
+        found.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    ("text", "account"),
+    [
+        ("abfs://box@name.dfs.core.windows.net/x", "name"),
+        ("az://box/x", ""),
+        ("s3://bucket/x", ""),
+    ],
+)
+def test_the_account_in_a_url(text: str, account: str) -> None:
+    assert parse_url(text).account == account
