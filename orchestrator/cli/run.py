@@ -170,10 +170,11 @@ def demo(
 def doctor(
     config: "RunConfig",
     scene: Annotated[
-        Path | None,
+        str | None,
         typer.Argument(
             metavar="SCENE|IMAGES|VIDEO",
-            help="Also estimate what a run of this scene needs, or check the panoramas or the video.",
+            help="Also estimate what a run of this scene (folder or URL) needs, or check the panoramas or the"
+            " video.",
         ),
     ] = None,
     address: AddressOption = None,

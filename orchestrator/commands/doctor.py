@@ -67,29 +67,30 @@ class Diagnosis:
 
 
 def diagnose(
-    scene: Path | None, config: RunConfig, address: str | None, prices: "PriceList | None" = None
+    source: str | None, config: RunConfig, address: str | None, prices: "PriceList | None" = None
 ) -> Diagnosis:
-    """Checks this machine and, if it is ready, what a run of `scene` needs here or on a cluster.
+    """Checks this machine and, if it is ready, what a run of `source` needs here or on a cluster.
 
     Of panoramas or a video the scene is made first, so only what can be known before is said.
 
-    Args: prices of machines, if they are known.
-    Raises InputError if the scene, the settings or the address are wrong.
+    Args: source, of a scene a folder or a URL; prices of machines, if they are known.
+    Raises InputError if the scene, the settings or the address are wrong; StoreLostError.
     """
     packages = (_package("ray", "'ray[default]'"), _package("pycolmap", "pycolmap"))
     findings = [_cpu(), _memory(), _disk(Path.cwd()), _torch(), _gpu(), _kernels(), *packages]
     machine = Diagnosis(findings)
-    if scene is None or not machine.ready:
+    if source is None or not machine.ready:
         return machine
     # these need the compiled core
     from panolog.orchestrator.commands import preparing, session  # noqa: PLC0415
     from panolog.orchestrator.preparation.settings import Options  # noqa: PLC0415
 
-    if (settings := preparing.settings_of(scene, Options())) is not None:
-        preparing.with_width(settings.width, config)
-        return Diagnosis([*findings, *_source(settings)])
-    found, preflight = session.estimate_run(scene, config, address, prices)
-    return Diagnosis([*findings, *_needs(found, preflight)], preflight)
+    new = preparing.found(source, config, Options())
+    if new.settings is not None:
+        return Diagnosis([*findings, *_source(new.settings)])
+    assert new.scene is not None  # that it is one of both is what `found` checks
+    preflight = session.estimate_run(new.scene, new.config, address, prices)
+    return Diagnosis([*findings, *_needs(new.scene, preflight)], preflight)
 
 
 def _cpu() -> Finding:

@@ -57,7 +57,6 @@ from panolog.renderer.process import choose_device
 from panolog.scene.errors import ClusterError, RunFolderError, RunLockedError
 from panolog.scene.files import remove_partial
 from panolog.scene.model import Scene
-from panolog.scene.read import read_scene
 
 _LOG = logging.getLogger(__name__)
 
@@ -279,16 +278,15 @@ def check(source: Path, root: Path, config: RunConfig, options: Options) -> None
 
 
 def estimate_run(
-    scene_path: Path, config: RunConfig, address: str | None, prices: PriceList | None = None
-) -> tuple[Scene, Preflight]:
+    scene: Scene, config: RunConfig, address: str | None, prices: PriceList | None = None
+) -> Preflight:
     """What a run of a scene would need, on this machine or on a cluster, with its folder in the current one.
 
-    Raises InputError as `start`, except if the run does not fit: that is the problem of the preflight.
+    Args: config, with a width. Raises InputError as `start`, except if the run does not fit: that is the
+    problem of the preflight.
     """
-    scene = read_scene(scene_path)
-    config = preparing.with_width(scene.width, config)
     with _workers(address, scene.root, None) as pool:
-        return scene, _examine(pool, scene, config, Path.cwd(), ignore, prices, local=address is None)
+        return _examine(pool, scene, config, Path.cwd(), ignore, prices, local=address is None)
 
 
 def _examine(

@@ -334,12 +334,13 @@ def test_scene_info_and_doctor(scene: Path) -> None:
     assert "torch" in call("doctor").stdout
 
 
-@pytest.mark.parametrize(("memory", "code"), [(2**40, 0), (2**20, 2)])
+@pytest.mark.parametrize(("memory", "code", "place"), [(2**40, 0, ""), (2**20, 2, ""), (2**40, 0, "file://")])
 def test_doctor_tells_what_a_job_needs_and_whether_it_fits(
-    scene: Path, monkeypatch: pytest.MonkeyPatch, memory: int, code: int
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, memory: int, code: int, place: str
 ) -> None:
     calibrated(monkeypatch, memory)
-    doctored = call("doctor", scene, "--json", "--iterations", 100, "--blocks", "2x1x1")
+    monkeypatch.setenv("PANOLOG_STORE_CACHE", str(tmp_path / "cache"))
+    doctored = call("doctor", f"{place}{scene}", "--json", "--iterations", 100, "--blocks", "2x1x1")
     assert doctored.exit_code == code
     shown = json.loads(doctored.stdout)
     assert shown["ready"] == (code == 0)

@@ -31,6 +31,8 @@ LOCAL = "takes files and folders of this machine only"
         (["report", "file:///nowhere/run"], "give -o FILE.html"),
         (["status", "file:///nowhere/run"], "there is no run"),
         (["run", "file:///nowhere/town", "-o", "new"], "there is no COLMAP model"),
+        (["doctor", "file:///nowhere/town"], "there is no COLMAP model"),
+        (["doctor", "s3://bucket/town?key=T0PSECRET"], "may hold a secret"),
     ],
 )
 def test_a_url_that_cannot_be_used_is_one_line(
