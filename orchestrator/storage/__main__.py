@@ -34,6 +34,7 @@ def main() -> None:
     plan = plan_from_json(line)
     ended, stop = threading.Event(), threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})  # blocked where another one was killed
 
     def wait() -> None:
         sys.stdin.read()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -11,6 +12,7 @@ from dataclasses import replace
 from subprocess import DEVNULL, PIPE
 from typing import Any
 
+from panolog.orchestrator.resources.children import ENDS
 from panolog.orchestrator.storage.plan import Plan, to_json
 from panolog.scene.errors import RunError, StoreError
 
@@ -53,7 +55,13 @@ class _Keeper:
         self._process = _started(plan)
         self._begin()
         self._thread = threading.Thread(target=self._keep, name="mirror", daemon=True)
-        self._thread.start()
+        # A thread has the mask of the one that starts it: requests to stop go to the main thread, also in a
+        # supervisor, which takes them with `sigtimedwait`.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDS)
+        try:
+            self._thread.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def finish(self) -> str:
         """Ends the mirror when all is out. Returns what is not; Ctrl-C ends the wait."""
@@ -91,7 +99,8 @@ class _Keeper:
                 self._left = str(content.get("left", "")) or self._left
             if self._process.wait() == 0:
                 return
-            self._left = f"{self._plan.url}: its mirror was killed (code {self._process.returncode})"
+            killed = f"{self._plan.url}: its mirror was killed (code {self._process.returncode})"
+            self._left = killed
             last = self._ended.wait(_AGAIN_S)
             self._process = _started(self._plan, again=True)
             if last:
@@ -101,8 +110,10 @@ class _Keeper:
             try:
                 self._begin()
                 self._left = ""
+                self._say(f"{killed}; another one is at work")
             except (StoreError, RunError) as error:
                 self._left = str(error)
+                self._say(f"{killed}, and another one cannot work: {error}")
                 if last:
                     return
 

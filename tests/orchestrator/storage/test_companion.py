@@ -1,0 +1,78 @@
+"""The process of a mirror: it is kept alive, and takes no signal from a supervisor that waits for one."""
+
+import signal
+import threading
+from pathlib import Path
+
+import psutil
+import pytest
+
+from panolog.orchestrator.storage import companion
+from panolog.orchestrator.storage.companion import mirrored
+from panolog.orchestrator.storage.lease import take
+from panolog.orchestrator.storage.plan import Plan
+from panolog.scene.errors import RunError
+from panolog.scene.stores.store import open_store
+from tests.orchestrator.storage.stored_runs import Driver, fetched
+from tests.ray_head import wait_until
+
+pytestmark = pytest.mark.system
+
+
+def plan_of(tmp_path: Path) -> Plan:
+    return Plan(tmp_path / "run", f"file://{tmp_path}/store", resumes=False, period=0.05, patience=2.0)
+
+
+def blocked(path: Path) -> set[int]:
+    """The signals that a thread, or a process, has blocked. Args: path, of its folder in /proc."""
+    lines = dict(line.split(":", 1) for line in (path / "status").read_text().splitlines())
+    mask = int(lines["SigBlk"], 16)
+    return {number for number in range(1, 65) if mask >> (number - 1) & 1}
+
+
+def mirror() -> psutil.Process:
+    """The process of the mirror that is a child of this one."""
+    found = [it for it in psutil.Process().children() if "panolog.orchestrator.storage" in it.cmdline()]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_a_mirror_that_is_killed_is_replaced_and_nothing_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(companion, "_AGAIN_S", 0.0)
+    said = list[str]()
+    with mirrored(plan_of(tmp_path), said.append):
+        driver = Driver(tmp_path / "run")
+        (thread,) = (it for it in threading.enumerate() if it.name == "mirror")
+        assert blocked(Path(f"/proc/self/task/{thread.native_id}")) >= {signal.SIGTERM, signal.SIGINT}
+        assert signal.SIGTERM not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+        first = mirror()
+        driver.save()
+        first.kill()
+        wait_until(lambda: len(said) == 2, "another mirror")
+        second = mirror()
+        assert second.pid != first.pid
+        assert signal.SIGTERM not in blocked(Path(f"/proc/{second.pid}"))  # it can be stopped
+        driver.end()
+    assert said[1] == f"file://{tmp_path}/store: its mirror was killed (code -9); another one is at work"
+    store = open_store(f"file://{tmp_path}/store")
+    assert store.read("point_cloud.ply") == driver.folder.point_cloud.read_bytes()
+    fetched(store, tmp_path / "fresh")
+
+
+def test_a_mirror_that_cannot_be_replaced_is_reported_at_once_and_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(companion, "_AGAIN_S", 0.0)
+    said, store = list[str](), open_store(f"file://{tmp_path}/store")
+    with pytest.raises(RunError, match="is at work on it"), mirrored(plan_of(tmp_path), said.append):
+        driver = Driver(tmp_path / "run")
+        first = mirror()
+        first.suspend()  # it does not notice
+        lease = take(store, tmp_path / "other", force=True)  # another machine takes the run
+        first.kill()
+        wait_until(lambda: len(said) == 2, "why there is no mirror")
+        driver.end()
+    assert "its mirror was killed (code -9), and another one cannot work" in said[1]
+    lease.release()
