@@ -24,7 +24,7 @@ from panolog.orchestrator.views.site.build import (
     write_folder,
 )
 from panolog.orchestrator.views.site.photographs import photograph
-from panolog.scene.errors import InputError
+from panolog.scene.errors import InputError, StoreLostError
 from panolog.scene.stores.outline import local_folder
 from panolog.scene.write import StageProgress, no_progress
 
@@ -148,7 +148,7 @@ class SiteServer(ThreadingHTTPServer):
             if copy is None:
                 try:
                     copy = photograph(scene, self._names[number])
-                except InputError:
+                except (InputError, StoreLostError):
                     return None
             self._copies[number] = copy
             while len(self._copies) > _CACHED:

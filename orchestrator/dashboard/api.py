@@ -81,6 +81,8 @@ from panolog.orchestrator.views.comparison.reading import ReadRun, UnreadRun
 from panolog.orchestrator.views.comparison.schema import Comparison
 from panolog.orchestrator.views.exposures import MOST_BYTES, ExposureCurve, exposure_curve
 from panolog.scene.errors import InputError
+from panolog.scene.stores.outline import local_folder, made_here
+from panolog.scene.stores.url import is_url
 
 router = APIRouter()
 _EventId = Annotated[int, Field(ge=0, lt=2**63)]
@@ -177,12 +179,18 @@ def _panorama(cache: pictures.PanoramaCache, run: Watch, row: int) -> Response:
 
 
 def _scene_of(run: Watch) -> Path:
-    """The folder that the run has recorded. Raises InputError if it has recorded none."""
+    """The folder that the run has recorded, or the outline of the URL.
+
+    Raises InputError if it has recorded none, or this machine has not read what is at the URL.
+    """
     scene = run.snapshot.page.info.get("scene") if run.snapshot.page else None
     path = scene.get("path") if isinstance(scene, dict) else None
     if not isinstance(path, str) or "\0" in path:
         raise InputError("run.json names no scene")
-    return Path(path)
+    folder = local_folder(path)
+    if is_url(path) and not made_here(folder):
+        raise InputError(f"the scene {path} is in a store, and this machine has not read it yet")
+    return folder
 
 
 @router.get("/api/runs/{id}/series")

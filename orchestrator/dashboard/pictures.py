@@ -1,12 +1,14 @@
 """Pictures: what records name, previews of training views and held-out panoramas; and the scene's panoramas.
 
-A run names its scene by a path, and a run from elsewhere may name any folder. So a panorama is a plain file
-really below a folder that is a scene, an image of at most so many pixels, and a small copy of it is sent.
+A run names its scene by a path or a URL, and a run from elsewhere may name any. So a panorama is a plain file
+really below a folder that is a scene, an image of at most so many pixels, and a small copy of it is sent. Of
+stores only scenes are read that this machine has read before.
 """
 
 import os
 import re
 from collections import OrderedDict
+from io import BytesIO
 from pathlib import Path
 from threading import Lock
 from typing import Any, BinaryIO
@@ -18,10 +20,11 @@ from panolog.orchestrator.dashboard.discovery import RunEntry, open_below, read_
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.views import queries
 from panolog.orchestrator.views.preparation import picture_path
-from panolog.orchestrator.views.site.photographs import small_copy
-from panolog.scene.errors import InputError
+from panolog.orchestrator.views.site.photographs import STORE_S, require_size, small_copy
+from panolog.scene.errors import InputError, StoreLostError
 from panolog.scene.files import natural_key
 from panolog.scene.read import check_names, image_folder, model_folder
+from panolog.scene.stores.outline import made_here, whole
 
 _SIZE = 50_000_000  # bytes of a JPEG at most
 _REDUCED = 1024  # pixels of the width of a panorama's copy
@@ -134,11 +137,26 @@ class PanoramaCache:
         with open_panorama(scene, name) as file, self._lock:
             known = os.fstat(file.fileno())
             key = (known.st_dev, known.st_ino, known.st_mtime_ns, known.st_size, width)
-            copy = self._copies.pop(key, None) or small_copy(file, name, width)
+            copy = self._copies.pop(key, None) or small_copy(_whole(file, scene, name), name, width)
             self._copies[key] = copy
             while len(self._copies) > _CACHED:
                 self._copies.popitem(last=False)
         return _response(copy)
+
+
+def _whole(file: BinaryIO, scene: Path, name: str) -> BinaryIO:
+    """A panorama of which `file` may be an outline, from the machine's cache or through it.
+
+    Raises InputError if the store does not have it, or not now.
+    """
+    if not made_here(scene):
+        return file
+    require_size(os.fstat(file.fileno()).st_size, name)
+    try:
+        data = whole(image_folder(scene) / name, STORE_S)
+    except StoreLostError as error:
+        raise InputError(str(error)) from error
+    return file if data is None else BytesIO(data)
 
 
 def _response(data: bytes) -> Response:

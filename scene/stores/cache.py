@@ -20,7 +20,7 @@ from pathlib import Path
 
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import SUFFIX, user_folder
-from panolog.scene.stores.store import Store, Version, open_store
+from panolog.scene.stores.store import PATIENCE_S, Store, Version, open_store
 
 FOLDER, BOUND = "PANOLOG_STORE_CACHE", "PANOLOG_STORE_CACHE_GIB"
 _GIB = 20.0
@@ -36,12 +36,12 @@ class Stored:
     name: str  # below it
     version: Version
 
-    def read(self) -> bytes:
-        """Its bytes, from the cache or through it.
+    def read(self, patience: float = PATIENCE_S) -> bytes:
+        """Its bytes, from the cache or through it. Args: patience, seconds for which a store may fail.
 
         Raises StoreError if it is another version by now or gone, StoreLostError if the store fails.
         """
-        return Cache.of(os.environ).read(self)
+        return Cache.of(os.environ).read(self, patience)
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Cache:
             raise ConfigError(f"{BOUND}={text}: write GiB, such as 20") from error
         return cls(cache_folder(environment) / "objects", bound)
 
-    def read(self, stored: Stored) -> bytes:
+    def read(self, stored: Stored, patience: float = PATIENCE_S) -> bytes:
         """The bytes of an object. Raises as `Stored.read`."""
         kept = self.folder / _digest(stored)
         with suppress(FileNotFoundError):
@@ -70,7 +70,7 @@ class Cache:
         with _locked(self.folder.parent / f"lock-{int(kept.name[:8], 16) % _LOCKS:02d}"):
             with suppress(FileNotFoundError):  # another process was quicker
                 return self._kept(kept)
-            return self._fetch(stored, kept)
+            return self._fetch(stored, kept, patience)
 
     def _kept(self, path: Path) -> bytes:
         data = path.read_bytes()
@@ -78,8 +78,8 @@ class Cache:
             os.utime(path)
         return data
 
-    def _fetch(self, stored: Stored, kept: Path) -> bytes:
-        data = _store(stored.url).read_whole(stored.name, stored.version)
+    def _fetch(self, stored: Stored, kept: Path, patience: float) -> bytes:
+        data = _store(stored.url, patience).read_whole(stored.name, stored.version)
         part = self.folder / f"{kept.name}.{os.getpid()}{SUFFIX}"
         try:
             if self._reserve(part, len(data)):
@@ -124,8 +124,8 @@ def variables(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 @lru_cache(maxsize=4)
-def _store(url: str) -> Store:
-    return open_store(url)
+def _store(url: str, patience: float) -> Store:
+    return open_store(url, patience)
 
 
 def _digest(stored: Stored) -> str:

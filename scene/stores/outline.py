@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from panolog.scene.errors import StoreError
 from panolog.scene.files import atomic, write_bytes
 from panolog.scene.stores.cache import Stored, cache_folder
-from panolog.scene.stores.store import Store, Version, open_store
+from panolog.scene.stores.store import PATIENCE_S, Store, Version, open_store
 from panolog.scene.stores.url import parse_url
 
 SUFFIX = ".outline"  # of the folder's name
@@ -66,9 +66,13 @@ def url_of(root: Path) -> str | None:
 
 def local_folder(scene: str) -> Path:
     """Where this machine has a scene, given as run.json names it: that folder, or the outline of a URL."""
-    outlines = cache_folder(os.environ) / "scenes"
-    found = sorted(outlines.glob(f"{_key(scene)}-*{SUFFIX}"), key=lambda path: path.stat().st_mtime)
+    found = sorted(_outlines().glob(f"{_key(scene)}-*{SUFFIX}"), key=lambda path: path.stat().st_mtime)
     return found[-1] if found else Path(scene)
+
+
+def made_here(root: Path) -> bool:
+    """Whether a folder is an outline that this machine has made: what it names may be fetched for anyone."""
+    return root.name.endswith(SUFFIX) and root.parent == _outlines()
 
 
 def stored_of(path: Path) -> Stored | None:
@@ -88,10 +92,10 @@ def remember(path: Path, stored: Stored) -> None:
     _KNOWN[path] = stored
 
 
-def whole(path: Path) -> bytes | None:
-    """The bytes of the object that a file outlines; None if it is a plain file. Raises as `Stored.read`."""
+def whole(path: Path, patience: float = PATIENCE_S) -> bytes | None:
+    """The bytes of the object that a file outlines; None if it is a plain file. As `Stored.read`."""
     stored = stored_of(path)
-    return None if stored is None else stored.read()
+    return None if stored is None else stored.read(patience)
 
 
 def _belongs(name: str, version: Version) -> bool:
@@ -109,7 +113,11 @@ def _folder(url: str, objects: Mapping[str, Version]) -> Path:
     """A folder for these versions: that of another version is not changed while a run reads it."""
     listed = json.dumps({name: [it.size, it.tag] for name, it in sorted(objects.items())})
     name = f"{_key(url)}-{hashlib.sha256(listed.encode()).hexdigest()[:16]}{SUFFIX}"
-    return cache_folder(os.environ) / "scenes" / name
+    return _outlines() / name
+
+
+def _outlines() -> Path:
+    return cache_folder(os.environ) / "scenes"
 
 
 def _complete(path: Path, version: Version) -> bool:

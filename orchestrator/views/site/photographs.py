@@ -18,6 +18,7 @@ from panolog.scene.read import check_names, image_folder, model_folder
 from panolog.scene.stores.outline import whole
 
 WIDE = 2048  # pixels of a copy in 3D
+STORE_S = 10.0  # for which a store may fail before a page shows no picture
 _BYTES = 300_000_000  # of a panorama's file at most
 _PIXELS = 2**27  # of a panorama at most: 16,384 x 8,192
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
@@ -30,10 +31,8 @@ def small_copy(file: BinaryIO, name: str, width: int) -> bytes:
 
     Raises InputError if the file is too large or no image.
     """
-    size = file.seek(0, os.SEEK_END)
+    require_size(file.seek(0, os.SEEK_END), name)
     file.seek(0)
-    if size > _BYTES:
-        raise InputError(f"{name} has more than {_BYTES:,} bytes")
     try:
         with Image.open(file, formats=_FORMATS) as picture:  # reads the header alone
             if picture.width * picture.height > _PIXELS:
@@ -47,16 +46,23 @@ def small_copy(file: BinaryIO, name: str, width: int) -> bytes:
     return output.getvalue()
 
 
+def require_size(size: int, name: str) -> None:
+    """Raises InputError if a panorama's file is too large to be looked at. Args: size, bytes."""
+    if size > _BYTES:
+        raise InputError(f"{name} has more than {_BYTES:,} bytes")
+
+
 def photograph(scene: Path, name: str, width: int = WIDE) -> bytes:
     """A small copy of a panorama of a scene on this machine.
 
-    Raises InputError if there is no such scene, or no image of that name really below it.
+    Raises InputError if there is no such scene, or no image of that name really below it; StoreLostError.
     """
     check_names(scene, [name])
     path = (image_folder(scene) / name).resolve()
     if not (path.is_file() and path.is_relative_to(scene.resolve())):
         raise InputError(f"{name} is missing in {image_folder(scene)}, or a link that leads out of the scene")
-    data = whole(path)  # of a scene in an object store
+    require_size(path.stat().st_size, name)
+    data = whole(path, STORE_S)  # of a scene in an object store
     with path.open("rb") if data is None else BytesIO(data) as file:
         return small_copy(file, name, width)
 
