@@ -4,6 +4,11 @@ Each error takes that line as its only argument, so it survives pickling across 
 """
 
 
+def in_one_line(error: BaseException, most: int | None = None) -> str:
+    """What an error says, on one line; its class if it says nothing. Args: most, characters."""
+    return " ".join(str(error).split())[:most] or type(error).__name__
+
+
 class PanologError(Exception):
     """Root of all errors that PanoLOG raises on purpose."""
 

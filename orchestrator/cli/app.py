@@ -21,7 +21,7 @@ from panolog.orchestrator.cli import (
 from panolog.orchestrator.cli.console import say
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.orchestrator.run import log
-from panolog.scene.errors import InputError, PanologError
+from panolog.scene.errors import InputError, PanologError, in_one_line
 
 
 class ExitCodes(Group):
@@ -32,7 +32,7 @@ class ExitCodes(Group):
         try:
             return super().invoke(ctx)
         except PanologError as error:
-            message, code = " ".join(str(error).split()), 2 if isinstance(error, InputError) else 1
+            message, code = in_one_line(error), 2 if isinstance(error, InputError) else 1
         except KeyboardInterrupt:
             message, code = "interrupted", 130
         except BrokenPipeError as error:  # the reader of stdout has gone, as in `panolog events RUN | head`

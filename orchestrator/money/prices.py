@@ -29,7 +29,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.run.money.records import NodeReserved
 from panolog.orchestrator.run.units import gib
-from panolog.scene.errors import ConfigError
+from panolog.scene.errors import ConfigError, in_one_line
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -139,7 +139,7 @@ def read_prices(path: Path) -> PriceList:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: is not UTF-8 text") from error
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: is not TOML: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{path}: is not TOML: {in_one_line(error)}") from error
     return _checked(tree, str(path), text)
 
 

@@ -22,7 +22,7 @@ from panolog.orchestrator.run.records import Noticed
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.run.units import DURATION, gib, seconds_of
-from panolog.scene.errors import ConfigError, PanologError, RunLockedError
+from panolog.scene.errors import ConfigError, PanologError, RunLockedError, in_one_line
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def _of_run(root: Path, wanted: Wanted, *, dry: bool) -> Survey:
     except RunLockedError:
         return Survey(root, skipped="a driver is at work on it")
     except (PanologError, OSError) as error:
-        return Survey(root, skipped=" ".join(str(error).split()), failed=True)
+        return Survey(root, skipped=in_one_line(error), failed=True)
 
 
 def remove_all(folder: RunFolder, removals: Sequence[Removal]) -> None:

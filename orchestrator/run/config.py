@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_va
 from panolog.orchestrator.run.machines.config import DeadlinesConfig, QuarantineConfig, ScalingConfig
 from panolog.partition.cells import MOST_BLOCKS, Cells, Cuts, Grid
 from panolog.partition.plan import PartitionConfig
-from panolog.scene.errors import ConfigError
+from panolog.scene.errors import ConfigError, in_one_line
 from panolog.workers.settings import Group
 from panolog.workers.tasks import Stage
 from panolog.workers.training.config import TrainConfig
@@ -324,7 +324,7 @@ def _read_yaml(file: Path) -> dict[str, Any]:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise ConfigError(f"{file}: cannot be read: {reason}") from error
     except _NOT_YAML as error:
-        raise ConfigError(f"{file}: is not YAML: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{file}: is not YAML: {in_one_line(error)}") from error
     if tree is None:
         return {}
     if not isinstance(tree, dict):

@@ -18,7 +18,14 @@ from panolog.orchestrator.storage.layout import Manifest, current
 from panolog.orchestrator.storage.lease import Lease, take
 from panolog.orchestrator.storage.mirror import Mirror
 from panolog.orchestrator.storage.plan import Plan, plan_from_json
-from panolog.scene.errors import InputError, PanologError, RunFolderError, StoreError, StoreLostError
+from panolog.scene.errors import (
+    InputError,
+    PanologError,
+    RunFolderError,
+    StoreError,
+    StoreLostError,
+    in_one_line,
+)
 from panolog.scene.stores.store import Store, open_store
 
 _PATIENCE_S = 30.0  # of one request: the mirror itself tries again
@@ -44,7 +51,7 @@ def main() -> None:
     try:
         store, lease, manifest = _begun(plan)
     except (PanologError, OSError) as error:
-        _tell(error=" ".join(str(error).split()), code=2 if isinstance(error, InputError) else 1)
+        _tell(error=in_one_line(error), code=2 if isinstance(error, InputError) else 1)
         return
     _tell(ready=True)
     _follow(plan, Mirror(RunFolder(plan.root), store, lease, manifest), lease, ended, stop)

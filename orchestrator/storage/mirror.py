@@ -39,7 +39,7 @@ from panolog.orchestrator.storage.layout import (
 )
 from panolog.orchestrator.storage.lease import Lease
 from panolog.orchestrator.storage.state import MirrorState, write_state
-from panolog.scene.errors import RunFolderError, RunLockedError, StoreError, StoreLostError
+from panolog.scene.errors import RunFolderError, RunLockedError, StoreError, StoreLostError, in_one_line
 from panolog.scene.stores.store import Store
 
 _THREADS = 4  # files stored at a time
@@ -104,7 +104,7 @@ class Mirror:
             self._say(problem=str(error))
             return False
         except _PASSING as error:
-            self._say(problem=_line(error))
+            self._say(problem=in_one_line(error))
             return False
         return True
 
@@ -291,7 +291,3 @@ class Mirror:
 
 def _joined(folder: str, name: str) -> str:
     return name if folder == "." else f"{folder}/{name}"
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

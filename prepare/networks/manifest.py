@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
-from panolog.scene.errors import ConfigError
+from panolog.scene.errors import ConfigError, in_one_line
 
 MAX_BYTES = 65_536  # of a manifest
 MAX_DEPTH = 8  # of its nesting
@@ -189,7 +189,7 @@ def _read(path: Path) -> Any:
         _check_yaml(path, text)
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{path}: cannot be read: {in_one_line(error)}") from error
 
 
 def _check_yaml(path: Path, text: str) -> None:

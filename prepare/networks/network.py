@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.networks.manifest import Input
 from panolog.prepare.networks.seam import Floats
-from panolog.scene.errors import ConfigError, DeviceError, RunError
+from panolog.scene.errors import ConfigError, DeviceError, RunError, in_one_line
 
 DEVICES = {
     "cpu": "CPUExecutionProvider",
@@ -26,6 +26,7 @@ DEVICES = {
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _FATAL = 4  # onnxruntime's log level: its errors are raised as ours, so its own lines would repeat them
 _CHUNK = 2**20  # bytes read at a time to hash a file
+_LONGEST = 200  # characters of an error of onnxruntime
 
 
 class Network:
@@ -56,7 +57,7 @@ class Network:
             found = self._session.run(self._outputs, {self._given.name: self._tensor(images)})
         except self._errors as error:
             raise RunError(
-                f"{self.model}: the network failed ({_line(error)}); try a smaller batch"
+                f"{self.model}: the network failed ({in_one_line(error, _LONGEST)}); try a smaller batch"
             ) from error
         return {
             name: self._array(name, value, len(images))
@@ -106,7 +107,7 @@ class Network:
             return runtime.InferenceSession(str(self.model), options, providers=wanted, enable_fallback=0)
         except self._errors as error:
             raise ConfigError(
-                f"{self.model}: onnxruntime cannot open it with {wanted[0]}: {_line(error)}"
+                f"{self.model}: onnxruntime cannot open it with {wanted[0]}: {in_one_line(error, _LONGEST)}"
             ) from error
 
     def _check_input(self) -> tuple[Any, int]:
@@ -215,8 +216,3 @@ def _errors(runtime: Any) -> tuple[type[Exception], ...]:
 
 def _has_tensorrt() -> bool:
     return any(importlib.util.find_spec(name) for name in ("tensorrt", "tensorrt_libs"))
-
-
-def _line(error: BaseException) -> str:
-    """The first 200 characters of an error on one line."""
-    return " ".join(str(error).split())[:200] or type(error).__name__

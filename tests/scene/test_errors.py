@@ -35,3 +35,9 @@ def test_the_table_is_the_whole_tree() -> None:
 def test_an_error_survives_pickling(kind: type[errors.PanologError]) -> None:
     copy = pickle.loads(pickle.dumps(kind("scene/sparse/0: damaged; export it again")))
     assert (type(copy), str(copy)) == (kind, "scene/sparse/0: damaged; export it again")
+
+
+def test_an_error_in_one_line() -> None:
+    assert errors.in_one_line(ValueError("line 3:\n   no\tcolon ")) == "line 3: no colon"
+    assert errors.in_one_line(ValueError("line 3: no colon"), 6) == "line 3"
+    assert errors.in_one_line(TimeoutError()) == "TimeoutError"

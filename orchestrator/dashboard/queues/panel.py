@@ -11,7 +11,7 @@ from panolog.orchestrator.queue.entries import Entry, State
 from panolog.orchestrator.queue.shares import describe
 from panolog.orchestrator.queue.store import DATABASE, opened
 from panolog.orchestrator.queue.view import QueueView, remove_entry, view_queue
-from panolog.scene.errors import QueueError
+from panolog.scene.errors import QueueError, in_one_line
 
 QueueAction = Literal["move", "remove", "retry"]
 _ENDED = 20  # entries that have ended that are shown, the latest first
@@ -38,7 +38,7 @@ class QueuePanel:
             with opened(self.folder, make=False) as queue:
                 view = view_queue(queue)
         except (QueueError, OSError) as error:
-            return QueueList(folder=str(self.folder), error=" ".join(str(error).split()))
+            return QueueList(folder=str(self.folder), error=in_one_line(error))
         shown = _shown(view.entries)
         return QueueList(
             folder=str(self.folder),
