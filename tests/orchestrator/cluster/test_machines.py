@@ -5,6 +5,7 @@ import secrets
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -143,10 +144,11 @@ def recovery() -> dict[str, str]:
     return dict(line.split("=", 1) for line in lines if line and not line.startswith("#"))
 
 
-@pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[Cluster]:
+@contextmanager
+def three_hosts(hidden: Path) -> Iterator[Cluster]:
+    """A cluster that is not started yet, or the test skips. Args: hidden, a folder that its workers lack."""
     try:
-        hosts = Hosts({"head": None, "one": tmp_path, "two": tmp_path})
+        hosts = Hosts({"head": None, "one": hidden, "two": hidden})
     except NoHostsError as error:
         pytest.skip(f"hosts of their own cannot be made here: {error}")
     with TemporaryDirectory(prefix="panolog-", dir="/tmp") as folder:  # short: Ray has its sockets there
@@ -154,6 +156,12 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
             yield Cluster(hosts, Path(folder))
         finally:
             hosts.close()
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    with three_hosts(tmp_path) as found:
+        yield found
 
 
 def test_a_host_loses_its_network_and_gets_it_back(cluster: Cluster, tmp_path: Path) -> None:
