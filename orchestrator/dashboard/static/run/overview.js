@@ -24,8 +24,8 @@ function facts({ summary, progress, eta, latest, store }, live, since) {
     ["PSNR, held out", decibel(summary.metrics?.psnr)],
     live || !model ? ["Gaussians in training", short(summary.training_gaussians)] : ["Size", bytes(model.bytes)],
     ["Gaussians kept", short(summary.kept_gaussians)],
-    .../** @type {[string, string][]} */ (store ? [["Object store", store]] : []),
     ...costs(summary.money),
+    .../** @type {[string, string][]} */ (store ? [["Object store", store]] : []), // a sentence: the last, in a row of its own
   ];
 }
 
