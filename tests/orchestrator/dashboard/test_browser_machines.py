@@ -1,6 +1,7 @@
-"""The machines of a run on its page: what is used of them, and those in quarantine."""
+"""The machines of a run on its page, what is used of them, and those in quarantine; its object store."""
 
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -19,8 +20,11 @@ from panolog.orchestrator.run.records import (
     RunBegan,
 )
 from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.storage.state import MirrorState, write_state
 from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium, opened
 from tests.orchestrator.dashboard.served import append, serving, write_whole_run
+from tests.orchestrator.dashboard.test_browser import settled
+from tests.visual import legible
 
 pytestmark = pytest.mark.system
 
@@ -97,3 +101,25 @@ def test_a_machine_in_quarantine_is_released(browser: Browser, tmp_path: Path, w
         append(folder, NodeReleased(QUARANTINED.node, QUARANTINED.host, "a user has released it"))
         expect(machine).to_have_count(0)
         assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+
+
+@pytest.mark.parametrize("width", [DESK, PHONE])
+def test_how_far_an_object_store_is_behind_is_legible(browser: Browser, tmp_path: Path, width: int) -> None:
+    place, since = "s3://reconstructions-of-the-city/2026/street/run", time.time() - 1500
+    why = f"{place}/.panolog/objects/blocks/000/checkpoint.safetensors/18b2: the store fails (Slow down.)"
+    folder = write_whole_run(tmp_path / "run", "/nowhere")
+    write_state(
+        folder.mirror,
+        MirrorState(place, "m", since=since, pending_files=12, pending_bytes=2**33, problem=why),
+    )
+    with (
+        lock.hold(folder.lock),
+        serving(tmp_path) as server,
+        opened(browser, server.url, width=width) as page,
+    ):
+        page.goto(f"{server.url}/runs/{server.id('run')}")
+        fact = page.locator("#facts div", has_text="Object store")
+        expect(fact).to_contain_text("12 files (8.0 GiB) to go")
+        expect(fact).to_contain_text("Slow down.")
+        settled(page)
+        assert legible.low_contrast(page) == legible.sideways(page) == []

@@ -1,6 +1,7 @@
-"""The panoramas of a run's scene: small copies, and of nothing but the scene."""
+"""The panoramas of a run's scene, also of one in a store: small copies, and of nothing but the scene."""
 
 import os
+import shutil
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -11,8 +12,12 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
+from panolog.orchestrator.dashboard import pictures
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import PreviewSaved
+from panolog.orchestrator.views.site import photographs
+from panolog.scene.read import read_scene
+from panolog.scene.stores.cache import FOLDER
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.dashboard.browser import PHONE, chromium, opened
 from tests.orchestrator.dashboard.served import Served, append, serving, write_whole_run
@@ -109,6 +114,66 @@ def test_a_name_that_leads_out_of_the_scene_is_refused(tmp_path: Path) -> None:
             folder.plan.write_text(text.replace("1.jpg", name))
             answer = server.client.get(f"/api/runs/{server.id('run')}/camera/1/panorama")
             assert answer.status_code == 404, name
+
+
+def stored_scene(root: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A scene in a store, with a run of it below `root`/folder. Returns its URL."""
+    scene, _ = of_scene(root)
+    noise = np.random.default_rng(0).integers(0, 256, (512, 1024, 3), np.uint8)
+    noise[256:] = (200, 60, 20)  # is in the middle of the file, which an outline does not have
+    for name in NAMES:
+        cv2.imwrite(str(scene / "images" / name), noise)
+    url = f"file://{scene}"
+    write_whole_run(root / "folder" / "stored", url)
+    monkeypatch.setenv(FOLDER, str(root / "cache"))
+    return url
+
+
+def test_a_panorama_in_a_store_comes_through_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = stored_scene(tmp_path, monkeypatch)
+    with serving(tmp_path / "folder") as server:
+        path = f"/api/runs/{server.id('stored')}/camera"
+        assert "this machine has not read it yet" in server.get(f"{path}/1")["no_picture"]
+        assert "has not read it yet" in server.errors(f"{path}/1/panorama", 404)
+        read_scene(url)
+        assert server.get(f"{path}/1")["no_picture"] is None
+        for _ in range(2):  # fetched, then kept
+            answer = server.client.get(f"{path}/1/panorama")
+            picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)
+            assert picture is not None
+            assert np.abs(picture[300:500].mean(axis=(0, 1)) - [200, 60, 20]).max() < 3
+        assert len(list((tmp_path / "cache" / "objects").iterdir())) == 1
+        os.utime(tmp_path / "scene" / "images" / "2.jpg", (1, 1))
+        assert "has changed in the store" in server.errors(f"{path}/2/panorama", 404)
+        monkeypatch.setattr(photographs, "_BYTES", 1000)
+        assert "has more than 1,000 bytes" in server.errors(f"{path}/3/panorama", 404)
+    assert len(list((tmp_path / "cache" / "objects").iterdir())) == 1
+
+
+def test_a_store_that_fails_is_why_there_is_no_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read_scene(stored_scene(tmp_path, monkeypatch))
+    monkeypatch.setattr(pictures, "STORE_S", 0.1)
+    (tmp_path / "scene" / "images" / "1.jpg").unlink()
+    (tmp_path / "scene" / "images" / "1.jpg").symlink_to("1.jpg")  # cannot be read, and may pass
+    with serving(tmp_path / "folder") as server:
+        why = server.errors(f"/api/runs/{server.id('stored')}/camera/1/panorama", 404)
+    assert "the store fails" in why
+
+
+def test_an_outline_that_a_run_brings_along_fetches_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = read_scene(stored_scene(tmp_path, monkeypatch)).root
+    brought = tmp_path / "other" / made.name
+    shutil.copytree(made, brought)
+    write_whole_run(tmp_path / "folder" / "brought", str(brought))
+    with serving(tmp_path / "folder") as server:
+        server.client.get(f"/api/runs/{server.id('brought')}/camera/1/panorama")
+    assert not (tmp_path / "cache" / "objects").exists()
 
 
 @pytest.mark.system

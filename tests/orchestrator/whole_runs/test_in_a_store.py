@@ -30,7 +30,7 @@ pytestmark = pytest.mark.system
 HELD_IN_A_BLOCK: list[Accident] = [("CheckpointSaved", "block/000", "worker", 0)]
 
 
-LONG = (*SETTINGS, "--iterations", "240")
+LONG = (*SETTINGS, "--iterations", "120")
 
 
 @pytest.fixture(scope="module")
