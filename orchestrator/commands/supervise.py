@@ -113,7 +113,7 @@ class _Supervisor:
 
     def _drive(self, arguments: Sequence[str]) -> tuple[int, str | None]:
         """Runs one driver to its end. Returns its exit code or minus its signal, and why another may help."""
-        # preexec_fn is for programs without other threads, as this one
+        # preexec_fn is for programs without other threads: the one that keeps a mirror only waits for lines
         driver = subprocess.Popen([*_PROGRAM, *arguments], preexec_fn=bound_to_parent(self.before))  # noqa: PLW1509
         while (code := driver.poll()) is None:
             if (number := self._taken(_POLL_S)) is not None:

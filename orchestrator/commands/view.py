@@ -23,7 +23,7 @@ from panolog.orchestrator.views.site.build import (
     write_file,
     write_folder,
 )
-from panolog.orchestrator.views.site.photographs import photograph
+from panolog.orchestrator.views.site.photographs import STORE_S, photograph
 from panolog.scene.errors import InputError, StoreLostError
 from panolog.scene.stores.outline import local_folder
 from panolog.scene.write import StageProgress, no_progress
@@ -147,7 +147,7 @@ class SiteServer(ThreadingHTTPServer):
             copy = self._copies.pop(number, None)
             if copy is None:
                 try:
-                    copy = photograph(scene, self._names[number])
+                    copy = photograph(scene, self._names[number], patience=STORE_S)
                 except (InputError, StoreLostError):
                     return None
             self._copies[number] = copy

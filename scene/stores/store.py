@@ -99,7 +99,10 @@ class Store:
     """
 
     def __init__(self, url: StoreUrl, patience: float = PATIENCE_S) -> None:
-        """Opens it, without a request. Args: patience, seconds. Raises StoreError without its package."""
+        """Opens it, without a request to the store. Args: patience, seconds.
+
+        Raises StoreError without its package or an account of the provider.
+        """
         self.url = url
         self._patience = patience
         self._errors, self._files = _opened(url)
@@ -251,20 +254,26 @@ def require_package(url: StoreUrl) -> None:
 
 
 def _opened(url: StoreUrl) -> tuple[_Errors, Any]:
-    """What a store's file system may raise, and the file system. Raises StoreError without an account."""
+    """What a store's file system may raise, and the file system.
+
+    Raises StoreError without its package or an account, StoreLostError if the account cannot be looked up.
+    """
     require_package(url)
     import fsspec  # noqa: PLC0415  # only runs in stores need it
 
     extra = PROTOCOLS[url.protocol]
     if extra == "gcs":
         os.environ.setdefault(_GCS_KINDS, "false")
-    for name in _LOGGERS.get(extra, ()):  # without a handler, Python would print what `_try` reports
-        logging.getLogger(name).addHandler(logging.NullHandler())
+    for log in map(logging.getLogger, _LOGGERS.get(extra, ())):
+        if not log.handlers:  # without one, Python would print what `_try` reports
+            log.addHandler(logging.NullHandler())
     errors = _ERRORS[extra].loaded()
     try:
         files, _ = fsspec.url_to_fs(str(url), **({"use_listings_cache": False} if extra else {}))
-    except (ValueError, *errors.final, *errors.passing) as error:
+    except (ValueError, *errors.final) as error:
         raise _no_access(str(url), error) from error
+    except errors.passing as error:
+        raise StoreLostError(f"{url}: the store fails ({_reason(error)})") from error
     account = url.account
     if account and account != files.service_client.account_name:
         raise StoreError(
@@ -294,8 +303,8 @@ def _refuses(error: Exception) -> bool:
 
 def _status(error: BaseException) -> int:
     """The status of an answer by HTTP; 0 if the error is of no answer."""
-    found = str(getattr(error, "status_code", None) or getattr(error, "code", None))
-    return int(found) if found.isdecimal() else 0
+    found = (str(getattr(error, name, "")) for name in ("status_code", "status", "code"))
+    return next((int(text) for text in found if text.isdecimal()), 0)
 
 
 def _version(info: Mapping[str, Any]) -> Version:

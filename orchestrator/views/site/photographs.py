@@ -16,6 +16,7 @@ from panolog.scene.colmap_files import read_image_records
 from panolog.scene.errors import InputError
 from panolog.scene.read import check_names, image_folder, model_folder
 from panolog.scene.stores.outline import whole
+from panolog.scene.stores.store import PATIENCE_S
 
 WIDE = 2048  # pixels of a copy in 3D
 STORE_S = 10.0  # for which a store may fail before a page shows no picture
@@ -52,8 +53,8 @@ def require_size(size: int, name: str) -> None:
         raise InputError(f"{name} has more than {_BYTES:,} bytes")
 
 
-def photograph(scene: Path, name: str, width: int = WIDE) -> bytes:
-    """A small copy of a panorama of a scene on this machine.
+def photograph(scene: Path, name: str, width: int = WIDE, patience: float = PATIENCE_S) -> bytes:
+    """A small copy of a panorama of a scene. Args: patience, seconds for which its store may fail.
 
     Raises InputError if there is no such scene, or no image of that name really below it; StoreLostError.
     """
@@ -62,7 +63,7 @@ def photograph(scene: Path, name: str, width: int = WIDE) -> bytes:
     if not (path.is_file() and path.is_relative_to(scene.resolve())):
         raise InputError(f"{name} is missing in {image_folder(scene)}, or a link that leads out of the scene")
     require_size(path.stat().st_size, name)
-    data = whole(path, STORE_S)  # of a scene in an object store
+    data = whole(path, patience)  # of a scene in an object store
     with path.open("rb") if data is None else BytesIO(data) as file:
         return small_copy(file, name, width)
 
