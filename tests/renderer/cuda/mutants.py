@@ -3,6 +3,7 @@
 Made from the sources by patterns. One that no longer matches fails: when a kernel changes, so do its mutants.
 """
 
+import functools
 import re
 import shutil
 from collections.abc import Iterator
@@ -181,18 +182,37 @@ class Mutant:
     text: str
 
     def write(self, folder: Path) -> Path:
-        """The sources with this change; returns the folder of the kernels."""
+        """The sources with this change, without the kernels that lack it; returns the folder of the kernels.
+
+        A compiler would spend most of its time on the others.
+        """
         shutil.copytree(CSRC, folder, ignore=shutil.ignore_patterns("*.cpp"))
         source = (folder / self.file).read_text()
         (folder / self.file).write_text(source[: self.start] + self.text + source[self.end :])
+        for module in self.modules():
+            path = folder / "cuda" / f"{module}.cu"
+            path.write_text(_only(self.kernels, path.read_text()))
         return folder / "cuda"
+
+    @functools.cached_property
+    def kernels(self) -> frozenset[str]:
+        """Those that may have the change: of a header or of no function, all of its modules."""
+        sources = {module: (CSRC / "cuda" / f"{module}.cu").read_text() for module in self.modules()}
+        source = (CSRC / self.file).read_text()
+        function = _function(source[: self.start]) if _inside(source[: self.start]) else ""
+        if self.file.suffix != ".cu" or not function:
+            return frozenset(name for source in sources.values() for name in _KERNEL.findall(source))
+        return frozenset(_KERNEL.findall(source)) & _callers(function, source)
 
     def modules(self) -> tuple[str, ...]:
         """In which it may be found: for a header in all that include it."""
-        sources = {module: CSRC / "cuda" / f"{module}.cu" for module in MODULES}
-        return tuple(
-            name for name, source in sources.items() if CSRC / self.file in included(source, (CSRC,))
-        )
+        return tuple(module for module in MODULES if CSRC / self.file in _files(module))
+
+
+@functools.cache
+def _files(module: str) -> frozenset[Path]:
+    """The source of a module and all that it includes."""
+    return frozenset(included(CSRC / "cuda" / f"{module}.cu", (CSRC,)))
 
 
 def mutants(pattern: Pattern) -> Iterator[Mutant]:
@@ -208,7 +228,34 @@ def mutants(pattern: Pattern) -> Iterator[Mutant]:
             yield Mutant(name, pattern, path.relative_to(CSRC), match.start(), match.end(), text)
 
 
+_KERNEL = re.compile(r"__launch_bounds__\(\d+\)\s+(\w+)\(")
+_FUNCTION = re.compile(r"(?:__launch_bounds__\(\d+\)|__forceinline__ [\w<>]+)\s+(\w+)\(")
+_END = re.compile(r"^\}", re.MULTILINE)  # of a function or a struct
+
+
 def _function(before: str) -> str:
     """The last function that begins in a source."""
-    found = re.findall(r"(?:__launch_bounds__\(\d+\)|__forceinline__ [\w<>]+)\s+(\w+)\(", before)
+    found = _FUNCTION.findall(before)
     return found[-1] if found else ""
+
+
+def _inside(before: str) -> bool:
+    """Whether a source that is cut here is cut in a function, and not between two."""
+    return _FUNCTION.search(_END.split(before)[-1]) is not None
+
+
+def _callers(function: str, source: str) -> set[str]:
+    """The functions of a source that name this one, or another that does; and itself."""
+    found, parts = {function}, [(_function(part), part) for part in _END.split(source)]
+    for _ in parts:
+        found |= {name for name, part in parts if name and found & set(re.findall(r"\w+", part))}
+    return found
+
+
+def _only(kernels: frozenset[str], source: str) -> str:
+    """A source in which the other kernels are templates without an instance: they are not compiled."""
+
+    def head(match: re.Match[str]) -> str:
+        return match[0] if match[1] in kernels else f"template <int> void\n    {match[1]}("
+
+    return re.sub(r'extern "C" __global__ void ' + _KERNEL.pattern, head, source)

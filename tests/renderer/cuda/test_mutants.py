@@ -206,8 +206,17 @@ def test_there_are_enough_faults() -> None:
         assert (exterior.places < 0).any() and len(exterior.splats) and sure.float().mean() > 0.5
 
 
+def test_a_change_is_in_the_kernels_that_call_what_is_changed() -> None:
+    where = {name.split(",")[0]: mutant.kernels for name, mutant in MUTANTS.items()}
+    assert where["project_motion"] == {"project_motion"}
+    assert where["add_sums"] == {"composite_backward", "composite_ray_backward"}
+    ours = {mutant.name: mutant for mutant in MUTANTS.values() if mutant.file.suffix == ".cuh"}
+    assert all({"composite_forward", "composite_backward"} <= mutant.kernels for mutant in ours.values())
+    assert all(mutant.kernels for mutant in MUTANTS.values())
+
+
 def exercise(mutant: Mutant, folder: Path) -> None:
-    launch = EmulatedLaunch(mutant.write(folder / "csrc"), into=folder)
+    launch = EmulatedLaunch(mutant.write(folder / "csrc"), into=folder, kernels=mutant.kernels)
     for module in mutant.modules():
         EXERCISES[module](launch)
 

@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,7 @@ class EmulatedLaunch:
         contract: bool = False,
         flush: bool = False,
         into: Path | None = None,
+        kernels: Collection[str] | None = None,
     ) -> None:
         """`contract` and `flush` round as a card may: with fused multiply-adds, with denormals as zero.
 
@@ -74,18 +76,22 @@ class EmulatedLaunch:
             contract: in the modules that NVRTC compiles so.
             flush: in the modules that NVRTC compiles with fast arithmetic.
             into: where libraries are built, whatever the compiler warns of; without it once for all tests.
+            kernels: which of `folder` run, the others being those of csrc/cuda; without it all.
         """
         self.folder = folder
         self.seed = seed
         self.contract = contract
         self.flush = flush
         self.into = into
+        self.kernels = kernels
         self.memory = _Memory()
 
     def __call__(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
         module = module_of(kernel)
-        source, rounding = self.folder / f"{module}.cu", MODULES.get(module, {})
-        code = library(source, self.contract and rounding.get("fma", True), self.into)
+        own = self.kernels is None or kernel in self.kernels
+        source = (self.folder if own else CSRC / "cuda") / f"{module}.cu"
+        rounding = MODULES.get(module, {})
+        code = library(source, self.contract and rounding.get("fma", True), self.into if own else None)
         run = getattr(code, f"run_{kernel}")
         run.argtypes, run.restype = (_Launch,), ctypes.c_char_p
         kinds, values = zip(*map(_raw, in_order(source, kernel, arguments)), strict=True)

@@ -17,7 +17,10 @@ from panolog.renderer.cuda.nvrtc import CSRC
 
 HERE = Path(__file__).parent
 BUILD = Path(__file__).parents[4] / "build" / "emulation"
-COMMON = ("-std=c++17", "-g1", "-fPIC", "-fno-exceptions", "-U_FORTIFY_SOURCE", "-Wall")
+COMMON = (
+    *("-std=c++17", "-fPIC", "-fno-exceptions", "-U_FORTIFY_SOURCE", "-Wall"),
+    *("-g1", "-gdwarf-4"),  # of DWARF 5 some addr2line name another file
+)
 RUNTIME = (*COMMON, "-O2", "-Wno-clobbered", "-Werror")
 KERNELS = (
     *COMMON,
