@@ -58,8 +58,11 @@ def run_with(root: Path, model: Gaussians | None = None, names: list[str] = NAME
     return folder
 
 
-def cloud(viewpoints: Viewpoints) -> Gaussians:
-    """Gaussians of all shapes and opacities around a point ahead, and a sky of large ones."""
+def cloud(viewpoints: Viewpoints, larger: tuple[float, float] = (2.0, 3.0)) -> Gaussians:
+    """Gaussians of all shapes and opacities around a point ahead, and a sky of large ones.
+
+    Args: larger, how much those near and those of the sky are larger than `some`, as logarithms.
+    """
     model = some(3000, sky=1000, seed=3)
     far = (torch.arange(3000) >= 2000)[:, None]
     ahead = viewpoints.start.position + 6 * viewpoints.start.ahead
@@ -68,6 +71,6 @@ def cloud(viewpoints: Viewpoints) -> Gaussians:
         means=model.means
         - torch.tensor([10.0, 20, 30])
         + torch.where(far, 0, torch.from_numpy(ahead)).float(),
-        scales=model.scales + torch.where(far, 3.0, 2.0),
+        scales=model.scales + torch.where(far, larger[1], larger[0]),
         opacities=model.opacities + 1.5,
     )

@@ -45,9 +45,14 @@ def rests(page: Page) -> None:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The address of the page of a run with photographs."""
+    """The address of the page of a run with photographs.
+
+    Its Gaussians are small: what the tests wait for is a GPU in software, which spends its time on pixels.
+    """
     root = tmp_path_factory.mktemp("site")
-    write_folder(site_of_run(run_with(root), Wanted()), root / "web")
+    folder = run_with(root)
+    write_ply(folder.model(COARSE), cloud(viewpoints_of(folder), larger=(1.0, 0.0)))
+    write_folder(site_of_run(folder, Wanted()), root / "web")
     with serving(root / "web") as url:
         yield url
 
