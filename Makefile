@@ -32,6 +32,9 @@ if not (os.environ.get("CXX") or any(map(shutil.which, ("c++", "g++", "clang++")
 endef
 export CHECK
 
+# Where an image of a container forbids them, each of the many processes compiles all of PanoLOG's sources anew.
+export PYTHONDONTWRITEBYTECODE :=
+
 .DEFAULT_GOAL := help
 .PHONY: setup demo test check lint types wheel wheel-check bench clean help
 
