@@ -14,6 +14,8 @@ from tests.prepare.sfm.consistency.simulated import SIZE, Square, square
 
 pytestmark = pytest.mark.system
 
+COUNT = 24  # panoramas, six for each side
+
 
 def _solve(place: Square) -> Solution:
     with silence_colmap():
@@ -31,7 +33,7 @@ def _share(place: Square, found: Solution) -> float:
 
 @pytest.mark.parametrize("ground", [True, False])
 def test_neighbours_in_order_outweigh_sides_that_look_the_same(ground: bool, tmp_path: Path) -> None:
-    place = square(tmp_path, ground=ground)
+    place = square(tmp_path, count=COUNT, ground=ground)
     found = _solve(place)
     assert found.skeleton.ordered
     assert len(found.found.poses) == len(place.centers)
@@ -40,7 +42,7 @@ def test_neighbours_in_order_outweigh_sides_that_look_the_same(ground: bool, tmp
 
 
 def test_without_order_what_lies_around_tells_sides_apart(tmp_path: Path) -> None:
-    place = square(tmp_path, order=np.random.default_rng(4).permutation(32))
+    place = square(tmp_path, count=COUNT, order=np.random.default_rng(4).permutation(COUNT))
     found = _solve(place)
     assert not found.skeleton.ordered
     assert len(found.found.poses) == len(place.centers)
@@ -50,7 +52,7 @@ def test_without_order_what_lies_around_tells_sides_apart(tmp_path: Path) -> Non
 
 
 def test_what_nothing_tells_apart_is_not_trusted(tmp_path: Path) -> None:
-    place = square(tmp_path, ground=False, order=np.random.default_rng(4).permutation(32))
+    place = square(tmp_path, count=COUNT, ground=False, order=np.random.default_rng(4).permutation(COUNT))
     found = _solve(place)
     rows = sorted(found.found.poses)
     assert not is_trusted(found.contradictions, found.skeleton, rows)
