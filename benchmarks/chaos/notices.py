@@ -42,9 +42,10 @@ HEADER = (
     *("iterations redone", "lost s", "bytes"),
 )
 SETTINGS = (
-    *("--blocks", "2x1x1", "--iterations", "1500", "--width", "128", "--device", "cpu"),
+    *("--blocks", "2x1x1", "--width", "128", "--device", "cpu"),
     *("--set", "sky.count=500", "--set", "checkpoint.every=50", "--set", "checkpoint.share=1"),
 )
+ITERATIONS = 1500  # so many that a task is still training when its node leaves
 _HIT = {2: Stage.COARSE, 3: Stage.BLOCK}  # the stage in which a node leaves, by the number of nodes
 _TIMEOUT_S = 300.0  # for a run
 _POLL_S = 0.05  # between two looks at the run
@@ -102,10 +103,12 @@ class Outcome:
 class Spots:
     """Runs of one scene on one cluster, whose nodes but the head may leave."""
 
-    def __init__(self, cluster: LocalCluster, services: dict[str, Metadata], root: Path, scene: Path) -> None:
+    def __init__(
+        self, cluster: LocalCluster, services: dict[str, Metadata], root: Path, scene: Path, iterations: int
+    ) -> None:
         """Args: services, the metadata service of each node that may leave; root, a folder for the runs."""
         self._cluster, self._services = cluster, services
-        self._root, self._scene = root, scene
+        self._root, self._scene, self._iterations = root, scene, iterations
 
     def run(self, number: int, planned: Planned | None) -> Run:
         """A whole run, of which a node leaves as planned."""
@@ -113,7 +116,7 @@ class Spots:
         folder = self._root / f"run-{number:03d}"
         self._cluster.wait()
         command = [str(BIN / "panolog"), "run", str(self._scene), "-o", str(folder), *SETTINGS]
-        command += ["--address", self._cluster.address]
+        command += ["--iterations", str(self._iterations), "--address", self._cluster.address]
         with (self._root / f"{folder.name}.log").open("wb") as log:
             environment = self._cluster.environment(DRIVER)
             driver = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
@@ -181,8 +184,10 @@ def plans(runs: int, seed: int, seconds: Sequence[float]) -> Iterator[Planned]:
         yield Planned(seconds[number % len(seconds)], random.uniform(0.1, 0.7))
 
 
-def notices(root: Path, plan: Sequence[Planned], sizes: Sequence[int] = (2, 3)) -> Outcome:
-    """All runs, in the folder `root`: as planned, in turn on clusters of so many nodes.
+def notices(
+    root: Path, plan: Sequence[Planned], sizes: Sequence[int] = (2, 3), iterations: int = ITERATIONS
+) -> Outcome:
+    """All runs, in the folder `root`: as planned, in turn on clusters of so many nodes; iterations of a task.
 
     Raises RunError if a cluster does not start.
     """
@@ -199,7 +204,7 @@ def notices(root: Path, plan: Sequence[Planned], sizes: Sequence[int] = (2, 3)) 
             variables = {name: {VARIABLE: service.url} for name, service in services.items()}
             cores = {HEAD: 0} | dict.fromkeys(names, 1)
             cluster = stack.enter_context(started(cable, cores, variables))
-            spots = Spots(cluster, services, folder, scene)
+            spots = Spots(cluster, services, folder, scene, iterations)
             mine = [None, *plan[index :: len(sizes)]]
             for number, planned in enumerate(mine):
                 done.append(spots.run(number, planned))

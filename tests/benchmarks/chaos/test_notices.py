@@ -85,7 +85,7 @@ def test_all_lengths_of_notice_come_equally_often() -> None:
 
 @pytest.mark.system
 def test_a_task_moves_and_nothing_is_trained_twice(tmp_path: Path) -> None:
-    outcome = notices(tmp_path, [Planned(120.0, 0.3)], sizes=(3,))
+    outcome = notices(tmp_path, [Planned(120.0, 0.1)], sizes=(3,), iterations=700)
     calm, moved = outcome.runs
     assert moved.digest == calm.digest, moved.end
     assert moved.cost is not None
