@@ -200,16 +200,24 @@ def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, 
         assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
 
 
-def test_a_limit_delivers_what_there_is_and_without_it_the_bytes_are_the_same(
+def test_ctrl_c_leaves_fresh_checkpoints_and_a_limit_delivers_what_there_is(
     runs: tuple[Path, Ended, Path], tmp_path: Path
 ) -> None:
+    """The whole foreground of a terminal gets the signal; without the limit the bytes are the same again."""
     calm, _, _ = runs
     root, prices = tmp_path / "run", tmp_path / "prices.toml"
     prices.write_text('currency = "EUR"\n[[machine]]\nname = "any"\nprice = 3600\nhost = "*"\n')
     more = ("--set", "checkpoint.every=1000", "--set", "preview.every=20", "--prices", prices)
-    stop: list[Accident] = [("PreviewSaved", str(TaskId.block(1)), "terminal", 2)]
-    end = end_of(launch("run", calm.parent / "town", "-o", root, *SETTINGS, *more, accidents=stop))
-    assert end.code == 130, end.stderr
+    commands: dict[TaskId, tuple[object, ...]] = {
+        COARSE: ("run", calm.parent / "town", "-o", root, *SETTINGS, *more),
+        TaskId.block(1): ("resume", root),
+    }
+    for task, command in commands.items():
+        end = end_of(launch(*command, accidents=[("PreviewSaved", str(task), "terminal", 2)]))
+        assert (end.code, end.stdout) == (130, ""), end.stderr
+        state = state_of(root)
+        assert (state.outcome, state.task(task).retries) == ("interrupted", 0)
+        assert 0 < (state.task(task).checkpoint or 0) < 60
     cost = state_of(root).money.used.cost
     assert cost > 0
     end = end_of(launch("resume", root, "--max-cost", cost * 1.001))  # which is used up by what follows
@@ -224,26 +232,6 @@ def test_a_limit_delivers_what_there_is_and_without_it_the_bytes_are_the_same(
     assert (again.code, state_of(root)) == (0, limited), again.stderr
     end = end_of(launch("resume", root, "--max-cost", "none"))
     assert (end.code, state_of(root).outcome) == (0, "done"), end.stderr
-    assert (root / "point_cloud.ply").read_bytes() == (calm / "point_cloud.ply").read_bytes()
-
-
-def test_ctrl_c_leaves_fresh_checkpoints(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
-    """The whole foreground of a terminal gets the signal, and the run ends as if nothing had been."""
-    calm, _, _ = runs
-    root, scene = tmp_path / "run", calm.parent / "town"
-    settings = [*SETTINGS, "--set", "checkpoint.every=1000", "--set", "preview.every=20"]
-    commands: dict[TaskId, tuple[object, ...]] = {
-        COARSE: ("run", scene, "-o", root, *settings),
-        TaskId.block(1): ("resume", root),
-    }
-    for task, command in commands.items():
-        end = end_of(launch(*command, accidents=[("PreviewSaved", str(task), "terminal", 2)]))
-        assert (end.code, end.stdout) == (130, ""), end.stderr
-        state = state_of(root)
-        assert (state.outcome, state.task(task).retries) == ("interrupted", 0)
-        assert 0 < (state.task(task).checkpoint or 0) < 60
-    end = end_of(launch("resume", root))
-    assert end.code == 0, end.stderr
     assert (root / "point_cloud.ply").read_bytes() == (calm / "point_cloud.ply").read_bytes()
 
 
