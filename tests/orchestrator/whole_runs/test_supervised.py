@@ -31,7 +31,7 @@ SETTINGS = (
     "densify.every_floor=5",
     "width=64",
 )
-FLAGS = {"iterations": 120, "device": "cpu", "blocks": "2x1x1"}
+FLAGS = {"iterations": 120, "device": "cpu", "blocks": "1x1x1"}
 OPTIONS = [word for setting in SETTINGS for word in ("--set", setting)]
 OPTIONS += [word for name, value in FLAGS.items() for word in (f"--{name}", str(value))]
 
