@@ -19,6 +19,7 @@ from tests.visual.runs import all_runs
 
 WIDTHS: dict[str, int] = {"desk": DESK, "phone": PHONE}
 THEMES: tuple[Theme, ...] = ("light", "dark")
+_QUIET_MS = 400
 _COMPARED = ("finished", "failed", "live")
 
 
@@ -51,7 +52,7 @@ class Shot:
     url: Callable[[Site], str]
     prepare: Callable[[Page], None] = lambda _: None  # after it has loaded
     whole: bool = True  # False: only what the window shows
-    quiet: float = 400  # milliseconds without a change, after which it is complete
+    quiet: float = _QUIET_MS  # milliseconds without a change, after which it is complete
 
     def open(self, site: Site, page: Page) -> None:
         """Shows the page as it is to be looked at."""
@@ -63,9 +64,9 @@ class Shot:
         self.settle(page)
 
     def show(self, page: Page, theme: Theme) -> None:
-        """Switches the page that is open to a theme."""
+        """Switches the page that is open to a theme, for which it requests nothing."""
         page.emulate_media(color_scheme=theme)
-        self.settle(page)
+        wait_until_quiet(page, min(self.quiet, _QUIET_MS))
 
     def settle(self, page: Page, *, patience: float = 1) -> None:
         """Waits until the page is complete; with more patience, longer."""
