@@ -32,7 +32,7 @@ if not (os.environ.get("CXX") or any(map(shutil.which, ("c++", "g++", "clang++")
 endef
 export CHECK
 
-# Where an image of a container forbids them, each of the many processes compiles all of PanoLOG's sources anew.
+# Keep bytecode where a container's environment forbids it: else each process compiles PanoLOG's sources anew.
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
