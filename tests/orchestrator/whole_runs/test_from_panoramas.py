@@ -22,7 +22,7 @@ from tests.prepare.video.videos import render, walk, write_video
 pytestmark = pytest.mark.system
 
 WIDTH = 512
-OPTIONS = ("--width", "128", "--blocks", "1x1x1", *SETTINGS)
+OPTIONS = ("--width", "128", *SETTINGS)
 # A driver that kills itself when the preparation is at a part of a step.
 KILLED = """
 import os, signal, sys
