@@ -23,7 +23,7 @@ from panolog.orchestrator.resources.scaling import Scaling
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Failure
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ClusterError, InputError
 from panolog.scene.images import MOST_THREADS, passing_views, view_bytes
 from panolog.scene.model import Scene
 from panolog.workers import device_memory
@@ -44,6 +44,7 @@ _DENSIFIED = 0.2  # share of Gaussians that densify at first: three scenes had 0
 
 _SECONDS = 3.0  # of iterations; with the worker's start about twice as many in all
 _WAIT_S = 0.5
+_JOIN_S = 60.0  # in which a node joins a cluster whose nodes have just been started
 _MEMORY_SHARE = 1 / 2  # of the placement's memory that the attempt may take
 _EACH = 2048  # bytes of a Gaussian in training, roughly
 
@@ -99,9 +100,10 @@ def basis_of(folder: RunFolder, scene: Scene, config: RunConfig) -> Basis:
 def await_machine(
     pool: Pool, need: Callable[[], int], say: Callable[[str], None], *, cuda: bool
 ) -> float | None:
-    """Waits until there is a machine for tasks, if Ray's autoscaler can start one, and requests it.
+    """Waits until there is a machine for tasks, and requests it where Ray's autoscaler can start one.
 
-    Returns after how many seconds it came; None if there was one, or none can be started.
+    Returns after how many seconds that came; None if it was not requested. Raises ClusterError where none can
+    be started and none joins.
 
     Args: need, returns the bytes of memory that a task should have; say, called with why it waits.
     """
@@ -109,17 +111,21 @@ def await_machine(
     while not placement.able(pool.nodes(), cuda=cuda):
         growth = pool.growth()
         groups = Scaling(growth, cuda, overhead=0.0).preferred(need())
-        if not groups:
-            return None
-        pool.request({groups[0].name: 0 if growth.joining else 1})
-        text = f"waiting for a machine: {groups[0].text()} is requested from Ray's autoscaler"
-        text += f"; it reports: {growth.trouble}" if growth.trouble else ""
+        if groups:
+            pool.request({groups[0].name: 0 if growth.joining else 1})
+            text = f"waiting for a machine: {groups[0].text()} is requested from Ray's autoscaler"
+            text += f"; it reports: {growth.trouble}" if growth.trouble else ""
+        else:
+            what = "GPU" if cuda else "core"
+            text = f"waiting for a machine with a {what}: the cluster has none"
+            if time.monotonic() - began > _JOIN_S:
+                raise ClusterError(f"no node of the cluster has a {what} for tasks; see `ray status`")
         if text != said:
             say(text)
             said = text
         pool.ready(_WAIT_S)
     pool.request({})
-    return time.monotonic() - began if said else None
+    return time.monotonic() - began if said and pool.growth().groups else None
 
 
 def calibrate(pool: Pool, scene: Scene, config: RunConfig) -> Basis:

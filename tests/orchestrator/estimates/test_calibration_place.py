@@ -5,12 +5,14 @@ from pathlib import Path
 
 import pytest
 
+from panolog.orchestrator.estimates import calibration
 from panolog.orchestrator.estimates.calibration import await_machine, calibrate
 from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.scaling import Group, Growth
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.records import Leaving
+from panolog.scene.errors import ClusterError
 from tests.orchestrator.calibrated import says
 from tests.orchestrator.fakes import FakePool
 from tests.workers.small import WIDTH, small_scene
@@ -61,10 +63,16 @@ def test_without_a_machine_one_is_requested_and_waited_for() -> None:
     assert pool.requests[0] == {"large": 1}
 
 
-def test_where_none_can_be_started_nothing_is_waited_for() -> None:
-    pool = ComingPool(())
-    assert await_machine(pool, lambda: 0, lambda _: None, cuda=False) is None
-    assert pool.requests == []
+def test_where_none_can_be_started_one_may_join() -> None:
+    pool, said = ComingPool(()), list[str]()
+    assert await_machine(pool, lambda: 0, said.append, cuda=False) is None
+    assert said == ["waiting for a machine with a core: the cluster has none"]
+
+
+def test_a_cluster_that_stays_empty_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration, "_JOIN_S", 0.0)
+    with pytest.raises(ClusterError, match="no node of the cluster has a core for tasks"):
+        await_machine(FakePool(says, []), lambda: 0, lambda _: None, cuda=False)
 
 
 def test_where_there_is_a_machine_nothing_is_requested() -> None:

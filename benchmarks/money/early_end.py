@@ -1,6 +1,6 @@
 """What a run should make of blocks that a limit ends: their last checkpoints, or what Stage I has of them?
 
-    python -m benchmarks.early_end [--iterations 400] [--recipe panolog]
+    python -m benchmarks.money.early_end [--iterations 400] [--recipe panolog]
 
 Trains a small town in two blocks and keeps their checkpoints. Of those after some parts of Stage II it merges
 a model each, and measures it on the held-out panoramas as it measures that of Stage I.

@@ -1,0 +1,1 @@
+"""What limits of cost and time do to a run."""
