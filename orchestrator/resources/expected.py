@@ -9,6 +9,7 @@ from panolog.orchestrator.resources.scaling import STARTUP_S, Growth, Price, Sca
 from panolog.orchestrator.run.clock import Clock
 
 _USUAL = 2  # measured starts that the usual one counts as
+_DRY_S = 1800.0  # for which a group that has given no machine comes last
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Expected:
         self.since: dict[str, list[float]] = {}  # Clock.time() of the requests, by group, the earliest first
         self.known: dict[str, Node] = {}  # the last machine of each group
         self._present: dict[str, int] = {}
+        self._dry: dict[str, float] = {}  # Clock.time() at which a group had given none for too long
         self._startups = [] if joined is None else [joined]  # seconds
 
     @property
@@ -63,7 +65,7 @@ class Expected:
         Args: as `Scaling.wanted`; patience, seconds after which those of a group that has given none count no
         more.
         """
-        late = self._late(patience)
+        late = self._note_late(patience)
         wanted = scaling.wanted(work, running, nodes, late)
         more = self._change(wanted)
         groups = {group.name: group for group in scaling.growth.groups}
@@ -89,6 +91,7 @@ class Expected:
         for group in growth.groups:
             present = growth.present(group)
             for _ in range(present - self._present.get(group.name, present)):
+                self._dry.pop(group.name, None)
                 if times := self.since.get(group.name):
                     self._startups.append(self._clock.time() - times.pop(0))
             self._present[group.name] = present
@@ -101,10 +104,13 @@ class Expected:
         self.since = {name: [*self.since.get(name, ()), *new[name]][:count] for name, count in wanted.items()}
         return {name: count for name, count in more.items() if count > 0}
 
-    def _late(self, seconds: float) -> set[str]:
-        """The groups of which a machine was requested so long ago."""
+    def _note_late(self, seconds: float) -> set[str]:
+        """The groups that have given no machine for so long, now or a while ago."""
         now = self._clock.time()
-        return {name for name, times in self.since.items() if now - times[0] > seconds}
+        late = [name for name, times in self.since.items() if now - times[0] > seconds]
+        self._dry |= {name: now for name in late if name not in self._dry}
+        self._dry = {name: at for name, at in self._dry.items() if name in late or now - at < _DRY_S}
+        return set(self._dry)
 
     def _left(self) -> dict[str, list[float]]:
         """Seconds until each should come, by group."""

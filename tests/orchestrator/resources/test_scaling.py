@@ -161,6 +161,21 @@ def test_a_group_that_gives_none_is_replaced_by_the_next() -> None:
     assert decide(expected, growth, work(1, HOUR)).wanted == {"small": 1}
     clock.now += 601
     assert decide(expected, growth, work(1, HOUR)).wanted == {"large": 1}
+    clock.now += 10
+    assert decide(expected, growth, work(1, HOUR)).wanted == {"large": 1}
+    clock.now += 1800
+    assert decide(expected, growth, work(1, HOUR)).wanted == {"small": 1}
+
+
+def test_a_group_that_gives_a_machine_again_is_taken_again() -> None:
+    clock = SetClock()
+    expected, growth = Expected(clock), Growth((SMALL, LARGE))
+    decide(expected, growth, work(1, HOUR))
+    clock.now += 601
+    decide(expected, growth, work(1, HOUR))
+    came = Growth((SMALL, LARGE), {"a": "small"})
+    busy = decide(expected, came, work(4, HOUR), [])
+    assert busy.wanted == {"small": 4}
 
 
 def test_requests_end_with_the_tasks() -> None:
