@@ -2,13 +2,16 @@
 
 import copy
 import json
+import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import pytest
+import yaml
 
-from tests.deploy.files import DEPLOY, load_all
+from tests.deploy.files import DEPLOY, ROOT, load_all
 
 SCHEMA = json.loads((Path(__file__).parent / "kueue.schema.json").read_text())
 SUBMITTER = {"cpu": 0.5, "memory": 200 * 2**20}  # KubeRay's default for the pod that submits the job
@@ -18,6 +21,14 @@ UNITS = {"Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
 @pytest.fixture
 def kinds() -> dict[str, Any]:
     return {kind["kind"]: kind for kind in load_all("kueue.yaml")}
+
+
+def job() -> Any:
+    """The RayJob as the command of kueue.md makes it, before it gets its label."""
+    page = (DEPLOY / "kueue.md").read_text()
+    (command,) = re.findall(r"^    (sed '.*?' deploy/kuberay\.yaml)", page, re.MULTILINE)
+    made = subprocess.run(command, shell=True, cwd=ROOT, check=True, capture_output=True, text=True)
+    return next(yaml.safe_load_all(made.stdout))
 
 
 def amount(text: str) -> float:
@@ -79,14 +90,14 @@ def test_names_fit_together(kinds: dict[str, Any]) -> None:
 def test_the_quota_is_that_of_one_run(kinds: dict[str, Any]) -> None:
     (group,) = kinds["ClusterQueue"]["spec"]["resourceGroups"]
     quota = {it["name"]: amount(it["nominalQuota"]) for it in group["flavors"][0]["resources"]}
-    wanted = needs(load_all("kuberay.yaml")[0])
+    wanted = needs(job())
     assert wanted.keys() == quota.keys()
     for name, size in wanted.items():
         assert size <= quota[name] < 1.1 * size, name
 
 
 def test_the_run_is_one_that_kueue_can_suspend() -> None:
-    spec = load_all("kuberay.yaml")[0]["spec"]
+    spec = job()["spec"]
     assert spec["shutdownAfterJobFinishes"] is True
     assert "clusterSelector" not in spec
     assert not spec["rayClusterSpec"].get("enableInTreeAutoscaling")

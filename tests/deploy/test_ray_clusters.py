@@ -9,6 +9,7 @@ import jsonschema
 import pytest
 from ray.autoscaler._private.util import prepare_config, validate_config
 
+from panolog.orchestrator.resources.scaling import IDLE_S
 from tests.deploy.files import DEPLOY, commands, load
 from tests.ray_head import BIN, environment
 
@@ -39,10 +40,11 @@ def test_every_ray_start_uses_the_token_and_notices_lost_machines(name: str) -> 
     assert load(name)["file_mounts"]["~/.ray/auth_token"] == "~/.ray/auth_token"
 
 
-def test_all_machines_of_aws_are_there_when_a_run_begins() -> None:
+def test_workers_of_aws_come_as_requested_and_go_after_an_idle_minute() -> None:
     config = load("aws.yaml")
     worker = config["available_node_types"]["worker"]
-    assert worker["min_workers"] == worker["max_workers"] == config["max_workers"]
+    assert (worker["min_workers"], worker["max_workers"]) == (0, config["max_workers"])
+    assert 60 * config["idle_timeout_minutes"] == IDLE_S
 
 
 def test_ray_up_does_what_the_page_says(tmp_path: Path) -> None:
