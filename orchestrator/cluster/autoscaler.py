@@ -142,7 +142,7 @@ def groups_of(config: Mapping[str, Any]) -> tuple[Group, ...]:
             continue
         pins = tuple(key for key in resources if key not in _STANDARD)
         accelerator = next((key[len(_ACCELERATOR) :] for key in pins if key.startswith(_ACCELERATOR)), "")
-        labels = {key: f"{value:g}" for key, value in resources.items() if key in pins and key != accelerator}
+        labels = {key: f"{resources[key]:g}" for key in pins if not key.startswith(_ACCELERATOR)}
         node_config = given.get("node_config") or {}
         instance = node_config.get("InstanceType") or node_config.get("machineType") or ""
         market = (node_config.get("InstanceMarketOptions") or {}).get("MarketType")

@@ -243,7 +243,8 @@ class Driver:
         placements = {task: attempt.placement for task, attempt in self._attempts.items()}
         running = demands.running(placements, self._clock.time())
         nodes = quarantine.usable(self._state, self._nodes)
-        placed = self._machines.place(demands.work(tasks), running, nodes)
+        waiting = demands.of(tasks)
+        placed = self._machines.place(waiting, lambda: demands.work(tasks), running, nodes)
         for task, where in placed:
             self._start(task, where)
         _LOG.debug("%d tasks wait for free resources", len(tasks) - len(placed))

@@ -1,6 +1,6 @@
 """The machines of a run, as its driver sees them from turn to turn."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
 
 from panolog.orchestrator.driver.job import Job
@@ -10,7 +10,7 @@ from panolog.orchestrator.money.prices import of_record, reserved
 from panolog.orchestrator.resources import leaving, placement, quarantine
 from panolog.orchestrator.resources.expected import Coming, Expected
 from panolog.orchestrator.resources.nodes import Node
-from panolog.orchestrator.resources.placement import Placed, Running
+from panolog.orchestrator.resources.placement import Demand, Placed, Running
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.resources.scaling import IDLE_S, Growth, Work
 from panolog.orchestrator.run.clock import Clock
@@ -53,16 +53,22 @@ class Machines:
         stays = any(other.id == node for other in leaving.staying(state, able))
         return "" if stays else state.nodes[node].host
 
-    def place(self, work: Work, running: Sequence[Running], nodes: Sequence[Node]) -> list[Placed]:
+    def place(
+        self,
+        waiting: Sequence[Demand],
+        work: Callable[[], Work],
+        running: Sequence[Running],
+        nodes: Sequence[Node],
+    ) -> list[Placed]:
         """The tasks that start now; requests the machines that the others should have.
 
-        Args: work, all tasks that wait; running, what runs; nodes that can be used.
+        Args: waiting, all tasks that wait; work, which they are; running, what runs; nodes that can be used.
         """
         growth = self._pool.growth()
-        come = self._grow(growth, work, running, nodes) if growth.groups else Coming()
+        come = self._grow(growth, work(), running, nodes) if growth.groups else Coming()
         every, busy = [*nodes, *come.nodes], [*running, *come.fill]
-        placed = placement.place(work.demands, every, busy, cuda=self._cuda)
-        idle = bool(work.demands) and not placed and not running
+        placed = placement.place(waiting, every, busy, cuda=self._cuda)
+        idle = bool(waiting) and not placed and not running
         self._explain(self._why(growth) if idle else "")
         return placed
 
