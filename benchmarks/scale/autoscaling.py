@@ -28,6 +28,7 @@ from benchmarks.scale.machines import DISTRICT, RTX_4090, WIDTH, basis_on
 from benchmarks.scale.models import PER_BLOCK
 from benchmarks.scale.places import city
 from benchmarks.scheduling import Block, recorded, simulate
+from benchmarks.three_days.cluster import VirtualClock
 from panolog.orchestrator.estimates import costs
 from panolog.orchestrator.estimates.estimate import Estimator
 from panolog.orchestrator.estimates.suggestions import balanced
@@ -93,19 +94,6 @@ class _Machine:
     gone: float = np.inf
 
 
-class _Clock:
-    now = 0.0
-
-    def time(self) -> float:
-        return self.now
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
-
-
 class Simulation:
     """One run with one autoscaler."""
 
@@ -113,7 +101,7 @@ class Simulation:
         self._case = case
         self._overhead = overhead
         self._random = np.random.default_rng(seed)
-        self._clock = _Clock()
+        self._clock = VirtualClock(0.0, 0.0)
         self._expected = Expected(self._clock)
         self._group = Group("gpu", most, cpus=8, gpus=1, accelerator="L4", memory=2**36)
         self._machines: list[_Machine] = []

@@ -6,7 +6,7 @@ from datetime import datetime
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.estimates.calibration import basis_of
-from panolog.orchestrator.money.prices import of_record, reserved
+from panolog.orchestrator.money.prices import of_record, price_by
 from panolog.orchestrator.resources import leaving, placement, quarantine
 from panolog.orchestrator.resources.expected import Coming, Expected
 from panolog.orchestrator.resources.nodes import Node
@@ -87,11 +87,7 @@ class Machines:
         budget = self._journal.state.money.budget
         prices = of_record(budget.prices) if budget else None
         settings, cuda = self._config.scaling, self._cuda
-
-        def price(node: Node) -> float | None:
-            return reserved(node, prices).price
-
-        scaling = self._expected.scaling(growth, nodes, settings.overhead, price, cuda=cuda)
+        scaling = self._expected.scaling(growth, nodes, settings.overhead, price_by(prices), cuda=cuda)
         found = self._expected.decide(scaling, work, running, nodes, settings.patience)
         if found.more:
             texts = {group.name: group.text() for group in growth.groups}
@@ -107,16 +103,14 @@ class Machines:
         if not growth.groups:
             able = placement.able(self._pool.nodes(), cuda=self._cuda)
             return "" if able else f"waiting for a machine with a {what}: the cluster has none now"
-        trouble = f"; it reports: {growth.trouble}" if growth.trouble else ""
         since = self._expected.since
         if not since:
-            return (
-                f"waiting for a machine with a {what}: Ray's autoscaler has started all that it may{trouble}"
-            )
+            why = f"waiting for a machine with a {what}: Ray's autoscaler has started all that it may"
+            return why + growth.report
         when = f"{datetime.fromtimestamp(self._expected.first).astimezone():%H:%M:%S}"
         texts = {group.name: group.text() for group in growth.groups}
         names = ", ".join(f"{len(times)} of {texts[name]}" for name, times in since.items())
-        return f"waiting for machines: {names}, requested from Ray's autoscaler at {when}{trouble}"
+        return f"waiting for machines: {names}, requested from Ray's autoscaler at {when}{growth.report}"
 
     def _explain(self, why: str) -> None:
         """Records that nothing runs, and why, or that something does again."""

@@ -114,7 +114,7 @@ def await_machine(
         if groups:
             pool.request({groups[0].name: 0 if growth.joining else 1})
             text = f"waiting for a machine: {groups[0].text()} is requested from Ray's autoscaler"
-            text += f"; it reports: {growth.trouble}" if growth.trouble else ""
+            text += growth.report
         else:
             what = "GPU" if cuda else "core"
             text = f"waiting for a machine with a {what}: the cluster has none"

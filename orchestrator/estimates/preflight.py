@@ -19,7 +19,7 @@ from panolog.orchestrator.estimates.suggestions import (
     within_memory,
 )
 from panolog.orchestrator.estimates.workers import Workers, workers
-from panolog.orchestrator.money.prices import PriceList, reserved
+from panolog.orchestrator.money.prices import PriceList, price_by
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.resources.scaling import Scaling
@@ -157,12 +157,13 @@ def _potential(
     growth, nodes = pool.growth(), pool.nodes()
     if not growth.groups:
         return nodes
-    known = {growth.members[node.id]: node for node in nodes if node.id in growth.members}
-
-    def price(node: Node) -> float | None:
-        return reserved(node, prices).price
-
-    scaling = Scaling(growth, config.device == "cuda", config.scaling.overhead, known=known, price=price)
+    scaling = Scaling(
+        growth,
+        config.device == "cuda",
+        config.scaling.overhead,
+        known=growth.described(nodes),
+        price=price_by(prices),
+    )
     estimate = _whole(scene, config, basis)
     refining = [stage.seconds for stage in estimate.stages if stage.name is Stage.BLOCK]
     return tuple(scaling.potential(_most_memory(estimate), sum(filter(None, refining)), nodes))

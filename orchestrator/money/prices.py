@@ -19,7 +19,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -104,6 +104,11 @@ def reserved(node: Node, prices: PriceList | None) -> NodeReserved:
     if prices is None:
         return NodeReserved(node.id, node.host, kind_of(node), None)
     return prices.reserved(node)
+
+
+def price_by(prices: PriceList | None) -> Callable[[Node], float | None]:
+    """What a machine costs per hour by a list; None if that is not known."""
+    return lambda node: reserved(node, prices).price
 
 
 def default_path() -> Path:

@@ -85,9 +85,7 @@ class Expected:
 
     def _review(self, growth: Growth, nodes: Sequence[Node]) -> None:
         """Takes note of which have come. Args: nodes that can be used."""
-        for node in nodes:
-            if member := growth.members.get(node.id):
-                self.known[member] = node
+        self.known |= growth.described(nodes)
         for group in growth.groups:
             present = growth.present(group)
             for _ in range(present - self._present.get(group.name, present)):

@@ -72,6 +72,15 @@ class Growth:
         """How many machines of a group there are, whether they can be used or not."""
         return sum(name == group.name for name in self.members.values())
 
+    def described(self, nodes: Sequence[Node]) -> dict[str, Node]:
+        """The last machine of each group that is among some, by the name of the group."""
+        return {self.members[node.id]: node for node in nodes if node.id in self.members}
+
+    @property
+    def report(self) -> str:
+        """`trouble` as the end of a sentence; "" without any."""
+        return f"; it reports: {self.trouble}" if self.trouble else ""
+
 
 NO_GROWTH = Growth()
 Price = Callable[[Node], float | None]  # per hour
@@ -165,7 +174,7 @@ class Scaling:
         found = list(nodes)
         for group in self.preferred(need):
             room = group.most - self.growth.present(group)
-            count = min(room, max(self.affordable(whole), 1) - len(found))
+            count = min(room, self.affordable(whole) - len(found))
             found += [self.node(group, number) for number in range(count)]
         return found
 
