@@ -1,11 +1,11 @@
 """Whether anything was lost, doubled or recorded out of order in a simulated run."""
 
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from benchmarks.three_days.faults import Period
 from benchmarks.three_days.life import Paths
 from benchmarks.three_days.load import HOUR, Load
 from panolog.orchestrator.run.records import (
@@ -24,9 +24,6 @@ from panolog.scene.files import SUFFIX
 from panolog.scene.ply import ply_header
 from panolog.workers.tasks import TaskId
 
-LAST_S = (
-    60.0  # seconds before a kill of the driver whose messages may be unrecorded: the tasks send them again
-)
 # The record that follows each message of a worker.
 _KINDS: dict[str, type[object]] = {
     "Hello": TaskStarted,
@@ -69,34 +66,40 @@ def read_sent(paths: Paths) -> list[Sent]:
 
 
 def wrong(sent: Sequence[Sent], records: Sequence[Stored], lives: Sequence[Life]) -> Iterator[str]:
-    """What was lost, doubled, or recorded out of order, one line each."""
-    kills = [Period(life.end - LAST_S, life.end + 1) for life in lives if life.killed]
-    by_task: dict[TaskId, list[Sent]] = {}
+    """What was lost, doubled, or recorded out of order, one line each.
+
+    Args: records, of the whole run; the first is that of the first driver's start.
+    """
+    epoch, begins = records[0].time - lives[0].begin, [life.begin for life in lives]
+    attempts: dict[tuple[TaskId, int], tuple[list[Sent], list[Record]]] = {}
     for line in sent:
         if line.kind in _KINDS:
-            by_task.setdefault(line.task, []).append(line)
-    recorded: dict[TaskId, list[Record]] = {}
+            number = bisect_right(begins, line.time) - 1
+            attempts.setdefault((line.task, number), ([], []))[0].append(line)
     for stored in records:
         if isinstance(stored.record, tuple(_KINDS.values())) and isinstance(stored.record.task, TaskId):
-            recorded.setdefault(stored.record.task, []).append(stored.record)
-    for task in by_task.keys() | recorded.keys():
-        yield from _wrong_of(task, by_task.get(task, []), recorded.get(task, []), kills)
+            number = bisect_right(begins, stored.time - epoch) - 1
+            attempts.setdefault((stored.record.task, number), ([], []))[1].append(stored.record)
+    for (task, number), (lines, recorded) in attempts.items():
+        yield from _wrong_of(task, lines, recorded, lives[number])
     # The last progress of a task is stored with its result, under its own time.
     others = [stored for stored in records if not isinstance(stored.record, Progressed)]
     if any(a.time > b.time for a, b in pairwise(others)):
         yield "records are not in the order of time"
 
 
-def _wrong_of(
-    task: TaskId, sent: Sequence[Sent], records: Sequence[Record], kills: Sequence[Period]
-) -> Iterator[str]:
-    """The same of one task: both are read side by side."""
+def _wrong_of(task: TaskId, sent: Sequence[Sent], records: Sequence[Record], life: Life) -> Iterator[str]:
+    """The same of one task with one driver: both are read side by side.
+
+    A driver records what it has taken before the simulated clock goes on. So a kill can lose the messages of
+    the last moment alone, and nothing of the task is recorded after them; its next attempt sends them again.
+    """
     left = list(reversed(records))
     for line in sent:
         kind = _KINDS[line.kind]
         if left and type(left[-1]) is kind and _iteration(left[-1], line.value) == line.value:
             left.pop()
-        elif kind not in _THINNED and not any(period.has(line.time) for period in kills):
+        elif kind not in _THINNED and (left or not life.killed or line.time < life.end):
             yield f"{task}: {line.kind} {line.value} of {line.time / HOUR:.3f} h is not recorded"
     for record in left:
         yield f"{task}: {type(record).__name__} is recorded, but was not sent: {record}"

@@ -71,6 +71,7 @@ class SimulatedCluster(InProcess):
     def __init__(self, clock: VirtualClock, load: Load, plan: Plan, log: Path) -> None:
         self.cpu = 0.0  # seconds used by the simulation itself
         self.messages = 0  # delivered
+        self.on_message: Callable[[Message], None] = ignore  # called with each, when it is in the log
         self._clock, self._load, self._plan = clock, load, plan
         self._seconds = load.block_seconds(plan.speed)
         self._places: dict[str, Place] = {}  # by node, of GPU 0
@@ -157,6 +158,7 @@ class SimulatedCluster(InProcess):
             del self._running[task]
         else:
             running.due, running.message = next(running.messages)
+        self.on_message(message)
         self.cpu += time.thread_time() - began
         return message
 

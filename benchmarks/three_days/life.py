@@ -10,10 +10,11 @@ import signal
 import socket
 import sqlite3
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
+from enum import Enum
 from pathlib import Path
-from threading import Timer
 from unittest.mock import patch
 
 from benchmarks.three_days import faults
@@ -24,19 +25,27 @@ from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.driver.requests import Stop
+from panolog.orchestrator.resources.pool import Hello, Message
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
-from panolog.orchestrator.run.records import RunBegan
-from panolog.orchestrator.run.state import Status
+from panolog.orchestrator.run.records import ModelSaved, RunBegan, Stored
+from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.stages.scenes import scene_of
 from panolog.scene.files import remove_partial
 
 SAMPLE_S = 600.0  # simulated seconds between two samples
 DISK_S = 7200.0  # between two measurements of the run folder: it takes 0.1 s with 60,000 files
-_LONGEST_S = 0.05  # real seconds until a SIGKILL that is due: anywhere within some turns of the driver
 STOPPED = 130
+
+
+class _Spot(Enum):
+    """Where in its work a SIGKILL that is due strikes a driver: each time at another."""
+
+    WRITING = 0  # while a file is written: of the messages since the last record some are on the disk
+    TAKEN = 1  # a worker's first message was taken, and is not recorded
+    RECORDED = 2  # a model was recorded, and its checkpoint is not removed
 
 
 @dataclass(frozen=True)
@@ -106,7 +115,8 @@ def live(paths: Paths, load: Load, epoch: float, now: float, number: int) -> Non
         began = RunBegan(socket.gethostname(), os.getpid(), number > 0, journal.state.latest)
         journal.record([began, *control.begin(folder)])
         world.sample(disk=True)
-        clock.on_tick = world.on_tick
+        clock.on_tick, cluster.on_message = world.on_tick, world.on_message
+        journal.on_change = world.on_change
         try:
             Driver(
                 Job(folder, scene_of(info, folder), info.config), journal, cluster, stop=Stop(), clock=clock
@@ -126,6 +136,10 @@ class _World:
     def __init__(self, paths: Paths, plan: faults.Plan, clock: VirtualClock, number: int) -> None:
         self._paths, self._plan, self._clock = paths, plan, clock
         self._ends = [end for end in plan.driver_ends if end[0] > clock.now]
+        kills = [fault for _, fault in plan.driver_ends if fault == Fault.DRIVER_KILLED]
+        left = [fault for _, fault in self._ends if fault == Fault.DRIVER_KILLED]
+        self._spot = _Spot((len(kills) - len(left)) % len(_Spot))  # of the next kill
+        self._doomed = False  # a kill is due
         self._sampled = self._measured = clock.now
         self._number = number
         self._holder: sqlite3.Connection | None = None
@@ -142,8 +156,19 @@ class _World:
             self.sample(disk=now - self._measured >= DISK_S)
         self._cpu += time.thread_time() - began
 
+    def on_message(self, message: Message) -> None:
+        """After a message was taken and logged."""
+        if isinstance(message, Hello):
+            self._at(_Spot.TAKEN)
+
+    def on_change(self, _: RunState, stored: Sequence[Stored]) -> None:
+        """After records were stored, and often without one."""
+        if any(isinstance(item.record, ModelSaved) for item in stored):
+            self._at(_Spot.RECORDED)
+
     def fsync(self, descriptor: int) -> None:
         """`os.fsync` on a disk that is full at times."""
+        self._at(_Spot.WRITING)
         if _within(self._plan.disk_full, self._clock.now):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._real(descriptor)
@@ -177,8 +202,12 @@ class _World:
         if fault == Fault.DRIVER_STOPPED:
             control.send(self._paths.run, "stop")
         else:
-            delay = _LONGEST_S * (hash(self._clock.now) % 97 / 97)
-            Timer(delay, os.kill, (os.getpid(), signal.SIGKILL)).start()
+            self._doomed = True
+
+    def _at(self, spot: _Spot) -> None:
+        """The driver is there."""
+        if self._doomed and spot == self._spot:
+            os.kill(os.getpid(), signal.SIGKILL)
 
     def _hold(self, locked: bool) -> None:
         """Another program takes the lock of the database, or gives it back."""

@@ -13,6 +13,7 @@ from panolog.orchestrator.run.records import (
     CheckpointSaved,
     ModelSaved,
     Record,
+    RunBegan,
     Stored,
     TaskFailed,
     TaskStarted,
@@ -39,19 +40,23 @@ def test_a_small_run_loses_nothing_through_killed_drivers_and_machines(tmp_path:
     assert not list(tmp_path.glob("days-*"))
 
 
-def sent(*kinds: tuple[str, int]) -> list[Sent]:
-    return [Sent(100.0 * i, TASK, kind, value, "") for i, (kind, value) in enumerate(kinds)]
+def sent(*kinds: tuple[str, int], begin: float = 0.0) -> list[Sent]:
+    return [Sent(begin + 100.0 * i, TASK, kind, value, "") for i, (kind, value) in enumerate(kinds)]
 
 
-def stored(*records: Record) -> list[Stored]:
-    return [Stored(i, float(i), record) for i, record in enumerate(records)]
+def stored(*records: Record, begin: float = 0.0) -> list[Stored]:
+    """Each when the message of `sent` at its place was taken; before them the start of the run."""
+    made = [Stored(i, EPOCH + begin + 100.0 * (i - 1), record) for i, record in enumerate(records, 1)]
+    return made if begin else [Stored(0, EPOCH, RunBegan("host", 1, resumed=False)), *made]
 
 
+EPOCH = 1e9
 STARTED = TaskStarted(TASK, 1, 0, "node", 1, "cuda", 4)
 SAVED = CheckpointSaved(TASK, 500, "path", 1)
 MODEL = ModelSaved(TASK, "path", 1, 1, 1000, 1.0)
 WHOLE = sent(("Hello", 0), ("Checkpoint", 500), ("Trained", 0))
 QUIET = [Life(0.0, 1000.0, killed=False)]
+KILLED = [Life(0.0, 200.0, killed=True), Life(290.0, 1000.0, killed=False)]
 
 
 def test_a_complete_history_is_right() -> None:
@@ -71,11 +76,24 @@ def test_lost_doubled_and_invented_records_are_noticed(records: tuple[Record, ..
     assert list(wrong(WHOLE, stored(*records), QUIET))
 
 
-def test_what_was_sent_just_before_a_kill_may_be_unrecorded() -> None:
-    lives = [Life(0.0, 205.0, killed=True), Life(300.0, 1000.0, killed=False)]
-    assert list(wrong(WHOLE, stored(STARTED, SAVED), lives)) == []
-    assert list(wrong(WHOLE, stored(STARTED), lives)) == [
-        "block/000: Checkpoint 500 of 0.028 h is not recorded"
+def test_a_kill_loses_the_messages_of_its_moment_alone() -> None:
+    assert list(wrong(WHOLE, stored(STARTED, SAVED), KILLED)) == []
+    lost = "block/000: Checkpoint 500 of 0.028 h is not recorded"
+    assert list(wrong(WHOLE, stored(STARTED), KILLED)) == [lost]
+    assert list(wrong(WHOLE, stored(STARTED, SAVED), QUIET)) == [
+        "block/000: Trained 0 of 0.056 h is not recorded"
+    ]
+
+
+def test_what_a_kill_has_lost_is_not_taken_for_what_the_next_driver_was_sent() -> None:
+    """The next one takes the same message again, and must record it."""
+    lost = [Life(0.0, 0.0, killed=True), Life(90.0, 1000.0, killed=False)]
+    lines = [*sent(("Hello", 0)), *sent(("Hello", 0), ("Trained", 0), begin=110.0)]
+    again = stored(STARTED, MODEL, begin=110.0)
+    assert list(wrong(lines, [*stored(), *again], lost)) == []
+    assert list(wrong(lines, [*stored(STARTED), *again], lost)) == []
+    assert list(wrong(lines, [*stored(STARTED), *again[1:]], lost)) == [
+        "block/000: Hello 0 of 0.031 h is not recorded"
     ]
 
 
