@@ -26,6 +26,7 @@ from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
+from tests.prepare.sfm.accuracy import drift, length
 
 Array = NDArray[np.float64]
 HEAD = (
@@ -115,24 +116,6 @@ def _accuracy(
     error = float(np.concatenate(found.errors(scene.width)).mean())
     percent = 100 * drift(found.centers, truth) / length(truth)
     return Accuracy(name, len(found.rows), percent, worst, error, contradictions, *spent.tolist())
-
-
-def length(centers: Array) -> float:
-    """Length of the path through positions (K, 3) in their order."""
-    return float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
-
-
-def drift(found: Array, truth: Array) -> float:
-    """Root mean square distance of positions (K, 3) from the true ones, after the best similarity.
-
-    The similarity minimises the squared distances (Umeyama, 1991).
-    """
-    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
-    left, sizes, right = np.linalg.svd(b.T @ a)
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    scale = (sizes * np.diag(sign)).sum() / (a**2).sum()
-    moved = scale * a @ (left @ sign @ right).T
-    return float(np.sqrt(((moved - b) ** 2).sum(axis=1).mean()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

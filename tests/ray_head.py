@@ -1,13 +1,15 @@
-"""A Ray head of its own with its job server, metrics and a token, as a cluster's head node has them."""
+"""Ray on this machine: a head with its job server, metrics and a token, and what clusters have in common."""
 
+import ctypes
 import os
 import secrets
+import socket
 import subprocess
 import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,9 +17,10 @@ from tempfile import TemporaryDirectory
 import psutil
 import pytest
 
-from benchmarks.chaos.cluster import free_ports
-
 BIN = Path(sys.executable).parent
+_RECOVERY = Path(__file__).parents[1] / "deploy" / "recovery.env"  # how soon Ray notices a lost process
+_SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER of prctl(2)
+_TIMEOUT_S = 120.0  # for processes to end
 _REPORTS = '{"metrics_report_interval_ms": 500}'
 
 
@@ -43,6 +46,44 @@ def environment() -> dict[str, str]:
         "OMP_NUM_THREADS": "1",
         "RAY_USAGE_STATS_ENABLED": "0",
     }
+
+
+def recovery() -> dict[str, str]:
+    """The settings that deploy/ recommends."""
+    lines = _RECOVERY.read_text().splitlines()
+    return dict(line.split("=", 1) for line in lines if line and not line.startswith("#"))
+
+
+def cluster_environment() -> dict[str, str]:
+    """That of the nodes and drivers of a new cluster: with a token of its own and the settings of deploy/."""
+    token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    return environment() | recovery() | token
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports that no process listens on, all different."""
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for one in sockets:
+            one.bind(("127.0.0.1", 0))
+        return [one.getsockname()[1] for one in sockets]
+
+
+@contextmanager
+def all_end() -> Iterator[None]:
+    """Ends all processes that begin meanwhile below this one, also those that their parents leave behind."""
+    before = {process.pid for process in psutil.Process().children(recursive=True)}
+    prctl = ctypes.CDLL(None).prctl
+    prctl(_SUBREAPER, 1)  # orphans become ours, so that we can wait for them
+    try:
+        yield
+    finally:
+        while new := [it for it in psutil.Process().children(recursive=True) if it.pid not in before]:
+            for process in new:
+                with suppress(psutil.NoSuchProcess):  # its parent has waited for it meanwhile
+                    process.kill()
+            psutil.wait_procs(new, timeout=_TIMEOUT_S)
+        prctl(_SUBREAPER, 0)
 
 
 def wait_until(holds: Callable[[], object], what: str, seconds: float = 120) -> None:

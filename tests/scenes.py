@@ -1,6 +1,7 @@
-"""Tiny scenes on disk: a ring of panoramas with random pixels among random points."""
+"""Tiny scenes on disk, a ring of panoramas with random pixels among random points; and copies of scenes."""
 
-from collections.abc import Sequence
+import shutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -9,8 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from panolog.scene.colmap import Observations, write_colmap
+from panolog.scene.model import Scene
+from panolog.scene.write import require_new
 
 WIDTH, HEIGHT = 64, 32
+Change = Callable[[str, NDArray[np.uint8]], NDArray[np.uint8]]  # name and picture (H, W, 3) BGR
 
 
 def write_scene(root: Path, *, names: Sequence[str] = (), points: int = 50, seed: int = 0) -> Path:
@@ -57,3 +61,23 @@ def write_image(path: Path, random: np.random.Generator, size: tuple[int, int] =
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix if cv2.haveImageWriter(path.name) else ".png"
     path.write_bytes(bytes(cv2.imencode(suffix, random.integers(0, 256, (size[1], size[0], 3), np.uint8))[1]))
+
+
+def copy_scene(scene: Scene, output: Path, change: Change) -> None:
+    """Writes the scene to a new folder, with all pictures changed and kept without loss.
+
+    Raises OSError if the disk takes no file, InputError if `output` exists or a picture is not PNG.
+    """
+    require_new(output)
+    images = next(name for name in ("images", "imgs") if (scene.root / name).is_dir())
+    shutil.copytree(scene.root, output, ignore=shutil.ignore_patterns(images, "depth_truth.json"))
+    for panorama in scene.panoramas:
+        path = output / images / panorama.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        picture = cv2.imread(str(panorama.image), cv2.IMREAD_COLOR)
+        assert picture is not None
+        if path.suffix.lower() == ".png":
+            cv2.imwrite(str(path), change(panorama.name, np.asarray(picture, np.uint8)))
+        else:
+            quality = [cv2.IMWRITE_JPEG_QUALITY, 98]
+            cv2.imwrite(str(path), change(panorama.name, np.asarray(picture, np.uint8)), quality)

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.captures.copies import copy_scene
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
+from tests.scenes import copy_scene
 
 TRUTH = "gains.json"
 PERIODS = (8, 13, 21, 34)  # panoramas: a camera follows the sky within seconds of a walk

@@ -1,13 +1,10 @@
 """A Ray cluster of several nodes on this machine, of which all processes may fail."""
 
-import ctypes
-import os
-import secrets
 import socket
 import subprocess
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -15,27 +12,15 @@ import psutil
 
 from benchmarks.chaos.cable import Cable, laid
 from benchmarks.chaos.shim import Control, build
-from benchmarks.runs import BIN
 from panolog.scene.errors import RunError
+from tests.ray_head import BIN, all_end, cluster_environment, free_ports
 
 HEAD, SECOND, DRIVER = GROUPS = "head", "second", "driver"  # of processes that have faults in common
 THIRD, FOURTH = "third", "fourth"
-_RECOVERY = Path(__file__).parents[2] / "deploy" / "recovery.env"  # how soon Ray notices a lost process
 _TMP = "/tmp"  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _NO_WORK = ("ray::IDLE", "ray::Agent", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
-_SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER of prctl(2)
-_TIMEOUT_S = 120.0  # for a node to start, and for processes to end
+_TIMEOUT_S = 120.0  # for a node to start
 _POLL_S = 0.05  # between two checks of a process table or a port
-
-
-def environment(token: str) -> dict[str, str]:
-    """Environment of nodes and drivers: ours without Ray's variables, one thread, and deploy/recovery.env."""
-    ours = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-    lines = [line for line in _RECOVERY.read_text().splitlines() if line and not line.startswith("#")]
-    recovery = dict(line.split("=", 1) for line in lines)
-    path = f"{BIN}:{os.environ['PATH']}"
-    fixed = {"PATH": path, "OMP_NUM_THREADS": "1", "RAY_USAGE_STATS_ENABLED": "0"}
-    return ours | recovery | fixed | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token}
 
 
 @contextmanager
@@ -53,16 +38,12 @@ def started(
     cable: Cable | None, cores: Mapping[str, int], variables: Mapping[str, Mapping[str, str]] | None = None
 ) -> Iterator["LocalCluster"]:
     """A cluster for as long as the context lasts. Args: as `LocalCluster`. Raises as `two_nodes`."""
-    # The children of a killed node or driver become ours, so that we can wait for them and end them.
-    ctypes.CDLL(None).prctl(_SUBREAPER, 1)
     with TemporaryDirectory(prefix="chaos-", dir=_TMP, ignore_cleanup_errors=True) as folder:
         cluster = LocalCluster(Path(folder), cable, cores, variables or {})
-        try:
+        with all_end():  # the children of a killed node or driver too
             cluster.keep()
             cluster.wait()
             yield cluster
-        finally:
-            end_children()
 
 
 class LocalCluster:
@@ -83,7 +64,7 @@ class LocalCluster:
         self._folder = folder
         self.cable = cable
         (self._port,) = free_ports(1)
-        self._environment = environment(secrets.token_hex(32))
+        self._environment = cluster_environment()
         self._library = build(folder)
         self._cores, self._variables = cores, variables
         self.controls = {name: Control(folder / f"{name}.control") for name in (*cores, DRIVER)}
@@ -182,21 +163,3 @@ def _busy(process: psutil.Process) -> bool:
 def _answers(host: str, port: int) -> bool:
     with socket.socket() as client:
         return client.connect_ex((host, port)) == 0
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports that no process listens on, all different."""
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [one.getsockname()[1] for one in sockets]
-
-
-def end_children() -> None:
-    """Ends all processes below this one, also those that their parents have left behind."""
-    while processes := psutil.Process().children(recursive=True):
-        for process in processes:
-            with suppress(psutil.NoSuchProcess):  # its parent has waited for it meanwhile
-                process.kill()
-        psutil.wait_procs(processes, timeout=_TIMEOUT_S)

@@ -27,7 +27,6 @@ import psutil
 from benchmarks import report
 from benchmarks.chaos.cable import laid
 from benchmarks.chaos.cluster import DRIVER, FOURTH, HEAD, SECOND, THIRD, LocalCluster, started
-from benchmarks.chaos.metadata import Metadata, metadata
 from benchmarks.chaos.notice_costs import LIMIT_S, NoticeCost, notice_cost
 from benchmarks.runs import BIN, history
 from panolog.orchestrator.resources.metadata import VARIABLE
@@ -36,6 +35,7 @@ from panolog.orchestrator.run.records import Progressed, TaskStarted
 from panolog.scene.errors import RunFolderError
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import Stage
+from tests.metadata_service import Metadata, metadata
 
 HEADER = (
     *("run", "nodes", "notice s", "task", "noticed after s", "checkpoint s", "started elsewhere after s"),

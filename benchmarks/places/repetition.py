@@ -21,11 +21,11 @@ import numpy as np
 from benchmarks import report
 from benchmarks.places.layouts import LAYOUTS
 from benchmarks.places.shoot import Walk, as_video, shoot
-from benchmarks.sfm import drift, length
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
+from tests.prepare.sfm.accuracy import drift, length
 
 KINDS = ("photographs", "shuffled", "video")
 _RIGHT = 0.2  # percent of the way

@@ -1,8 +1,6 @@
 """A Ray cluster whose autoscaler starts and ends nodes on this machine."""
 
-import ctypes
 import json
-import secrets
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,13 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.chaos.cluster import end_children, environment, free_ports
-from benchmarks.runs import BIN
+from tests.ray_head import BIN, all_end, cluster_environment, free_ports
 
 _HEAD = f"{'f' * 51}00000"  # Node.id, by which Ray's provider of local nodes knows the head
 _HEAD_TYPE = "ray.head.default"
 _PROVIDER = "ray.autoscaler._private.fake_multi_node.node_provider.FakeMultiNodeProvider"
-_SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER of prctl(2)
 _UNUSED = (
     *("initialization_commands", "setup_commands", "head_setup_commands", "worker_setup_commands"),
     *("head_start_ray_commands", "worker_start_ray_commands"),
@@ -29,10 +25,9 @@ def autoscaled(most: int, idle: float = 5.0) -> Iterator[tuple[str, dict[str, st
 
     Args: most, nodes of one core that its autoscaler starts; idle, seconds after which it ends one.
     """
-    ctypes.CDLL(None).prctl(_SUBREAPER, 1)  # its processes become ours, so that we can end them
     (port,) = free_ports(1)
     address = f"127.0.0.1:{port}"
-    variables = environment(secrets.token_hex(32)) | {"RAY_enable_autoscaler_v2": "1"}
+    variables = cluster_environment() | {"RAY_enable_autoscaler_v2": "1"}
     fake = {"RAY_FAKE_CLUSTER": "1", "AUTOSCALER_UPDATE_INTERVAL_S": "1"}
     fake |= {"RAY_CLOUD_INSTANCE_ID": _HEAD, "RAY_OVERRIDE_NODE_ID_FOR_TESTING": _HEAD}
     with TemporaryDirectory(prefix="scaled-", dir="/tmp", ignore_cleanup_errors=True) as folder:
@@ -42,11 +37,9 @@ def autoscaled(most: int, idle: float = 5.0) -> Iterator[tuple[str, dict[str, st
         command += ["--num-cpus=0", f"--autoscaling-config={config}", f"--temp-dir={folder}"]
         command += ["--min-worker-port=0", "--max-worker-port=0", "--object-store-memory=100000000"]
         command += ["--include-dashboard=false"]
-        try:
+        with all_end():
             subprocess.run(command, env=variables | fake, check=True, stdout=sys.stderr)
             yield address, variables
-        finally:
-            end_children()
 
 
 def _config(address: str, most: int, idle: float) -> dict[str, object]:

@@ -5,6 +5,8 @@ import os
 import subprocess
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -12,15 +14,16 @@ import yaml
 from ray.autoscaler._private.kuberay.autoscaling_config import _derive_autoscaling_config_from_ray_cr
 from ray.autoscaler.v2.schema import ClusterStatus, LaunchRequest
 
-from benchmarks.processes import in_fresh_process
-from benchmarks.runs import BIN, history
 from panolog.orchestrator.cluster import autoscaler
 from panolog.orchestrator.cluster.autoscaler import groups_of, read_config
 from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.resources.scaling import Group, Growth
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Preparing, TaskFailed
+from panolog.orchestrator.run.store import read_records
 from panolog.synthetic.make import make_town
 from tests.orchestrator.cluster.autoscaled import autoscaled
+from tests.ray_head import BIN
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 
@@ -123,7 +126,9 @@ def test_machines_come_as_requested_and_go_when_they_are_idle(
     address, variables = cluster
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    assert in_fresh_process(come_and_go, address, tmp_path) == [
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+        said = process.submit(come_and_go, address, tmp_path).result()
+    assert said == [
         f"0 of {Growth((Group('small', 2, 1),))}",
         *("2 nodes, 2 of the group", "0 nodes, 0 of the group", "1 nodes, 1 of the group"),
     ]
@@ -142,7 +147,7 @@ def test_a_run_begins_without_a_machine(cluster: tuple[str, dict[str, str]], tmp
         [*command, str(root), "--address", address], env=env, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    records = [stored.record for stored in history(root)]
+    records = [stored.record for stored in read_records(RunFolder(root).database)]
     steps = [record.step for record in records if isinstance(record, Preparing)]
     assert "waiting for a machine: small (1 core) is requested from Ray's autoscaler" in steps
     assert json.loads((root / "preflight.json").read_text())["basis"]["joined"] > 0

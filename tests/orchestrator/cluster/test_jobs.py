@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.chaos.cluster import free_ports
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.cluster.jobs import ClusterJob
 from panolog.orchestrator.run.config import as_settings, load_config
@@ -25,7 +24,7 @@ from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.follower.receivers import receiver
 from tests.orchestrator.messages import without_progress
-from tests.ray_head import BIN, Head, ray_head, read, wait_until
+from tests.ray_head import BIN, Head, free_ports, ray_head, read, wait_until
 
 pytestmark = pytest.mark.system
 

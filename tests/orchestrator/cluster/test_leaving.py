@@ -9,7 +9,6 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from benchmarks.chaos.metadata import Metadata, metadata
 from panolog.orchestrator.cluster import agents
 from panolog.orchestrator.cluster.leave import leave, raylets
 from panolog.orchestrator.cluster.pool import RayPool
@@ -19,6 +18,7 @@ from panolog.orchestrator.resources.pool import Ended, Hello, Message
 from panolog.orchestrator.run.records import Leaving
 from panolog.scene.errors import ClusterError
 from panolog.workers.events import Checkpoint
+from tests.metadata_service import Metadata, metadata
 from tests.orchestrator.scripted import TASK, Works
 
 pytestmark = pytest.mark.system

@@ -24,11 +24,10 @@ from panolog.orchestrator.run.store import read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from tests.orchestrator.cluster.hosts import Hosts, NoHostsError
-from tests.ray_head import BIN, environment, wait_until
+from tests.ray_head import BIN, environment, recovery, wait_until
 
 pytestmark = pytest.mark.system
 
-REPOSITORY = Path(__file__).resolve().parents[3]
 HEAD, ADDRESS = "10.77.0.1", "10.77.0.1:6379"
 WORKERS = {"one": "10.77.0.2", "two": "10.77.0.3"}
 SETTINGS: tuple[str, ...] = ("--iterations", "60", "--device", "cpu")
@@ -136,12 +135,6 @@ class Cluster:
         command += ["--object-store-memory=100000000", f"--temp-dir={self.folder / host}"]
         with self.log(host).open("w") as output:
             self.hosts.launch(host, *command, env=self.environment, stdout=output, stderr=output)
-
-
-def recovery() -> dict[str, str]:
-    """The settings that deploy/ recommends."""
-    lines = (REPOSITORY / "deploy" / "recovery.env").read_text().splitlines()
-    return dict(line.split("=", 1) for line in lines if line and not line.startswith("#"))
 
 
 @contextmanager

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.chaos.metadata import NAME, Metadata, metadata
 from panolog.orchestrator.resources import metadata as module
 from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.metadata import (
@@ -22,6 +21,7 @@ from panolog.orchestrator.resources.metadata import (
 )
 from panolog.orchestrator.resources.watch import Watch
 from panolog.orchestrator.run.records import Leaving
+from tests.metadata_service import NAME, Metadata, metadata
 
 REBALANCE = "/latest/meta-data/events/recommendations/rebalance"
 PREEMPTED = "/computeMetadata/v1/instance/preempted"

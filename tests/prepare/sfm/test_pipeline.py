@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.sfm import drift
 from panolog.prepare.sfm import pairs
 from panolog.prepare.sfm.pipeline import (
     SfmSettings,
@@ -23,6 +22,7 @@ from panolog.prepare.sfm.report import SfmReport
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
+from tests.prepare.sfm.accuracy import drift
 from tests.prepare.video.containers import add_spherical, add_track, equirectangular
 from tests.prepare.video.sensors import gps5, grav, payload
 from tests.prepare.video.videos import Shot, render, walk, write_video

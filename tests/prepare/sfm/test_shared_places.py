@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.sfm import drift, length
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
 from panolog.prepare.sfm.report import SfmReport
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
 from tests.data import reduced, shared
+from tests.prepare.sfm.accuracy import drift, length
 
 pytestmark = pytest.mark.system
 

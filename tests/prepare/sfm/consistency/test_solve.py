@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.sfm import drift, length
 from panolog.prepare.sfm.consistency.contradictions import consistent_part, is_trusted
 from panolog.prepare.sfm.consistency.solve import Solution, solve
 from panolog.prepare.sfm.workspace import silence_colmap
 from panolog.scene.write import no_progress
+from tests.prepare.sfm.accuracy import drift, length
 from tests.prepare.sfm.consistency.simulated import SIZE, Square, square
 
 pytestmark = pytest.mark.system
