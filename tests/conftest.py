@@ -11,6 +11,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before torch is imported: the process
 import pytest
 from hypothesis import settings
 
+from tests import leaks
+
 _DURATIONS = Path(__file__).with_name(
     "durations.json"
 )  # seconds of each file that takes long, in `make test`
@@ -29,6 +31,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help=f"record the slow files of this run in {_DURATIONS.name}",
     )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Checks after each test that nothing of it is left."""
+    leaks.configure(config)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
