@@ -9,7 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from panolog.orchestrator.commands.delivery import deliver
 from panolog.orchestrator.driver.driver import Driver, Hooks
@@ -26,8 +25,6 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Failure, RunBegan
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import Database, read_milestones, read_records
-from panolog.orchestrator.views.plan_picture import write_plan_picture
-from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import (
@@ -220,11 +217,8 @@ class Harness:
         self.pool, self.stop = FakePool(script, self.nodes), Stop()
         with closing(Database(self.folder.database, self.clock)) as database:
             database.append([RunBegan("host", 1, resumed)])
-            journal, hooks = Journal(database, clock=self.clock), Hooks(self._draw, deliver)
+            journal, hooks = Journal(database, clock=self.clock), Hooks(deliver=deliver)
             return Driver(self.job, journal, self.pool, hooks, self.stop, self.clock).run()
-
-    def _draw(self, plan: Plan, means: NDArray[np.float32]) -> None:
-        write_plan_picture(self.folder.plan_picture, plan, means)
 
     def attempts(self, task: TaskId) -> list[tuple[Placement, TaskSpec]]:
         """Placement and spec of each attempt of the last driver at a task."""

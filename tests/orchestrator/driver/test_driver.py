@@ -50,7 +50,7 @@ def test_a_run_ends_with_everything_in_its_place(harness: Harness) -> None:
     assert [where.threads for where, spec in harness.pool.started if spec.task.stage is Stage.BLOCK] == [1, 1]
     assert (state.outcome, state.metrics) == ("done", {"psnr": 24.0, "lpips": None})
     assert ply_header(harness.folder.point_cloud) == (202, 2)
-    for path in (harness.folder.plan, harness.folder.plan_picture, harness.folder.scores):
+    for path in (harness.folder.plan, harness.folder.scores):
         assert path.is_file()
     assert len(list(harness.folder.images.iterdir())) == len(harness.job.scene.test)
     assert not list(harness.folder.root.rglob("checkpoint.safetensors"))
