@@ -1,6 +1,7 @@
-"""A run that learns exposures, poses and movers, killed in Stage I, in Stage II and in the evaluation."""
+"""A run that learns exposures, poses and movers, interrupted in Stage I, in Stage II and in the evaluation."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -8,36 +9,31 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.captures.copies import copy_scene
+from panolog.orchestrator.commands import session
+from panolog.orchestrator.driver.local_pool import local_pool
+from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import TaskStarted
+from panolog.orchestrator.run.records import CheckpointSaved, Stored, TaskStarted, ViewEvaluated
+from panolog.orchestrator.run.state import OnChange, RunState, ignore
 from panolog.orchestrator.run.store import read_records
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, EVAL, TaskId
-from tests.orchestrator.whole_runs.test_whole_runs import (
-    SETTINGS,
-    Accident,
-    Ended,
-    end_of,
-    launch,
-    state_of,
-    wait_for_workers,
-)
+from tests.scenes import copy_scene
+from tests.scenes import copy_scene
 
 pytestmark = pytest.mark.system
 
-WIDTH = 128
-LEARNING = ("exposure.learn=true", "poses.refine=true", "movers.weigh=true")
-EARLY = ("iterations=100", "exposure.begin=0.1", "poses.begin=0.1", "poses.visits=0", "movers.factor=1.2")
-OPTIONS = (*SETTINGS, *(word for setting in (*LEARNING, *EARLY) for word in ("--set", setting)))
-BLOCK = TaskId.block(0)
-KILLED: list[list[Accident]] = [  # of a driver after the other
-    [("CheckpointSaved", str(COARSE), "worker", 9), ("CheckpointSaved", str(COARSE), "driver", 9)],
-    [("CheckpointSaved", str(COARSE), "driver", 9)],
-    [("CheckpointSaved", str(BLOCK), "worker", 9), ("CheckpointSaved", str(BLOCK), "driver", 9)],
-    [("ViewEvaluated", str(EVAL), "worker", 9), ("ViewEvaluated", str(EVAL), "driver", 9)],
-]
+WIDTH, BLOCK = 128, TaskId.block(0)
+CONFIG = load_config(
+    sets=(
+        *("iterations=100", "sky.count=100", "checkpoint.every=20", "checkpoint.share=1", "device=cpu"),
+        *("densify.start=10", "densify.every_floor=5", "exposure.learn=true", "exposure.begin=0.1"),
+        *("poses.refine=true", "poses.begin=0.1", "poses.visits=0"),
+        *("movers.weigh=true", "movers.factor=1.2"),
+    )
+)
+INTERRUPTED = [(CheckpointSaved, COARSE), (CheckpointSaved, BLOCK), (ViewEvaluated, EVAL)]
 
 
 def write_walk(folder: Path) -> Path:
@@ -55,48 +51,57 @@ def write_walk(folder: Path) -> Path:
     return folder / "walk"
 
 
+def interrupt(kind: type, task: TaskId) -> OnChange:
+    """Ends a driver at the first record of a kind; its workers are killed where they are."""
+
+    def show(_: RunState, news: Sequence[Stored]) -> None:
+        if any(isinstance(it.record, kind) and it.record.task == task for it in news):
+            raise KeyboardInterrupt
+
+    return show
+
+
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended, Path]:
-    """An undisturbed run, how it ended, and the folder of one that was killed again and again."""
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, RunFolder]:
+    """An undisturbed run, and one that was interrupted again and again."""
     folder = tmp_path_factory.mktemp("captured")
-    scene, calm, killed = write_walk(folder), folder / "calm", folder / "killed"
-    undisturbed = launch("run", scene, "-o", calm, *OPTIONS)
-    for number, accidents in enumerate(KILLED):
-        command = ("resume", killed) if number else ("run", scene, "-o", killed, *OPTIONS)
-        end = end_of(launch(*command, accidents=accidents))
-        assert end.code == -9, end.stderr
-        wait_for_workers(killed)
-    end = end_of(launch("resume", killed))
-    assert end.code == 0, end.stderr
-    return calm, end_of(undisturbed), killed
+    scene, calm, disturbed = write_walk(folder), RunFolder(folder / "calm"), RunFolder(folder / "disturbed")
+    with local_pool() as pool:
+        session.start(scene, calm.root, CONFIG, None, ignore, pool)
+    for number, (kind, task) in enumerate(INTERRUPTED):
+        show = interrupt(kind, task)
+        with local_pool() as pool, pytest.raises(KeyboardInterrupt):
+            if number:
+                session.resume(disturbed.root, None, show, pool)
+            else:
+                session.start(scene, disturbed.root, CONFIG, None, show, pool)
+    with local_pool() as pool:
+        assert session.resume(disturbed.root, None, ignore, pool).outcome == "done"
+    return calm, disturbed
 
 
-def files_of(root: Path) -> dict[str, bytes]:
+def files_of(folder: RunFolder) -> dict[str, bytes]:
     """What a run has made of its scene and learnt, besides times and places."""
-    folder = RunFolder(root)
     learnt = [folder.measured, folder.captured(COARSE), folder.exposure, folder.poses, folder.mover_shares]
     models = [folder.point_cloud, folder.model(COARSE), folder.model(BLOCK), folder.plan]
     found = [*learnt, *models, folder.metrics, folder.seams]
     for place in (folder.movers, folder.sparse, folder.images):
         found += [path for path in sorted(place.rglob("*")) if path.is_file()]
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in found}
+    return {path.relative_to(folder.root).as_posix(): path.read_bytes() for path in found}
 
 
-def test_what_was_killed_everywhere_ends_with_the_same_bytes(runs: tuple[Path, Ended, Path]) -> None:
-    calm, end, killed = runs
-    assert (end.code, end.stdout) == (0, ""), end.stderr
-    assert "Traceback" not in end.stderr
-    attempts = [
-        s.record.task for s in read_records(RunFolder(killed).database) if isinstance(s.record, TaskStarted)
-    ]
-    assert all(attempts.count(task) >= 3 for task in (COARSE, BLOCK, EVAL))
-    ours, theirs = files_of(killed), files_of(calm)
+def test_what_was_interrupted_everywhere_ends_with_the_same_bytes(runs: tuple[RunFolder, RunFolder]) -> None:
+    calm, disturbed = runs
+    records = [stored.record for stored in read_records(disturbed.database)]
+    attempts = [record.task for record in records if isinstance(record, TaskStarted)]
+    assert all(attempts.count(task) == 2 for task in (COARSE, BLOCK, EVAL))
+    ours, theirs = files_of(disturbed), files_of(calm)
     assert [name for name in theirs if ours[name] != theirs[name]] == []
-    assert not list(killed.rglob("*.part"))
+    assert not list(disturbed.root.rglob("*.part"))
 
 
-def test_all_three_were_learnt(runs: tuple[Path, Ended, Path]) -> None:
-    folder = RunFolder(runs[0])
+def test_all_three_were_learnt(runs: tuple[RunFolder, RunFolder]) -> None:
+    folder, _ = runs
     stops = {each["name"]: each["stops"] for each in json.loads(folder.exposure.read_text())["panoramas"]}
     assert np.std(list(stops.values())) > 0.1
     moves = json.loads(folder.poses.read_text())["panoramas"]
@@ -105,4 +110,3 @@ def test_all_three_were_learnt(runs: tuple[Path, Ended, Path]) -> None:
     assert shares["street_003.png"] > 0
     fitted = json.loads(folder.metrics.read_text())["pose_fit"]
     assert set(fitted["views"]) == {"street_000.png", "street_008.png"}
-    assert state_of(runs[2]).outcome == "done"
