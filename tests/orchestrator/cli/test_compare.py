@@ -1,30 +1,15 @@
 """`panolog compare`, and `panolog report` of several runs: what they print, and how they fail."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
 
-from panolog.orchestrator.cli import app
 from panolog.orchestrator.run.folder import RunFolder
-from tests.orchestrator.messages import without_progress
+from tests.orchestrator.cli.program import call, one_line, shown
 from tests.orchestrator.views.comparison.runs import metrics, write
 
 ESCAPE = "\x1b[31m\x1b]0;title\x07red"
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(app.app, [str(argument) for argument in arguments])
-
-
-def one_line(result: Result) -> str:
-    assert (result.exit_code, result.stdout) == (2, ""), result.output
-    (line,) = without_progress(result.stderr)
-    return line
 
 
 @pytest.fixture
@@ -60,9 +45,7 @@ def test_what_is_not_fair_is_one_line_each(two: tuple[RunFolder, RunFolder], tmp
 
 
 def test_json_is_one_object(two: tuple[RunFolder, RunFolder]) -> None:
-    result = call("compare", *(folder.root for folder in two), "--json")
-    content: dict[str, Any] = json.loads(result.stdout)
-    assert (result.exit_code, result.stderr) == (0, "")
+    content = shown("compare", *(folder.root for folder in two))
     assert [run["name"] for run in content["runs"]] == ["paper", "panolog"]
     assert content["runs"][1]["metrics"]["ws_psnr"]["better"] == 2
     assert {setting["key"] for setting in content["settings"]} >= {"seed", "recipe"}
@@ -111,13 +94,3 @@ def test_a_name_is_no_command_to_the_terminal(two: tuple[RunFolder, RunFolder], 
     assert "\x1b" not in result.stdout
     assert "\x07" not in result.stdout
     assert "[bold]x[/bold]" in result.stdout
-
-
-def test_it_imports_neither_torch_nor_ray(two: tuple[RunFolder, RunFolder]) -> None:
-    roots = [str(folder.root) for folder in two]
-    script = (
-        "import sys; from panolog.orchestrator.cli.app import app\n"
-        f"app(['compare', *{roots!r}], standalone_mode=False)\n"
-        "assert not {'torch', 'ray', 'cv2'} & set(sys.modules), sorted(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)

@@ -1,25 +1,13 @@
-"""`panolog notify test`, and what `run` refuses before it begins."""
+"""`panolog notify test`; what `run` refuses before it begins, and which secrets nobody inherits from it."""
 
+import os
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 
-from panolog.orchestrator.cli import app
+from tests.orchestrator.cli.program import call, one_line
 from tests.orchestrator.follower.receivers import receiver
 from tests.scenes import write_scene
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(app.app, [str(argument) for argument in arguments])
-
-
-def refused(result: Result) -> str:
-    assert result.exit_code == 2, result.output
-    assert result.stdout == ""
-    (line,) = result.stderr.splitlines()
-    assert "T0PSECRET" not in line
-    return line
 
 
 def test_a_test_message_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,20 +30,46 @@ def test_a_test_message_that_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
     assert failed.startswith("panolog: notify PANOLOG_NOTIFY#1: the server answers HTTP 404; check the URL")
 
 
-def test_no_target(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("PANOLOG_NOTIFY", raising=False)
-    assert "give --notify KIND:URL or set PANOLOG_NOTIFY" in refused(call("notify", "test"))
-
-
 @pytest.mark.parametrize(
-    ("options", "expected"),
+    ("words", "expected"),
     [
-        (("--notify", "slack:https://hooks.slack.com/T0PSECRET"), "its URL is a secret"),
-        (("--notify", "slack:env:NOTHING"), "is not set"),
-        (("--log", "excel"), "there is no such sink"),
+        (("notify", "test"), "give --notify KIND:URL or set PANOLOG_NOTIFY"),
+        (("run", "town", "-o", "run", "--notify", "slack:https://hooks.slack.com/T0PSECRET"), "is a secret"),
+        (("run", "town", "-o", "run", "--notify", "slack:env:NOTHING"), "is not set"),
+        (("run", "town", "-o", "run", "--log", "excel"), "there is no such sink"),
     ],
 )
-def test_wrong_options_begin_no_run(tmp_path: Path, options: tuple[str, ...], expected: str) -> None:
-    scene = write_scene(tmp_path / "scene")
-    assert expected in refused(call("run", scene, "-o", tmp_path / "run", *options))
+def test_wrong_options_begin_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], expected: str
+) -> None:
+    monkeypatch.delenv("PANOLOG_NOTIFY", raising=False)
+    monkeypatch.chdir(tmp_path)
+    write_scene(tmp_path / "town")
+    line = one_line(call(*words))
+    assert expected in line and "T0PSECRET" not in line
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_gives_its_secrets_to_no_process_that_it_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A follower of its own gets them, on a pipe; Ray and the workers would inherit the environment."""
+    seen: list[dict[str, str]] = []
+
+    def start(*_: object) -> None:
+        seen.append(dict(os.environ))
+
+    monkeypatch.setattr("panolog.orchestrator.commands.session.start", start)
+    monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
+    secrets = ("HOOK", "PANOLOG_NOTIFY", "PANOLOG_NOTIFY_SECRET", "PANOLOG_NTFY_TOKEN")
+    secrets += ("PANOLOG_SMTP_USER", "PANOLOG_SMTP_PASSWORD")
+    with receiver() as server:
+        for name in secrets:
+            monkeypatch.setenv(name, "T0PSECRET")
+        monkeypatch.setenv("HOOK", f"{server.url}/T0PSECRET")
+        monkeypatch.setenv("PANOLOG_NOTIFY", f"ntfy:{server.url}/T0PSECRET")
+        options = ("--notify", "webhook:env:HOOK", "--notify", "mail:smtp://127.0.0.1:1/you@there")
+        result = call("run", write_scene(tmp_path / "town"), "-o", tmp_path / "run", *options)
+    assert result.exit_code == 0, result.output
+    (environment,) = seen
+    assert not {name for name, value in environment.items() if "T0PSECRET" in value}

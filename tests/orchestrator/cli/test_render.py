@@ -5,14 +5,14 @@ from pathlib import Path
 
 import cv2
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands.render import lens_like
 from panolog.renderer.camera import Lens
 from panolog.scene.ply import write_ply
 from panolog.scene.read import read_scene
 from panolog.workers.training.initialise import scene_gaussians
+from tests.orchestrator.cli.program import call, one_line
 from tests.scenes import write_scene
 
 FRAMES = 4
@@ -35,7 +35,7 @@ def poses(tmp_path: Path) -> Path:
 
 
 def render(*arguments: object) -> Result:
-    return CliRunner().invoke(app.app, ["render", *map(str, arguments)])
+    return call("render", *arguments)
 
 
 @pytest.mark.parametrize(
@@ -76,12 +76,38 @@ def test_a_video_that_is_cut_off_leaves_nothing(
     assert list(out.iterdir()) == []
 
 
-def test_a_video_has_even_sides(ply: Path, poses: Path, tmp_path: Path) -> None:
-    for options in (("--fov", 90, "--size", "64x35"), ("--width", 66)):
-        refused = render(ply, "-o", tmp_path / "out", "--poses", poses, "--mp4", *options)
-        assert refused.exit_code == 2
-        assert "both must be even" in refused.stderr
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (("--path", "3", "--width", "33"), "must be even"),
+        (("--poses", "poses.json", "--mp4", "--fov", "90", "--size", "64x35"), "both must be even"),
+        (("--poses", "poses.json", "--mp4", "--width", "66"), "both must be even"),
+        (("--fov", "90", "--size", "big"), "like 1280x720"),
+        (("--fov", "90", "--size", "40000x20"), "at most 32766"),
+        (("--fov", "200"), "--fov 200: the field of view is 200 degrees, must be above 0 and below 180"),
+        (("--fov", "90", "--width", "64"), "give --size"),
+        (("--fps", "30"), "give --mp4 too"),
+        (("--size", "8x8"), "give --fov too"),
+        (("--yaw", "0"), "give --fov too"),
+        (("--pitch", "3"), "give --fov too"),
+    ],
+)
+def test_wrong_options(
+    ply: Path,
+    poses: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    options: tuple[str, ...],
+    line: str,
+) -> None:
+    monkeypatch.chdir(poses.parent)
+    assert line in one_line(render(ply, "-o", "out", *options))
     assert not (tmp_path / "out").exists()
+
+
+def test_what_is_neither_a_run_nor_a_model(tmp_path: Path) -> None:
+    refused = render(tmp_path / "x.ply", "-o", tmp_path / "out", "--path", "3")
+    assert "neither a run nor a PLY" in one_line(refused)
 
 
 def test_pictures_along_a_path_are_written_one_by_one(ply: Path, poses: Path, tmp_path: Path) -> None:

@@ -6,9 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from panolog.orchestrator.cli import app
 from panolog.prepare.networks import depth_maps, masks
 from panolog.prepare.networks.depth_maps import DepthJob
 from panolog.scene.files import SUFFIX
@@ -18,7 +17,8 @@ from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.trainer import TrainSpec, train
-from tests.orchestrator.messages import without_progress
+from tests.orchestrator.cli import program
+from tests.orchestrator.cli.program import one_line
 from tests.prepare.networks.networks import given, red_depth
 from tests.scenes import HEIGHT, WIDTH, write_scene
 from tests.workers.small import AFFINE
@@ -33,14 +33,7 @@ MANIFEST = {
 
 
 def call(*arguments: object) -> Result:
-    return CliRunner().invoke(app.app, ["scene", *map(str, arguments)])
-
-
-def one_line(result: Result) -> str:
-    assert result.exit_code == 2, result.output
-    (line,) = without_progress(result.stderr)
-    assert result.stdout == ""
-    return line
+    return program.call("scene", *arguments)
 
 
 @pytest.fixture

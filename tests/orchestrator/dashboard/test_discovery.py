@@ -13,7 +13,7 @@ from panolog.orchestrator.dashboard.guard import Access
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.records import Outcome, RunBegan, RunEnded
 from panolog.scene.errors import InputError
-from tests.orchestrator.cli.test_app import call, one_line
+from tests.orchestrator.cli.program import call, one_line
 from tests.orchestrator.dashboard.served import Served, append, serving, streaming, write_run
 
 

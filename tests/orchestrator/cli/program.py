@@ -1,0 +1,57 @@
+"""The program, called in this process, for tests."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from typer.testing import CliRunner, Result
+
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.scene.ply import write_ply
+from panolog.scene.read import read_scene
+from panolog.workers.tasks import COARSE
+from panolog.workers.training.initialise import scene_gaussians
+from tests.orchestrator.messages import without_progress
+
+STEPS = ("starting Ray", "connecting to the cluster", "measuring exposures", "calibrating")  # of a preflight
+GONE = SceneRef(path="/gone", fingerprint="f")
+
+
+def call(*arguments: object) -> Result:
+    """What `panolog` with these words prints, and its exit code."""
+    return CliRunner().invoke(app.app, [str(argument) for argument in arguments])
+
+
+def one_line(result: Result) -> str:
+    """What is said of wrong input: one line on stderr, nothing on stdout, and exit code 2."""
+    assert (result.exit_code, result.stdout) == (2, ""), result.output
+    (line,) = [line for line in without_progress(result.stderr) if line not in STEPS]
+    return line
+
+
+def shown(*arguments: object) -> Any:
+    """The content of what is printed on stdout with --json."""
+    result = call(*arguments, "--json")
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def begun(root: Path, scene: SceneRef = GONE) -> RunFolder:
+    """A run folder with its settings, of a scene that is gone."""
+    folder = RunFolder(root)
+    folder.root.mkdir()
+    write_info(folder, make_info(scene, RunConfig(width=64)))
+    return folder
+
+
+def finished(root: Path, scene: Path, fingerprint: str | None = None) -> Path:
+    """A run folder with both models. Args: fingerprint, another than that of the scene."""
+    read = read_scene(scene)
+    folder = begun(root, SceneRef(path=str(scene), fingerprint=fingerprint or read.fingerprint))
+    folder.of(COARSE).mkdir(parents=True)
+    for path in (folder.model(COARSE), folder.point_cloud):
+        write_ply(path, scene_gaussians(read))
+    return root

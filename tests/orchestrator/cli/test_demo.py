@@ -1,0 +1,76 @@
+"""`panolog demo`: what it makes, where, and where it cannot go. Nothing is made or trained here."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from panolog.orchestrator.run.info import SceneRef
+from tests.orchestrator.cli.program import begun, call, one_line
+
+
+class Demo:
+    """What the command would have made and started."""
+
+    def __init__(self) -> None:
+        self.made: list[tuple[Any, ...]] = []  # what, where, with which options
+        self.started: list[tuple[Path, Path, str]] = []  # scene, run, recipe and blocks
+
+    def make(self, kind: str, folder: Path, **options: Any) -> None:
+        """In place of `make_town` and the like."""
+        self.made.append((kind, folder, options.get("panoramas"), options.get("flight")))
+
+    def start(self, scene: Path, root: Path, config: Any, *_: object) -> None:
+        """In place of `session.start`."""
+        self.started.append((scene, root, f"{config.recipe} {config.blocks}"))
+
+
+@pytest.fixture
+def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Demo:
+    found = Demo()
+    commands = "panolog.orchestrator.commands"
+    for kind in ("town", "flight", "city"):
+        monkeypatch.setattr(
+            f"{commands}.demo.make_{kind}",
+            lambda folder, kind=kind, **options: found.make(kind, folder, **options),
+        )
+    monkeypatch.setattr(f"{commands}.session.start", found.start)
+    monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
+    monkeypatch.chdir(tmp_path)
+    return found
+
+
+def test_where_a_demo_cannot_go(demo: Demo, tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").touch()
+    assert "is not empty" in one_line(call("demo", "-o", "."))
+    assert "cannot be written next to it" in one_line(call("demo", "-o", "/"))
+    begun(tmp_path / "run", SceneRef(path=str(tmp_path / "run-town"), fingerprint="f"))
+    for options in (("--flight",), ("--city", "9")):
+        assert "a run of another scene" in one_line(call("demo", *options, "-o", tmp_path / "run"))
+    assert call("demo", "--city", "1").exit_code == 2
+    assert (demo.made, demo.started) == ([], [])
+    assert {path.name for path in tmp_path.iterdir()} == {"thesis.txt", "run"}
+
+
+def test_a_town_whose_making_was_cut_off_is_made_again(demo: Demo, tmp_path: Path) -> None:
+    model = tmp_path / "run-town" / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.bin").touch()
+    assert call("demo", "-o", tmp_path / "run").exit_code == 0
+    (model / "points3D.bin").touch()
+    assert call("demo", "-o", tmp_path / "run").exit_code == 0
+    assert demo.made == [("town", tmp_path / "run-town", None, None)]
+    assert len(demo.started) == 2
+
+
+def test_each_place_is_made_next_to_its_run(demo: Demo, tmp_path: Path) -> None:
+    for options in (("--flight",), ("--city", "300"), ("--city", "20", "--flight")):
+        assert call("demo", *options).exit_code == 0
+    flight, city, seen = (tmp_path / "runs" / f"{name}" for name in SCENES)
+    assert demo.made == [("flight", flight, 32, None), ("city", city, 300, False), ("city", seen, 20, True)]
+    assert [scene for scene, *_ in demo.started] == [flight, city, seen]
+    assert demo.started[0][1] == Path("runs/flight")
+    assert [settings for *_, settings in demo.started] == ["paper 2x1x1", "panolog 7", "panolog 2"]
+
+
+SCENES = ("flight-district", "city-city-300", "city-city-20-flight")
