@@ -1,4 +1,4 @@
-"""A run that learns exposures, poses and movers, interrupted in Stage I, in Stage II and in the evaluation."""
+"""A run that learns exposures, poses and movers, interrupted in both stages and in the evaluation."""
 
 import json
 from collections.abc import Sequence
@@ -19,7 +19,6 @@ from panolog.orchestrator.run.store import read_records
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, EVAL, TaskId
-from tests.scenes import copy_scene
 from tests.scenes import copy_scene
 
 pytestmark = pytest.mark.system
