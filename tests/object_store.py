@@ -182,6 +182,7 @@ class _Handler(BaseHTTPRequestHandler):
             if name.lower() not in _HOP:
                 self.send_header(name, value)
         self.send_header("Content-Length", length or str(len(data) if size is None else size))
+        self.send_header("Connection", "close")  # so that its thread ends with the test, not 12 seconds later
         self.end_headers()
         if self.command != "HEAD":
             self.wfile.write(data)
