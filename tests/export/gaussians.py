@@ -28,9 +28,7 @@ def scattered(
     return Splats(**{name: column.astype(np.float32) for name, column in columns.items()})
 
 
-def cluster(
-    place: tuple[float, float, float], color: tuple[float, float, float], *, spread: float = 0.5
-) -> Splats:
+def cluster(place: Triple, color: Triple, *, spread: float = 0.5) -> Splats:
     """400 opaque balls of one colour around a place."""
     rng, count = np.random.default_rng(1), 400
     shade = (np.array(color) - 0.5) / C0
@@ -55,3 +53,22 @@ def turn_between(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDA
     """(N,) degrees between unit quaternions (N, 4)."""
     cosine = np.abs((first.astype(np.float64) * second).sum(axis=1)).clip(0, 1)
     return np.asarray(np.degrees(2 * np.arccos(cosine)))
+
+
+def mutated(data: bytes, rng: np.random.Generator) -> bytes:
+    """A file in which bits flip, and which is cut, or where some bytes are overwritten or repeated."""
+    changed = bytearray(data)
+    for _ in range(rng.integers(1, 4)):
+        at = int(rng.integers(len(changed)))
+        match rng.integers(4):
+            case 0:
+                changed[at] ^= 1 << int(rng.integers(8))
+            case 1:
+                del changed[at + 1 :]
+            case 2:
+                changed[at : at + int(rng.integers(9))] = rng.bytes(int(rng.integers(9)))
+            case _:
+                changed[at:at] = changed[at : at + int(rng.integers(40))]
+        if not changed:
+            break
+    return bytes(changed)

@@ -93,11 +93,6 @@ def test_equal_gaussians_have_no_span(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.sh0, np.tile(one.sh0, (300, 1)), atol=1e-5)
 
 
-def test_no_file(tmp_path: Path) -> None:
-    with pytest.raises(PlyError, match="no such file"):
-        read_compressed_ply(tmp_path / "none.ply")
-
-
 GOOD = header(1) + "\0" * 88
 LONG = "ply\n" + "comment a\n" * 500
 PLAIN = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n1234"
@@ -106,27 +101,20 @@ WRONG = {
     "a picture": ("\x89PNG\r\n\x1a\n", "is no compressed PLY"),
     "no end": (LONG, "header is damaged"),
     "a long line": ("ply\n" + "a" * 10_000, "header is damaged"),
-    "a plain PLY": (
-        "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n1234",
-        "as",
-    ),
+    "a plain PLY": (PLAIN, "as PlayCanvas"),
     "ascii": (GOOD.replace("binary_little_endian", "ascii"), "binary"),
     "doubles": (GOOD.replace("property float min_x", "property double min_x"), "its header has"),
-    "a list": (GOOD.replace("property float min_x", "property list uchar int min_x"), "its header has"),
     "another type": (
         GOOD.replace("property uint packed_scale", "property float packed_scale"),
         "as PlayCanvas",
     ),
-    "another name": (GOOD.replace("packed_scale", "packed_size"), "as PlayCanvas"),
     "twice": (GOOD.replace("min_y", "min_x"), "as PlayCanvas"),
     "no chunk": (header(1, chunks=0) + "\0" * 88, "as PlayCanvas"),
     "too many chunks": (header(256, chunks=2) + "\0" * 9000, "as PlayCanvas"),
     "truncated": (GOOD[:-1], "truncated, 1 bytes are missing"),
     "a billion": (header(999_999_999, chunks=3_906_250) + "\0" * 88, "truncated"),
     "ten billions": (header(9_999_999_999) + "\0" * 88, "its header has"),
-    "negative": (header(-1) + "\0" * 88, "its header has"),
     "degree 4": (header(1, rest=72) + "\0" * 500, "as PlayCanvas"),
-    "7 coefficients": (header(1, rest=7) + "\0" * 500, "as PlayCanvas"),
     "no numbers": (header(1) + "\xff" * 88, "no numbers"),
 }
 
@@ -134,29 +122,10 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_no_compressed_ply_is_one_line(tmp_path: Path, name: str) -> None:
     content, reason = WRONG[name]
-    (tmp_path / "a.ply").write_bytes(content.encode("latin-1"))
+    path = tmp_path / "a.ply"
+    with pytest.raises(PlyError, match="no such file"):
+        read_compressed_ply(path)
+    path.write_bytes(content.encode("latin-1"))
     with pytest.raises(PlyError, match=reason) as error:
-        read_compressed_ply(tmp_path / "a.ply")
-    assert str(error.value).startswith(str(tmp_path / "a.ply")) and "\n" not in str(error.value)
-
-
-def test_damage_is_an_error_or_other_gaussians(tmp_path: Path) -> None:
-    path, rng = tmp_path / "a.ply", np.random.default_rng(0)
-    write_compressed_ply(path, InMemory(scattered(300, 1)))
-    whole, read = path.read_bytes(), 0
-    for _ in range(400):
-        damaged = bytearray(whole)
-        if rng.random() < 0.3:
-            del damaged[rng.integers(len(whole)) :]
-        for at in rng.integers(900, size=rng.integers(1, 4)):  # its header, and a part of its chunks
-            if at < len(damaged):
-                damaged[at] = rng.integers(256)
-        path.write_bytes(damaged)
-        try:
-            found = read_compressed_ply(path)
-        except PlyError as error:
-            assert "\n" not in str(error)
-        else:
-            read += 1
-            assert all(np.isfinite(column).all() for column in found.columns().values())
-    assert 0 < read < 400
+        read_compressed_ply(path)
+    assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from panolog.export.earth import enu_to_ecef, geodetic_of
+from panolog.export.earth import geodetic_of
 from panolog.export.georeference import Georeference, georeference_from, georeference_of
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.read import read_scene
@@ -15,27 +15,6 @@ from panolog.scene.write import Offset, Origin, write_offset
 from tests.scenes import write_scene
 
 MUNICH = Origin(latitude=48.137, longitude=11.575, altitude=520.0)
-
-
-@pytest.mark.parametrize(
-    "place", [(48.1, 11.5, 500), (-33, 151, -10), (89.99, 0, 0), (0, 180, 4000), (-90, 0, 1)]
-)
-def test_places_on_the_ellipsoid(place: tuple[float, float, float]) -> None:
-    matrix = enu_to_ecef(*place)
-    np.testing.assert_allclose(matrix[:3, :3].T @ matrix[:3, :3], np.eye(3), atol=1e-12)
-    latitude, longitude, height = geodetic_of(matrix[:3, 3])
-    np.testing.assert_allclose((latitude, height), (place[0], place[2]), atol=1e-6)
-    assert abs(place[0]) == 90 or longitude == pytest.approx(place[1])
-
-
-def test_known_points_in_ecef() -> None:
-    """The ends of the axes, and one by PROJ."""
-    np.testing.assert_allclose(enu_to_ecef(0, 0, 0)[:3, 3], [6378137, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(enu_to_ecef(90, 0, 0)[:3, 3], [0, 0, 6356752.314245], atol=1e-6)
-    pyproj = pytest.importorskip("pyproj")
-    convert = pyproj.Transformer.from_crs(4979, 4978, always_xy=True)
-    known = convert.transform(11.575, 48.137, 520.0)
-    np.testing.assert_allclose(enu_to_ecef(48.137, 11.575, 520)[:3, 3], known, atol=1e-6)
 
 
 def test_east_north_up() -> None:

@@ -11,7 +11,7 @@ import zstandard
 from panolog.export.splats import InMemory, Splats
 from panolog.export.spz import Version, read_spz, write_spz
 from panolog.scene.errors import FormatError
-from tests.export.gaussians import matched, scattered, turn_between
+from tests.export.gaussians import matched, mutated, scattered, turn_between
 
 MAGIC = b"NGSP"
 BOTH: tuple[Version, ...] = (3, 4)
@@ -129,11 +129,8 @@ def test_equal_models_are_equal_bytes(tmp_path: Path, version: Version) -> None:
     assert packed == (tmp_path / "b").read_bytes()
     assert version == 4 or packed[:8] == b"\x1f\x8b\x08\x00\x00\x00\x00\x00"  # no name, no time
     assert len(read_spz(tmp_path / "a")) == 70_000
-
-
-def test_nothing_is_no_model(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="no Gaussian"):
-        write_spz(tmp_path / "a.spz", InMemory(scattered(0)))
+        write_spz(tmp_path / "a", InMemory(scattered(0)), version)
 
 
 def header(version: int, count: int, degree: int = 0, bits: int = 12, streams: int = 0) -> bytes:
@@ -152,18 +149,13 @@ WRONG = {
     "empty": (b"", "is no SPZ"),
     "a picture": (b"\x89PNG\r\n\x1a\n" + bytes(100), "is no SPZ"),
     "another gzip": (gzip.compress(bytes(100)), "is no SPZ of version"),
-    "an old version": (gzip.compress(header(1, 1) + bytes(100)), "is no SPZ of version"),
     "a newer version": (gzip.compress(header(5, 1) + bytes(100)), "is no SPZ of version"),
     "only a header": (gzip.compress(header(3, 1)), "truncated"),
     "no header": (gzip.compress(b"NGSP"), "truncated"),
     "degree 5": (gzip.compress(header(3, 1, 5) + bytes(500)), "header of the SPZ is damaged"),
     "99 bits": (gzip.compress(header(3, 1, 0, 99) + bytes(500)), "header of the SPZ is damaged"),
     "4 billion": (gzip.compress(header(3, 2**32 - 1) + bytes(100)), "cannot be in an SPZ of"),
-    "40 million": (gzip.compress(header(3, 40_000_000) + bytes(40_000_000)), "cannot be in an SPZ of"),
-    "a million": (
-        gzip.compress(header(3, 1_000_000) + bytes(20_000_000)),
-        "cannot be in an SPZ of",
-    ),
+    "a million": (gzip.compress(header(3, 1_000_000) + bytes(20_000_000)), "cannot be in an SPZ of"),
     "more": (gzip.compress(header(3, 1) + bytes(21)), "more than its header says"),
     "half a gzip": (
         gzip.compress(header(3, 1000) + np.random.default_rng(0).bytes(20_000))[:9000],
@@ -189,33 +181,27 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_no_spz_is_one_line(tmp_path: Path, name: str) -> None:
     content, reason = WRONG[name]
-    (tmp_path / "a.spz").write_bytes(content)
-    with pytest.raises(FormatError, match=reason) as error:
-        read_spz(tmp_path / "a.spz")
-    assert str(error.value).startswith(str(tmp_path / "a.spz")) and "\n" not in str(error.value)
-
-
-def test_no_file(tmp_path: Path) -> None:
-    for path in (tmp_path, tmp_path / "none.spz"):
+    path = tmp_path / "a.spz"
+    for nothing in (tmp_path, path):
         with pytest.raises(FormatError, match="no such file"):
-            read_spz(path)
+            read_spz(nothing)
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match=reason) as error:
+        read_spz(path)
+    assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("mutations", [40, pytest.param(400, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("version", [2, *BOTH])
-def test_damage_is_an_error_or_other_gaussians(tmp_path: Path, version: int) -> None:
+def test_damage_is_an_error_or_other_gaussians(tmp_path: Path, version: int, mutations: int) -> None:
     path, rng = tmp_path / "a.spz", np.random.default_rng(version)
     if version == 2:
         path.write_bytes(gzip.compress(header(2, 40, 1) + rng.bytes(40 * (9 + 1 + 3 + 3 + 3 + 9))))
     else:
         write_spz(path, InMemory(scattered(40, 1)), 4 if version == 4 else 3)
     whole, read = path.read_bytes(), 0
-    for _ in range(400):
-        damaged = bytearray(whole)
-        if rng.random() < 0.3:
-            del damaged[rng.integers(len(whole)) :]
-        for at in rng.integers(len(whole), size=rng.integers(1, 4)):
-            if at < len(damaged):
-                damaged[at] = rng.integers(256)
+    for _ in range(mutations):
+        damaged = mutated(whole, rng)
         path.write_bytes(damaged)
         try:
             found = read_spz(path)
@@ -224,7 +210,7 @@ def test_damage_is_an_error_or_other_gaussians(tmp_path: Path, version: int) -> 
         else:
             read += 1
             assert all(np.isfinite(column).all() for column in found.columns().values())
-    assert read < 400  # damage has been found
+    assert read < mutations  # damage has been found
 
 
 @pytest.mark.parametrize("version", [2, 3])

@@ -7,15 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from panolog.export.gltf import glb
 from panolog.export.gltf.glb import Compression, write_glb
 from panolog.export.splats import REST, InMemory, Splats
 from panolog.export.spz import decode, read_spz, write_spz
 from panolog.scene.errors import FormatError
-from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import write_ply
 from tests.export.gaussians import C0, matched, scattered
 from tests.export.gltf.reading import read_glb
 from tests.export.peers import node, peer
@@ -112,31 +109,6 @@ def test_khronos_validator(tmp_path: Path, compression: Compression) -> None:
     broken[broken.index(b'"min":[-') + 7] = ord(" ")  # the validator looks at the numbers
     path.write_bytes(broken)
     assert compression or any(issue["code"].startswith("ACCESSOR_M") for issue in issues(path, "plain"))
-
-
-@pytest.mark.system
-def test_as_splat_transform_writes_it(tmp_path: Path) -> None:
-    """The same attributes from the same model, whose y splat-transform takes to be down in a PLY."""
-    splats, cli = scattered(1000), peer("@playcanvas/splat-transform") / "bin" / "cli.mjs"
-    write_ply(tmp_path / "a.ply", _gaussians(splats))
-    assert node(cli, "-w", "-q", tmp_path / "a.ply", tmp_path / "theirs.glb").returncode == 0
-    write_glb(tmp_path / "ours.glb", InMemory(splats), None)
-    ours, theirs = read_glb(tmp_path / "ours.glb"), read_glb(tmp_path / "theirs.glb")
-    assert ours.primitive["extensions"] == theirs.primitive["extensions"]
-    assert set(ours.primitive["attributes"]) == set(theirs.primitive["attributes"])
-    for name in (":SCALE", ":OPACITY", ":SH_DEGREE_0_COEF_0"):
-        np.testing.assert_allclose(
-            ours.attribute(EXTENSION + name), theirs.attribute(EXTENSION + name), rtol=1e-5
-        )
-    positions = ours.attribute("POSITION") + ours.matrix[:3, 3]
-    np.testing.assert_allclose(positions * [-1, -1, 1], theirs.attribute("POSITION"), atol=1e-5)
-    assert np.abs(ours.attribute("COLOR_0").astype(int) - theirs.attribute("COLOR_0")).max() <= 1
-
-
-def _gaussians(splats: Splats) -> Gaussians:
-    columns = splats.columns() | {"sh0": splats.sh0[:, None]}
-    tensors = {name: torch.from_numpy(column) for name, column in columns.items()}
-    return Gaussians(**tensors, sky=0, exact=False)
 
 
 def test_an_spz_in_a_glb_is_that_of_a_file(tmp_path: Path) -> None:

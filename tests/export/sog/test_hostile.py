@@ -2,7 +2,6 @@
 
 import io
 import json
-import random
 import struct
 import tracemalloc
 import zipfile
@@ -18,9 +17,9 @@ from PIL import Image
 from panolog.export.sog.read import read_sog
 from panolog.export.sog.write import write_sog, write_sog_folder
 from panolog.scene.errors import FormatError
+from tests.export.gaussians import mutated
 from tests.export.sog.models import source
 
-MUTATIONS = 400
 Change = Callable[[dict[str, Any]], object]
 
 
@@ -44,53 +43,30 @@ def assert_one_line(path: Path) -> str:
     return ""
 
 
-def mutated(data: bytes, seed: int) -> bytes:
-    """Flips bits, cuts, repeats or overwrites some bytes."""
-    draw = random.Random(seed)
-    changed = bytearray(data)
-    for _ in range(draw.randint(1, 3)):
-        at = draw.randrange(len(changed))
-        match draw.randrange(4):
-            case 0:
-                changed[at] ^= 1 << draw.randrange(8)
-            case 1:
-                del changed[at:]
-            case 2:
-                changed[at : at + draw.randrange(9)] = draw.randbytes(draw.randrange(9))
-            case 3:
-                changed[at:at] = changed[at : at + draw.randrange(40)]
-        if not changed:
-            break
-    return bytes(changed)
-
-
-def test_every_mutation_of_a_bundle(whole: Path, tmp_path: Path) -> None:
-    data = (whole / "a.sog").read_bytes()
+@pytest.mark.parametrize("mutations", [40, pytest.param(400, marks=pytest.mark.nightly)])
+def test_mutations_of_a_bundle(whole: Path, tmp_path: Path, mutations: int) -> None:
+    data, rng = (whole / "a.sog").read_bytes(), np.random.default_rng(0)
     directory = data.index(b"PK\1\2")
-    for seed in range(MUTATIONS):
-        changed = mutated(data, seed)
-        if seed % 2:  # the directory is a small part, and decides most
-            changed = data[:directory] + mutated(data[directory:], seed)
+    for number in range(mutations):
+        changed = mutated(data, rng)
+        if number % 2:  # the directory is a small part, and decides most
+            changed = data[:directory] + mutated(data[directory:], rng)
         (tmp_path / "a.sog").write_bytes(changed)
         assert_one_line(tmp_path / "a.sog")
-
-
-def test_every_truncation_of_a_bundle(whole: Path, tmp_path: Path) -> None:
-    data = (whole / "a.sog").read_bytes()
-    for length in range(0, len(data), max(1, len(data) // 100)):
+    for length in range(0, len(data), max(1, len(data) * 4 // mutations)):
         (tmp_path / "a.sog").write_bytes(data[:length])
         assert assert_one_line(tmp_path / "a.sog")
 
 
+@pytest.mark.parametrize("mutations", [10, pytest.param(100, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     "name", ["means_l.webp", "quats.webp", "sh0.webp", "shN_centroids.webp", "meta.json"]
 )
-def test_every_mutation_of_a_file(whole: Path, tmp_path: Path, name: str) -> None:
-    for file in (whole / "files").iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    for seed in range(MUTATIONS // 4):
-        (tmp_path / name).write_bytes(mutated((whole / "files" / name).read_bytes(), seed))
-        assert_one_line(tmp_path)
+def test_mutations_of_a_file(whole: Path, tmp_path: Path, name: str, mutations: int) -> None:
+    rng, folder = np.random.default_rng(0), changed_meta(whole, tmp_path, lambda meta: None)
+    for _ in range(mutations):
+        (folder / name).write_bytes(mutated((whole / "files" / name).read_bytes(), rng))
+        assert_one_line(folder)
 
 
 def changed_meta(whole: Path, folder: Path, change: Change) -> Path:
@@ -106,26 +82,16 @@ def changed_meta(whole: Path, folder: Path, change: Change) -> Path:
     ("change", "line"),
     [
         (lambda meta: meta.update(version=3), "is of version 3"),
-        (lambda meta: meta.update(version=True), "is of version True"),
-        (lambda meta: meta.update(count=0), "no whole number from 1"),
         (lambda meta: meta.update(count=1.5), "no whole number from 1"),
-        (lambda meta: meta.update(count="9"), "no whole number from 1"),
         (lambda meta: meta.update(count=10**9), "no whole number from 1"),
         (lambda meta: meta.update(count=30_000_000), "30,000,000 Gaussians cannot be in"),
         (lambda meta: meta.update(count=1000), "pixels for 1,000 Gaussians"),
         (lambda meta: meta["means"].update(mins=[0, 0]), r"no 3 numbers of up to ±80 as means\.mins"),
-        (lambda meta: meta["means"].update(maxs=[0, 0, 1e308]), r"as means\.maxs"),
         (lambda meta: meta["means"].update(maxs=[0, 0, float("nan")]), r"as means\.maxs"),
         (lambda meta: meta["scales"].update(codebook=[1.0] * 255), r"no 256 numbers .* as scales\.codebook"),
-        (lambda meta: meta["sh0"].update(codebook=None), r"as sh0\.codebook"),
-        (lambda meta: meta["quats"].update(files=[]), r"names no 1 images as quats\.files"),
         (lambda meta: meta["quats"].update(files=[7]), r"names no 1 images as quats\.files"),
         (
             lambda meta: meta["quats"].update(files=["../quats.webp"]),
-            "is not the name of a file in this folder",
-        ),
-        (
-            lambda meta: meta["quats"].update(files=["/etc/passwd"]),
             "is not the name of a file in this folder",
         ),
         (lambda meta: meta["quats"].update(files=["nowhere.webp"]), "missing, although meta.json names it"),
@@ -134,7 +100,6 @@ def changed_meta(whole: Path, folder: Path, change: Change) -> Path:
         (lambda meta: meta["quats"].update(files=["sh0.webp"]), "quaternions have a reserved form"),
         (lambda meta: meta["shN"].update(count=3), "of a palette of 3"),
         (lambda meta: meta["shN"].update(count=65_537), r"as shN\.count"),
-        (lambda meta: meta["shN"].update(bands=2), "which is no palette"),
         (lambda meta: meta["shN"].update(bands=4), r"as shN\.bands"),
         (lambda meta: meta.pop("sh0"), "has no sh0"),
         (lambda meta: meta.update(scales=[]), "has no scales"),
@@ -168,10 +133,11 @@ def test_missing(tmp_path: Path) -> None:
         read_sog(tmp_path)
 
 
-def bundle(path: Path, files: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
-    with zipfile.ZipFile(path, "w", method) as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
+def bundle(path: Path, whole: Path, **changed: bytes) -> Path:
+    """Deflated. Args: whole, of the module; changed files, without the ends of their names."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in (whole / "files").iterdir():
+            archive.writestr(file.name, changed.get(file.stem, file.read_bytes()))
     return path
 
 
@@ -185,28 +151,22 @@ def peak(path: Path) -> tuple[str, int]:
 
 
 def test_deflated_bundles_are_read(whole: Path, tmp_path: Path) -> None:
-    files = {file.name: file.read_bytes() for file in (whole / "files").iterdir()}
-    found = read_sog(bundle(tmp_path / "a.sog", files))
+    found = read_sog(bundle(tmp_path / "a.sog", whole))
     np.testing.assert_array_equal(found.means, read_sog(whole / "a.sog").means)
 
 
 def test_zip_bombs(whole: Path, tmp_path: Path) -> None:
-    files = {file.name: file.read_bytes() for file in (whole / "files").iterdir()}
-    line, bytes_taken = peak(bundle(tmp_path / "a.sog", files | {"means_l.webp": bytes(2**28)}))
+    line, bytes_taken = peak(bundle(tmp_path / "a.sog", whole, means_l=bytes(2**28)))
     assert "larger than the" in line and bytes_taken < 2**24
-    line, bytes_taken = peak(bundle(tmp_path / "b.sog", files | {"meta.json": b" " * 2**26}))
+    bomb = bundle(tmp_path / "b.sog", whole, meta=b" " * 2**26)
+    line, bytes_taken = peak(bomb)
     assert "larger than the 1,048,576 bytes" in line and bytes_taken < 2**24
-
-
-def test_a_directory_that_lies_about_sizes(whole: Path, tmp_path: Path) -> None:
-    files = {file.name: file.read_bytes() for file in (whole / "files").iterdir()}
-    data = bytearray(bundle(tmp_path / "a.sog", files | {"meta.json": b" " * 2**26}).read_bytes())
-    at = 0
+    data, at = bytearray(bomb.read_bytes()), 0
     while (at := data.find(b"PK\1\2", at)) >= 0:
         struct.pack_into("<I", data, at + 24, 1000)  # of what is deflated, less than there is
         at += 4
-    (tmp_path / "a.sog").write_bytes(data)
-    line, bytes_taken = peak(tmp_path / "a.sog")
+    bomb.write_bytes(data)
+    line, bytes_taken = peak(bomb)
     assert line and bytes_taken < 2**24
 
 
@@ -232,12 +192,8 @@ def png(width: int, height: int) -> bytes:
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(b""))
-        + chunk(b"IEND", b"")
-    )
+    chunks = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunks
 
 
 def test_png_is_read(whole: Path, tmp_path: Path) -> None:

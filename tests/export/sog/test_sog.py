@@ -16,9 +16,8 @@ from panolog.export.order import morton_order
 from panolog.export.sog.read import read_sog
 from panolog.export.sog.write import encode, write_sog, write_sog_folder
 from panolog.export.splats import REST, InMemory, Splats
-from panolog.renderer.render import render_panorama
 from panolog.scene.errors import FormatError
-from tests.export.sog.models import gaussians, source, splats, turned_alike
+from tests.export.sog.models import source, splats, turned_alike
 
 
 def assert_alike(found: Splats, wanted: Splats, palette_error: float = 0.03) -> None:
@@ -38,26 +37,43 @@ def assert_alike(found: Splats, wanted: Splats, palette_error: float = 0.03) -> 
         assert np.sqrt(np.square(found.shN - wanted.shN).mean()) < palette_error
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_it_is_read_again(tmp_path: Path, degree: int) -> None:
-    model = splats(3000, degree)
+@pytest.mark.parametrize(
+    ("count", "degree"),
+    [*((3000, degree) for degree in range(4)), (1, 3), (2, 3), (15, 3), (16, 3), (17, 3), (64, 3), (65, 3)],
+)
+def test_it_is_read_again(tmp_path: Path, count: int, degree: int) -> None:
+    model = splats(count, degree)
     write_sog(tmp_path / "a.sog", InMemory(model))
-    assert_alike(read_sog(tmp_path / "a.sog"), model.select(morton_order(model.means)))
+    wanted = model.select(morton_order(model.means))
+    assert_alike(read_sog(tmp_path / "a.sog"), wanted, 0.03 if count == 3000 else 0.15)
+    one = Splats.joined([splats(1)] * 300)
+    write_sog(tmp_path / "one.sog", InMemory(one))
+    np.testing.assert_allclose(read_sog(tmp_path / "one.sog").means, one.means, rtol=1e-6)
 
 
-@pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 64, 65])
-def test_few_gaussians(tmp_path: Path, count: int) -> None:
-    model = splats(count)
-    write_sog(tmp_path / "a.sog", InMemory(model))
-    assert_alike(read_sog(tmp_path / "a.sog"), model.select(morton_order(model.means)), 0.15)
+def test_numbers_are_where_the_format_has_them(tmp_path: Path) -> None:
+    """By hand, from PlayCanvas's description; nothing of the reader is used."""
+    write_sog_folder(tmp_path, source(700))
+    meta, found = json.loads((tmp_path / "meta.json").read_text()), read_sog(tmp_path)
 
+    def pixels(part: str, number: int = 0) -> np.ndarray:
+        image = np.asarray(Image.open(tmp_path / meta[part]["files"][number]))
+        return image.reshape(-1, image.shape[2])[:700].astype(int)
 
-def test_equal_gaussians(tmp_path: Path) -> None:
-    one = splats(1)
-    write_sog(tmp_path / "a.sog", InMemory(Splats.joined([one] * 300)))
-    found = read_sog(tmp_path / "a.sog")
-    np.testing.assert_allclose(found.means, np.repeat(one.means, 300, 0), rtol=1e-6)
-    np.testing.assert_array_equal(found.scales, np.repeat(one.scales, 300, 0))
+    low, high = (np.array(meta["means"][name]) for name in ("mins", "maxs"))
+    place = low + (high - low) * (pixels("means", 1)[:, :3] * 256 + pixels("means")[:, :3]) / 65_535
+    np.testing.assert_allclose(found.means, np.sign(place) * np.expm1(np.abs(place)), rtol=1e-4, atol=1e-5)
+    for part in ("scales", "sh0"):
+        values = np.array(meta[part]["codebook"])[pixels(part)[:, :3]]
+        np.testing.assert_allclose(getattr(found, part), values, rtol=1e-5, atol=1e-6)
+    rest, largest = (pixels("quats")[:, :3] / 255 - 0.5) * np.sqrt(2), pixels("quats")[:, 3] - 252
+    for row in range(700):  # the largest of w x y z is left out
+        expected = np.insert(rest[row], largest[row], np.sqrt(max(0, 1 - np.square(rest[row]).sum())))
+        np.testing.assert_allclose(turned_alike(found.quats[[row]], expected[None]), [expected], atol=1e-3)
+    labels = pixels("shN", 1)[:, 0] + 256 * pixels("shN", 1)[:, 1]
+    palette = np.asarray(Image.open(tmp_path / meta["shN"]["files"][0]))
+    entries = palette[labels // 64].reshape(700, 64, 15, -1)[np.arange(700), labels % 64][..., :3]
+    np.testing.assert_allclose(found.shN, np.array(meta["shN"]["codebook"])[entries], rtol=1e-5, atol=1e-6)
 
 
 def test_what_is_transparent_keeps_its_colour(tmp_path: Path) -> None:
@@ -82,14 +98,6 @@ def test_folder_and_file_hold_the_same(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_sog(path).means, read_sog(tmp_path / "a.sog").means)
 
 
-def test_neighbours_are_neighbours(tmp_path: Path) -> None:
-    model = splats(5000, 0)
-    write_sog(tmp_path / "a.sog", InMemory(model))
-    found = read_sog(tmp_path / "a.sog").means
-    apart = [np.linalg.norm(np.diff(means, axis=0), axis=1).mean() for means in (found, model.means)]
-    assert apart[0] < 0.4 * apart[1]
-
-
 def test_order_is_kept_on_request() -> None:
     model = splats(900, 1)
     with ThreadPoolExecutor(1) as pool:
@@ -99,12 +107,16 @@ def test_order_is_kept_on_request() -> None:
     assert np.abs(pixels - alpha).max() <= 0.501
 
 
-def test_bytes_do_not_depend_on_threads_or_pieces(tmp_path: Path) -> None:
+def test_bytes_do_not_depend_on_threads_or_pieces() -> None:
     made = []
     for threads in (1, 4):
         with ThreadPoolExecutor(threads) as pool:
-            made.append(encode(source(70_000), pool))
+            made.append(encode(source(70_000, 1), pool))
     assert made[0] == made[1]
+
+
+@pytest.mark.nightly
+def test_bytes_do_not_depend_on_the_process(tmp_path: Path) -> None:
     write_sog(tmp_path / "a.sog", source(3000))
     script = (
         "from panolog.export.sog.write import write_sog; from tests.export.sog.models import source;"
@@ -114,11 +126,6 @@ def test_bytes_do_not_depend_on_threads_or_pieces(tmp_path: Path) -> None:
     environment = {"OPENBLAS_NUM_THREADS": "1", "PYTHONHASHSEED": "7", "PYTHONPATH": str(root)}
     subprocess.run([sys.executable, "-c", script], check=True, env=environment, cwd=root)
     assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
-
-
-def test_size(tmp_path: Path) -> None:
-    write_sog(tmp_path / "a.sog", source(100_000))
-    assert (tmp_path / "a.sog").stat().st_size < 248 * 100_000 / 14  # random positions hardly compress
 
 
 def test_nothing_to_write(tmp_path: Path) -> None:
@@ -147,25 +154,18 @@ def test_a_folder_is_replaced_only_if_it_is_ours(tmp_path: Path) -> None:
 
 def test_version_1(tmp_path: Path) -> None:
     """As PlayCanvas's readers decode it: linear between bounds, opacity as logit, bands by the width."""
-    rng = np.random.default_rng(3)
-    count, degree = 20, 2
+    rng, size = np.random.default_rng(3), REST[2]
     images = {
-        name: rng.integers(0, 256, (5, 4, 4), np.uint8)
-        for name in ("l", "u", "scales", "quats", "sh0", "labels")
+        name: rng.integers(0, 256, (5, 4, 4), np.uint8) for name in ("l", "u", "scales", "quats", "sh0")
     }
     images["quats"][..., 3] = 252 + rng.integers(0, 4, (5, 4))
-    images["labels"][..., 0] %= 64
-    images["labels"][..., 1] = 0
-    images["centroids"] = rng.integers(0, 256, (1, 64 * REST[degree], 3), np.uint8)
+    images["labels"] = np.stack([rng.integers(0, 64, (5, 4), np.uint8), *np.zeros((2, 5, 4), np.uint8)], -1)
+    images["centroids"] = rng.integers(0, 256, (1, 64 * size, 3), np.uint8)
     for name, pixels in images.items():
         Image.fromarray(pixels).save(tmp_path / f"{name}.webp", lossless=True, exact=True)
+    means = {"shape": [20, 3], "mins": [-1, -2, -3], "maxs": [1, 2, 3], "files": ["l.webp", "u.webp"]}
     meta = {
-        "means": {
-            "shape": [count, 3],
-            "mins": [-1, -2, -3],
-            "maxs": [1, 2, 3],
-            "files": ["l.webp", "u.webp"],
-        },
+        "means": means,
         "scales": {"mins": [-9, -8, -7], "maxs": [1, 2, 3], "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"mins": [-1, -2, -3, -4], "maxs": [1, 2, 3, 4], "files": ["sh0.webp"]},
@@ -178,16 +178,5 @@ def test_version_1(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.opacities, -4 + 8 * flat["sh0"][:, 3] / 255, rtol=1e-4, atol=1e-6)
     place = -2 + 4 * (flat["u"][:, 1] * 256 + flat["l"][:, 1]) / 65_535
     np.testing.assert_allclose(found.means[:, 1], np.sign(place) * np.expm1(abs(place)), rtol=1e-5, atol=1e-6)
-    entry = images["centroids"][0].reshape(64, REST[degree], 3)[images["labels"].reshape(-1, 4)[:, 0]]
+    entry = images["centroids"][0].reshape(64, size, 3)[images["labels"][..., 0].ravel()]
     np.testing.assert_allclose(found.shN, -0.5 + 0.75 * entry / 255, rtol=1e-4, atol=1e-6)
-
-
-def test_renders_are_alike(tmp_path: Path) -> None:
-    model = splats(20_000)
-    write_sog(tmp_path / "a.sog", InMemory(model))
-    images = [
-        render_panorama(gaussians(each), np.eye(3), np.zeros(3), 256, 0.0).astype(np.float64)
-        for each in (read_sog(tmp_path / "a.sog"), model)
-    ]
-    assert images[1].std() > 20
-    assert 10 * np.log10(255**2 / np.square(images[0] - images[1]).mean()) > 38

@@ -1,0 +1,128 @@
+"""splat-transform, by the authors of SOG: it reads what we write, and we read what it writes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from panolog.export.compressed_ply import read_compressed_ply, write_compressed_ply
+from panolog.export.gltf.glb import write_glb
+from panolog.export.order import morton_order
+from panolog.export.sog.read import read_sog
+from panolog.export.sog.streamed import write_streamed
+from panolog.export.sog.write import write_sog, write_sog_folder
+from panolog.export.splats import InMemory, Splats
+from panolog.export.spz import Version, read_spz, write_spz
+from panolog.scene.ply import read_ply, write_ply
+from tests.export.gaussians import scattered, turn_between
+from tests.export.gltf.reading import read_glb
+from tests.export.peers import node, peer
+from tests.export.sog.models import gaussians, source, splats
+
+pytestmark = [pytest.mark.system, pytest.mark.nightly]
+
+COUNT = 3001
+EXTENSION = "KHR_gaussian_splatting"
+
+
+def transformed(*arguments: str | Path) -> None:
+    """Runs splat-transform, which must neither fail nor warn."""
+    done = node(peer("@playcanvas/splat-transform") / "bin" / "cli.mjs", "-w", *arguments)
+    assert done.returncode == 0, done.stderr
+    assert not any(word in (done.stdout + done.stderr).lower() for word in ("warn", "error", "nan"))
+
+
+def as_read(path: Path) -> Splats:
+    """What splat-transform makes of a file."""
+    transformed(path, path.with_suffix(".peer.ply"))
+    return Splats.of(read_ply(path.with_suffix(".peer.ply")))
+
+
+def assert_equal(found: Splats, theirs: Splats) -> None:
+    """Up to float32, and to their quaternions, which are not normalised."""
+    assert len(found) == len(theirs)
+    for name in ("means", "scales", "sh0"):
+        np.testing.assert_allclose(getattr(found, name), getattr(theirs, name), atol=1e-5, err_msg=name)
+    np.testing.assert_allclose(found.opacities.clip(-8, 8), theirs.opacities.clip(-8, 8), atol=1e-4)
+    coefficients = found.shN.shape[1]
+    np.testing.assert_allclose(found.shN, theirs.shN[:, :coefficients], atol=1e-6)
+    assert not theirs.shN[:, coefficients:].any()
+    assert turn_between(found.quats, theirs.quats).max() < 0.05
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("version", [3, 4])
+def test_spz(tmp_path: Path, version: Version, degree: int) -> None:
+    ours, theirs = tmp_path / "ours.spz", tmp_path / "theirs.spz"
+    write_spz(ours, InMemory(scattered(COUNT, degree, size=0.004)), version)  # with more than 12 bits
+    was = read_spz(ours)
+    assert_equal(was, as_read(ours))
+    transformed(ours.with_suffix(".peer.ply"), "--spz-version", str(version), theirs)
+    found = read_spz(theirs)
+    assert np.abs(found.means - was.means).max() <= 2.0**-13  # theirs has 12 bits
+    np.testing.assert_allclose(found.shN, was.shN, atol=8 / 128)  # theirs has 5 and 4 bits, ours 6 and 5
+    np.testing.assert_allclose(found.sh0, was.sh0)
+    np.testing.assert_allclose(found.scales, was.scales)
+    assert turn_between(found.quats, was.quats).max() < 0.05
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_compressed_ply(tmp_path: Path, degree: int) -> None:
+    ours, theirs = tmp_path / "ours.compressed.ply", tmp_path / "theirs.compressed.ply"
+    write_compressed_ply(ours, InMemory(scattered(COUNT, degree)))
+    assert_equal(read_compressed_ply(ours), as_read(ours))
+    transformed(ours.with_suffix(".peer.ply"), theirs)
+    assert_equal(read_compressed_ply(theirs), as_read(theirs))
+    assert abs(theirs.stat().st_size - ours.stat().st_size) < 100  # the comment
+
+
+@pytest.mark.parametrize(("count", "degree"), [(1, 3), (63, 1), (5000, 0), (5000, 2), (70_000, 3)])
+def test_sog(tmp_path: Path, count: int, degree: int) -> None:
+    model = splats(count, degree)
+    write_sog(tmp_path / "a.sog", InMemory(model))
+    theirs = as_read(tmp_path / "a.sog")
+    assert_equal(read_sog(tmp_path / "a.sog"), theirs)
+    wanted = model.select(morton_order(model.means)).means
+    steps = np.ptp(np.copysign(np.log1p(np.abs(wanted)), wanted), axis=0) / 65_535
+    assert (np.abs(theirs.means - wanted) <= 0.51 * steps * (1 + np.abs(wanted)) + 1e-4).all()
+
+
+@pytest.mark.parametrize("name", ["a.sog", "meta.json"])
+def test_sog_of_theirs_and_in_a_folder(tmp_path: Path, name: str) -> None:
+    write_sog_folder(tmp_path / "ours", source(800))
+    assert_equal(read_sog(tmp_path / "ours"), as_read(tmp_path / "ours/meta.json"))
+    write_ply(tmp_path / "model.ply", gaussians(splats(3000)))
+    transformed("-g", "cpu", tmp_path / "model.ply", tmp_path / name)
+    assert_equal(read_sog(tmp_path / name), as_read(tmp_path / name))
+
+
+@pytest.mark.parametrize("level", range(3))
+def test_a_level_of_a_streamed_sog(tmp_path: Path, level: int) -> None:
+    write_streamed(tmp_path, source(30_000, 1), source(500, 0, seed=9), side=8, most=5000, levels=3)
+    transformed("-L", str(level), tmp_path / "lod-meta.json", tmp_path / "level.ply")
+    meta = json.loads((tmp_path / "lod-meta.json").read_text())
+    own = Splats.joined(
+        [read_sog(tmp_path / name) for name in meta["filenames"] if name.startswith(f"{level}_")]
+    )
+    theirs = read_ply(tmp_path / "level.ply")
+    assert len(theirs) == meta["counts"][level] == len(own)
+    np.testing.assert_allclose(theirs.means.numpy(), own.means, rtol=1e-6)
+
+
+def test_glb(tmp_path: Path) -> None:
+    """The same attributes from the same model, whose y splat-transform takes to be down in a PLY."""
+    model = scattered(1000)
+    write_ply(tmp_path / "a.ply", gaussians(model))
+    transformed("-q", tmp_path / "a.ply", tmp_path / "theirs.glb")
+    write_glb(tmp_path / "ours.glb", InMemory(model), None)
+    ours, theirs = read_glb(tmp_path / "ours.glb"), read_glb(tmp_path / "theirs.glb")
+    assert ours.primitive["extensions"] == theirs.primitive["extensions"]
+    assert set(ours.primitive["attributes"]) == set(theirs.primitive["attributes"])
+    for name in (":SCALE", ":OPACITY", ":SH_DEGREE_0_COEF_0"):
+        np.testing.assert_allclose(
+            ours.attribute(EXTENSION + name), theirs.attribute(EXTENSION + name), rtol=1e-5
+        )
+    positions = ours.attribute("POSITION") + ours.matrix[:3, 3]
+    np.testing.assert_allclose(positions * [-1, -1, 1], theirs.attribute("POSITION"), atol=1e-5)
+    assert np.abs(ours.attribute("COLOR_0").astype(int) - theirs.attribute("COLOR_0")).max() <= 1
