@@ -19,7 +19,8 @@ from tests.orchestrator.whole_runs.test_whole_runs import (
 )
 from tests.prepare.video.videos import render, walk, write_video
 
-pytestmark = pytest.mark.system
+# tests/orchestrator/preparation kills each step with a fake of SfM, tests/prepare/sfm the real one.
+pytestmark = [pytest.mark.system, pytest.mark.nightly]
 
 WIDTH = 512
 OPTIONS = ("--width", "128", *SETTINGS)

@@ -1,28 +1,37 @@
-"""A run from and into an object store, whose head is lost in Stage II with its disk."""
+"""A run from and into a store, which goes on where its folder is lost with its disk."""
 
 import os
 import shutil
 import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 
 import psutil
 import pytest
+from typer.testing import CliRunner
 
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.cluster import connection
+from panolog.orchestrator.commands import session
+from panolog.orchestrator.driver.local_pool import LocalPool, local_pool
+from panolog.orchestrator.resources.nodes import Placement
+from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import RunBegan
+from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import read_records
 from panolog.orchestrator.storage.layout import OBJECTS, current
 from panolog.orchestrator.storage.lease import holder
 from panolog.scene.stores.store import Store, open_store
 from panolog.synthetic.make import make_town
-from panolog.workers.tasks import COARSE
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import Stage
 from tests.object_store import ObjectStore, object_store
 from tests.orchestrator.follower.test_whole_run import SECRET, files_with_secrets, observed
-from tests.orchestrator.whole_runs.test_supervised import driver_with
-from tests.orchestrator.whole_runs.test_whole_runs import SETTINGS, Accident, end_of, launch
+from tests.orchestrator.whole_runs.test_whole_runs import SETS, SETTINGS, Accident, end_of, launch, same_bytes
+from tests.ray_head import wait_until
 
 pytestmark = pytest.mark.system
 
@@ -30,7 +39,7 @@ pytestmark = pytest.mark.system
 HELD_IN_A_BLOCK: list[Accident] = [("CheckpointSaved", "block/000", "worker", 0)]
 
 
-LONG = (*SETTINGS, "--iterations", "120")
+BLOCK = "blocks/000/checkpoint.safetensors"
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +51,36 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def calm(town: Path) -> RunFolder:
     """An undisturbed run."""
     folder = RunFolder(town.with_name("calm"))
-    ended = end_of(launch("run", town, "-o", folder.root, *LONG))
-    assert ended.code == 0, ended.stderr
+    with local_pool() as pool:
+        session.start(town, folder.root, load_config(sets=SETS), None, ignore, pool)
     return folder
+
+
+class Interrupted(LocalPool):
+    """Ctrl-C when Stage I has ended."""
+
+    def start(self, placement: Placement, spec: TaskSpec) -> None:
+        if spec.task.stage == Stage.BLOCK:
+            raise KeyboardInterrupt
+        super().start(placement, spec)
+
+
+def test_a_run_in_a_store_goes_on_in_an_empty_folder(
+    tmp_path: Path, town: Path, calm: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PANOLOG_STORE_CACHE", str(tmp_path / "cache"))
+    run, first, second = f"file://{tmp_path}/store", tmp_path / "first", tmp_path / "second"
+    commands = (
+        ["run", town.as_uri(), "-o", run, "--local", first, *SETTINGS],
+        ["resume", run, "--local", second],
+    )
+    for words, pool, code in zip(commands, (Interrupted(), LocalPool()), (130, 0), strict=True):
+        with closing(pool):
+            monkeypatch.setattr(connection, "connect", lambda *_, pool=pool: nullcontext(pool))
+            ended = CliRunner().invoke(app.app, [str(word) for word in words])
+        assert ended.exit_code == code, ended.output
+        shutil.rmtree(first, ignore_errors=True)
+    check_results(open_store(run), RunFolder(second), calm)
 
 
 @pytest.fixture
@@ -65,13 +101,6 @@ def mirrors(cache: Path) -> list[psutil.Process]:
     return found
 
 
-def wait_until(ready: Callable[[], bool], seconds: float = 120.0) -> None:
-    end = time.monotonic() + seconds
-    while not ready():
-        assert time.monotonic() < end
-        time.sleep(0.2)
-
-
 def stored(scene: Path, server: ObjectStore) -> str:
     """The URL of a scene after all of it is in the store."""
     place = open_store(server.url("town"))
@@ -86,6 +115,7 @@ def has(store: Store, name: str) -> bool:
     return manifest is not None and name in manifest.files
 
 
+@pytest.mark.nightly  # all at once: Ray, a real server with faults, kills; each has tests of its own
 def test_a_head_that_is_lost_with_its_disk_is_replaced(
     tmp_path: Path, town: Path, calm: RunFolder, server: ObjectStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -98,8 +128,8 @@ def test_a_head_that_is_lost_with_its_disk_is_replaced(
     scene, run = stored(town, server), server.url("run")
     store = open_store(run)
     with observed() as seen:
-        first = launch("run", scene, "-o", run, *LONG, accidents=HELD_IN_A_BLOCK)
-        wait_until(lambda: first.poll() is not None or has(store, "blocks/000/checkpoint.safetensors"))
+        first = launch("run", scene, "-o", run, *SETTINGS, accidents=HELD_IN_A_BLOCK)
+        wait_until(lambda: first.poll() is not None or has(store, BLOCK), "the block in the store", 300)
         refused = end_of(launch("resume", run, "--local", tmp_path / "other"))
         status = end_of(launch("status", run, "--json"))
         for process in mirrors(cache):
@@ -124,37 +154,11 @@ def test_a_head_that_is_lost_with_its_disk_is_replaced(
     assert all(SECRET not in (store.read(name) or b"") for name in store.list())
 
 
-def test_a_supervised_run_and_its_mirror_survive_that_each_is_killed(
-    tmp_path: Path, town: Path, calm: RunFolder, server: ObjectStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cache = tmp_path / "store"
-    monkeypatch.setenv("PANOLOG_STORE_CACHE", str(cache))
-    monkeypatch.setenv("PANOLOG_STORE_SECONDS", "0.2")
-    for name, value in server.environment.items():
-        monkeypatch.setenv(name, value)
-    scene, url = stored(town, server), server.url("supervised")
-    store = open_store(url)
-    root, killed = tmp_path / "run", list[int]()
-    process = launch("run", scene, "-o", url, "--local", root, "--supervise", *LONG)
-    driver_with(root, lambda state: state.task(COARSE).checkpoint, killed).kill()
-    driver_with(root, lambda state: state.task(COARSE).status == "running", killed)
-    (mirror,) = mirrors(cache)
-    mirror.kill()
-    ended = end_of(process)
-    assert ended.code == 0, ended.stderr
-    assert "its mirror was killed (code -9); another one is at work" in ended.stderr
-    assert "resume 1 of at most" in ended.stderr
-    check_results(store, RunFolder(root), calm)
-    assert mirrors(cache) == []
-
-
 def check_results(store: Store, new: RunFolder, calm: RunFolder) -> None:
     """The run has been resumed, and has the bytes of an undisturbed one; the store has all of it once."""
     drivers = [it.record for it in read_records(new.database) if isinstance(it.record, RunBegan)]
     assert [it.resumed for it in drivers] == [False, True]
-    names = ("coarse/model.ply", "blocks/000/model.ply", "blocks/001/model.ply", "point_cloud.ply")
-    for name in (*names, "partition/plan.json", "eval/seams.json"):
-        assert (new.root / name).read_bytes() == (calm.root / name).read_bytes(), name
+    same_bytes(new.root, calm.root)
     assert store.read("point_cloud.ply") == calm.point_cloud.read_bytes()
     assert holder(store) == ""
     manifest = current(store)

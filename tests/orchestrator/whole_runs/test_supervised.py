@@ -18,19 +18,12 @@ from panolog.orchestrator.run.records import Noticed, Outcome, RunBegan, RunEnde
 from panolog.orchestrator.run.state import RunState, ignore, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.synthetic.make import make_town
-from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.tasks import COARSE
 from tests.ray_head import environment, wait_until
 
 pytestmark = pytest.mark.system
 
-SETTINGS = (
-    "sky.count=100",
-    "checkpoint.every=20",
-    "checkpoint.share=1",
-    "densify.start=10",
-    "densify.every_floor=5",
-    "width=64",
-)
+SETTINGS = ("sky.count=100", "checkpoint.every=20", "checkpoint.share=1", "densify.start=10", "width=64")
 FLAGS = {"iterations": 120, "device": "cpu", "blocks": "1x1x1"}
 OPTIONS = [word for setting in SETTINGS for word in ("--set", setting)]
 OPTIONS += [word for name, value in FLAGS.items() for word in (f"--{name}", str(value))]
@@ -80,20 +73,18 @@ def test_a_run_whose_driver_is_killed_and_loses_ray_ends_with_the_same_bytes(
     root, seen = tmp_path / "run", list[int]()
     process = supervise(scene, root)
     driver_with(root, lambda state: state.task(COARSE).checkpoint, seen).kill()
-    driver = driver_with(root, lambda state: state.task(COARSE).status == "running", seen)
+    driver = driver_with(root, lambda state: "running" in {it.status for it in state.tasks.values()}, seen)
     (head,) = (child for child in driver.children(recursive=True) if child.name() == "gcs_server")
     head.kill()
-    driver_with(root, lambda state: state.task(TaskId.block(0)).checkpoint, seen).kill()
-    _, stderr = process.communicate(timeout=300)
+    _, stderr = process.communicate(timeout=480)
     assert process.returncode == 0, stderr
     assert "Traceback" not in stderr
     records = [item.record for item in read_records(RunFolder(root).database, limit=10**6)]
-    assert [record.pid for record in records if isinstance(record, RunBegan)][:3] == seen
+    assert [record.pid for record in records if isinstance(record, RunBegan)][:2] == seen
     notices = [record.message for record in records if isinstance(record, Noticed) and record.task is None]
     assert [notice.removeprefix("resumed by the supervisor after: ")[:25] for notice in notices] == [
         "killed by signal 9 (SIGKI",
         "exit code 1 without a rec",
-        "killed by signal 9 (SIGKI",
     ]
     assert [record.outcome for record in records if isinstance(record, RunEnded)] == ["done"]
     calm = tmp_path / "calm"
@@ -102,22 +93,17 @@ def test_a_run_whose_driver_is_killed_and_loses_ray_ends_with_the_same_bytes(
     assert (root / "point_cloud.ply").read_bytes() == (calm / "point_cloud.ply").read_bytes()
 
 
-@pytest.mark.parametrize("when", ["calibrating", "training"])
-def test_ctrl_c_of_a_terminal_stops_supervisor_and_driver(scene: Path, tmp_path: Path, when: str) -> None:
+def test_ctrl_c_of_a_terminal_stops_supervisor_and_driver_after_a_fresh_checkpoint(
+    scene: Path, tmp_path: Path
+) -> None:
     root = tmp_path / "run"
     process = supervise(scene, root, "--iterations", "100000")
-    if when == "training":
-        driver_with(root, lambda state: state.task(COARSE).checkpoint, [])
-    else:
-        driver_with(root, lambda state: state.step == "calibrating", [])
+    driver_with(root, lambda state: state.task(COARSE).checkpoint, [])
     os.killpg(process.pid, signal.SIGINT)  # the driver gets it twice
-    _, stderr = process.communicate(timeout=120)
+    _, stderr = process.communicate(timeout=480)
     assert process.returncode == 130, stderr
     assert "Traceback" not in stderr
-    if when == "training":
-        records = [item.record for item in read_records(RunFolder(root).database)]
-        assert TaskYielded(COARSE) in records  # after a fresh checkpoint
-        assert records[-1] == RunEnded(Outcome.INTERRUPTED)
-        assert f"panolog: stopped; `panolog resume {root}` resumes the run" in stderr.splitlines()
-    else:
-        assert not root.exists()
+    records = [item.record for item in read_records(RunFolder(root).database)]
+    assert TaskYielded(COARSE) in records
+    assert records[-1] == RunEnded(Outcome.INTERRUPTED)
+    assert f"panolog: stopped; `panolog resume {root}` resumes the run" in stderr.splitlines()

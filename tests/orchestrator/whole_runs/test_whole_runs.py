@@ -1,8 +1,10 @@
-"""Whole runs through Ray, undisturbed and killed at every stage: the result is the same to the byte."""
+"""Whole runs through Ray, undisturbed and with killed workers, and without Ray: the same bytes."""
 
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,30 +16,31 @@ import pytest
 from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app
+from panolog.orchestrator.cluster import connection
+from panolog.orchestrator.commands import session
+from panolog.orchestrator.driver.local_pool import local_pool
+from panolog.orchestrator.money.limits import Wanted
+from panolog.orchestrator.money.prices import read_prices
+from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import RunEnded, TaskStarted
+from panolog.orchestrator.run.records import CheckpointSaved, Stored, TaskStarted
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.scene.ply import ply_header
 from panolog.synthetic.make import make_town
-from panolog.workers.tasks import COARSE, PLAN, TaskId
+from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.examples.test_examples import example
 
 pytestmark = pytest.mark.system
 
-SETTINGS = tuple(
-    word
-    for setting in (
-        *("iterations=60", "sky.count=100", "checkpoint.every=20", "checkpoint.share=1"),
-        *("device=cpu", "densify.start=10", "densify.every_floor=5"),
-    )
-    for word in ("--set", setting)
-)
+SETS = ("iterations=60", "sky.count=100", "checkpoint.every=20", "checkpoint.share=1")
+SETS += ("device=cpu", "densify.start=10", "densify.every_floor=5")
+SETTINGS = tuple(word for setting in SETS for word in ("--set", setting))
 
 # A driver with accidents: after the first record of a kind and task it, or the worker, gets a signal.
-# A worker that is to get one waits for it, however quick it is. In the merge the signal precedes the rename.
+# A worker that is to get one waits for it, however quick it is.
 SCRIPT = """
-import json, os, signal, sys, time
+import json, os, sys, time
 from dataclasses import dataclass, replace
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import session
@@ -46,7 +49,6 @@ from panolog.workers import stopping
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.training.trainer import TrainSpec
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 accidents, workers = json.loads(sys.argv.pop(1)), {}
 
 def strike(stored):
@@ -56,10 +58,7 @@ def strike(stored):
             workers[task] = record.pid
         if accidents and accidents[0][:2] == [name, task]:
             *_, victim, number = accidents.pop(0)
-            if victim == "terminal":
-                os.killpg(0, number)
-            else:
-                os.kill(workers[task] if victim == "worker" else os.getpid(), number)
+            os.kill(workers[task] if victim == "worker" else os.getpid(), number)
 
 def waiting(kind):
     @dataclass(frozen=True, eq=False, kw_only=True)
@@ -77,7 +76,7 @@ def waiting(kind):
 WAITING = {kind: waiting(kind) for kind in (TrainSpec, EvaluateSpec)}
 
 def wait(spec):
-    kinds = {"CheckpointSaved": "Checkpoint", "PreviewSaved": "Preview", "ViewEvaluated": "Evaluated"}
+    kinds = {"CheckpointSaved": "Checkpoint", "ViewEvaluated": "Evaluated"}
     of_task = [(kind, victim) for kind, task, victim, _ in accidents if task == str(spec.task)]
     awaited = [kinds[kind] for kind, victim in of_task if victim != "driver"]
     return WAITING[type(spec)](**vars(spec), awaited=awaited[0]) if awaited else spec
@@ -92,13 +91,7 @@ def driver(job, journal, pool, hooks, stop):
     journal.on_change = on_change
     return Driver(job, journal, pool, replace(hooks, on_start=wait), stop)
 
-def merging(event, arguments):
-    merged = event == "os.rename" and "point_cloud.ply" in str(arguments[1])
-    if merged and accidents and accidents[0][0] == "merging":
-        os.kill(os.getpid(), signal.SIGKILL)
-
 session.Driver = driver
-sys.addaudithook(merging)
 app.main()
 """
 Accident = tuple[str, str, str, int]
@@ -106,9 +99,11 @@ IN_STAGE_ONE: list[Accident] = [
     ("CheckpointSaved", "coarse", "worker", 9),
     ("CheckpointSaved", "coarse", "driver", 9),
 ]
-IN_A_BLOCK: list[Accident] = [("CheckpointSaved", "block/000", "driver", 9)]
-IN_THE_MERGE: list[Accident] = [("merging", "", "driver", 9)]
-CTRL_C: list[Accident] = [("TaskStarted", "eval", "driver", 2)]
+OF_WORKERS: list[Accident] = [
+    ("CheckpointSaved", "coarse", "worker", 9),
+    ("CheckpointSaved", "block/000", "worker", 9),
+    ("ViewEvaluated", "eval", "worker", 9),
+]
 
 
 def launch(*arguments: object, accidents: list[Accident] | None = None) -> subprocess.Popen[str]:
@@ -143,16 +138,16 @@ def wait_for_workers(root: Path) -> None:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended, Path]:
-    """An undisturbed run, what it said, and the folder of one that was killed in Stage I at the same time."""
+    """An undisturbed run, what it said, and the folder of one whose workers were killed."""
     folder = tmp_path_factory.mktemp("recovery")
     scene = make_town(folder / "town", panoramas=9, width=64, points=300)
     calm, killed = folder / "calm", folder / "killed"
     processes = [
         launch("run", scene, "-o", calm, *SETTINGS),
-        launch("run", scene, "-o", killed, *SETTINGS, accidents=IN_STAGE_ONE),
+        launch("run", scene, "-o", killed, *SETTINGS, accidents=OF_WORKERS),
     ]
     calm_end, killed_end = map(end_of, processes)
-    assert killed_end.code == -9, killed_end.stderr
+    assert (killed_end.code, killed_end.stdout) == (0, ""), killed_end.stderr
     return calm, calm_end, killed
 
 
@@ -173,66 +168,64 @@ def test_a_run_says_where_everything_is_and_leaves_nothing_behind(runs: tuple[Pa
     assert not list(root.rglob("*.part"))
 
 
-def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, Ended, Path]) -> None:
-    calm, _, killed = runs
-    task = state_of(killed).task(COARSE)
-    assert (task.retries, task.checkpoint) == (1, 40)
-    wait_for_workers(killed)
-    for accidents, done in ((IN_A_BLOCK, PLAN), (IN_THE_MERGE, TaskId.block(0))):
-        end = end_of(launch("resume", killed, accidents=accidents))
-        assert end.code == -9, end.stderr
-        assert state_of(killed).status(done) == "done"
-        assert not RunFolder(killed).point_cloud.exists()
-        wait_for_workers(killed)
-    assert list(killed.glob(".point_cloud.ply.*.part"))
-    interrupted = end_of(launch("resume", killed, accidents=CTRL_C))
-    assert (interrupted.code, interrupted.stdout) == (130, ""), interrupted.stderr
-    assert "Traceback" not in interrupted.stderr
-    assert state_of(killed).outcome == "interrupted"
-    end = end_of(launch("resume", killed))
-    assert end.code == 0, end.stderr
-    ends = [s.record for s in read_records(RunFolder(killed).database) if isinstance(s.record, RunEnded)]
-    assert [record.outcome for record in ends] == ["interrupted", "done"]
-    assert not list(killed.rglob("*.part"))
-    for name in ("coarse/model.ply", "blocks/000/model.ply", "blocks/001/model.ply", "point_cloud.ply"):
-        assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
-    for name in ("partition/plan.json", "eval/seams.json", "eval/seams/000-001/merged.jpg"):
-        assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
-
-
-def test_ctrl_c_leaves_fresh_checkpoints_and_a_limit_delivers_what_there_is(
-    runs: tuple[Path, Ended, Path], tmp_path: Path
+def test_a_run_whose_workers_are_killed_in_each_stage_ends_with_the_same_bytes(
+    runs: tuple[Path, Ended, Path],
 ) -> None:
-    """The whole foreground of a terminal gets the signal; without the limit the bytes are the same again."""
+    calm, _, killed = runs
+    records = [stored.record for stored in read_records(RunFolder(killed).database)]
+    starts = [record for record in records if isinstance(record, TaskStarted)]
+    for task, iterations in ((COARSE, [0, 20]), (TaskId.block(0), [0, 20]), (EVAL, [0, 0])):
+        assert [start.iteration for start in starts if start.task == task] == iterations
+    same_bytes(killed, calm)
+    assert not list(killed.rglob("*.part"))
+
+
+def same_bytes(ours: Path, theirs: Path) -> None:
+    names = ("coarse/model.ply", "blocks/000/model.ply", "blocks/001/model.ply", "point_cloud.ply")
+    for name in (*names, "partition/plan.json", "eval/seams.json", "eval/seams/000-001/merged.jpg"):
+        assert (ours / name).read_bytes() == (theirs / name).read_bytes(), name
+
+
+def test_a_limit_delivers_what_there_is_and_without_it_the_bytes_are_the_same(
+    runs: tuple[Path, Ended, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calm, _, _ = runs
     root, prices = tmp_path / "run", tmp_path / "prices.toml"
     prices.write_text('currency = "EUR"\n[[machine]]\nname = "any"\nprice = 3600\nhost = "*"\n')
-    more = ("--set", "checkpoint.every=1000", "--set", "preview.every=20", "--prices", prices)
-    commands: dict[TaskId, tuple[object, ...]] = {
-        COARSE: ("run", calm.parent / "town", "-o", root, *SETTINGS, *more),
-        TaskId.block(1): ("resume", root),
-    }
-    for task, command in commands.items():
-        end = end_of(launch(*command, accidents=[("PreviewSaved", str(task), "terminal", 2)]))
-        assert (end.code, end.stdout) == (130, ""), end.stderr
-        state = state_of(root)
-        assert (state.outcome, state.task(task).retries) == ("interrupted", 0)
-        assert 0 < (state.task(task).checkpoint or 0) < 60
+
+    def interrupt(_: RunState, news: Sequence[Stored]) -> None:
+        for stored in news:
+            if isinstance(stored.record, CheckpointSaved) and stored.record.task == TaskId.block(1):
+                raise KeyboardInterrupt
+
+    with local_pool() as pool, pytest.raises(KeyboardInterrupt):
+        wanted = Wanted(prices=read_prices(prices))
+        town, config = calm.parent / "town", load_config(sets=SETS)
+        session.start(town, root, config, None, interrupt, pool, wanted=wanted)
     cost = state_of(root).money.used.cost
     assert cost > 0
-    end = end_of(launch("resume", root, "--max-cost", cost * 1.001))  # which is used up by what follows
-    assert (end.code, end.stdout) == (0, ""), end.stderr
-    assert "ended early: the limit of" in end.stderr
-    limited = state_of(root)
-    assert (limited.outcome, limited.status(TaskId.block(1))) == ("limited", "waiting")
-    assert limited.merged is not None
-    assert (limited.metrics or {})["psnr"] is not None
-    assert "<h2>Cost</h2>" in RunFolder(root).report.read_text()
-    again = end_of(launch("resume", root))
-    assert (again.code, state_of(root)) == (0, limited), again.stderr
-    end = end_of(launch("resume", root, "--max-cost", "none"))
-    assert (end.code, state_of(root).outcome) == (0, "done"), end.stderr
-    assert (root / "point_cloud.ply").read_bytes() == (calm / "point_cloud.ply").read_bytes()
+    with local_pool() as pool:
+        monkeypatch.setattr(connection, "connect", lambda *_: nullcontext(pool))
+        said = resumed(root, cost * 1.001)  # which is used up by what follows
+        assert "ended early: the limit of" in said
+        limited = state_of(root)
+        assert (limited.outcome, limited.status(TaskId.block(1))) == ("limited", "waiting")
+        assert limited.merged is not None
+        assert (limited.metrics or {})["psnr"] is not None
+        assert "<h2>Cost</h2>" in RunFolder(root).report.read_text()
+        resumed(root)
+        assert state_of(root) == limited
+        resumed(root, "none")
+    assert state_of(root).outcome == "done"
+    same_bytes(root, calm)
+
+
+def resumed(root: Path, *limit: object) -> str:
+    """What a driver says until its end. Args: limit, of cost, unless it stays as it is."""
+    words = [str(word) for it in limit for word in ("--max-cost", it)]
+    result = CliRunner().invoke(app.app, ["resume", str(root), *words])
+    assert result.exit_code == 0, result.output
+    return result.stderr
 
 
 def call(*arguments: object) -> Any:
@@ -318,5 +311,4 @@ def test_the_example_without_ray_ends_with_the_same_bytes(
     example("run_without_ray")([str(calm.parent / "town"), str(root), *SETTINGS])
     assert "eval: EvaluationSaved" in capsys.readouterr().out
     assert state_of(root).outcome == "done"
-    for name in ("coarse/model.ply", "blocks/001/model.ply", "point_cloud.ply", "partition/plan.json"):
-        assert (root / name).read_bytes() == (calm / name).read_bytes(), name
+    same_bytes(root, calm)
