@@ -16,6 +16,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing.util import Finalize
 from pathlib import Path
 
 import pytest
@@ -27,11 +28,7 @@ _MINE = "PANOLOG_TESTS"  # in the environment of all processes that this one has
 # Helpers of Python itself; they end with this process.
 _SERVERS = ("multiprocessing.forkserver", "multiprocessing.resource_tracker")
 _POOLS = ("fsspecIO", "asyncio_", "AnyIO worker thread", "ray_", "tqdm")  # threads of libraries
-_CACHES = (
-    "pymp-",
-    "torchinductor_",
-    ".ses",
-)  # files that Python, torch and ONNX Runtime keep for the process
+_CACHES = ("pymp-", "torchinductor_", ".ses")  # files of Python, torch and ONNX Runtime
 
 Found = dict[str, int]  # description -> the process, or 0
 
@@ -111,7 +108,8 @@ def configure(config: pytest.Config) -> None:
     os.environ[_MINE] = str(os.getpid())
     folder = tempfile.mkdtemp(prefix="pano-")  # short: paths of sockets are limited to 107 bytes
     os.environ["TMPDIR"] = tempfile.tempdir = folder
-    config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    # After multiprocessing has removed its own folder there, at -100.
+    Finalize(None, shutil.rmtree, (folder, True), exitpriority=-200)
     config.pluginmanager.register(LeakCheck(), "leaks")
 
 
