@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 import cv2
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from panolog.orchestrator.cli import app
 from panolog.prepare.sfm import pipeline
 from panolog.prepare.sfm.report import SfmReport
 from panolog.scene.read import read_scene
 from tests.data import reduced
+from tests.orchestrator.cli.program import call
 from tests.prepare.video.videos import render, walk
 
 pytestmark = pytest.mark.system
@@ -72,7 +72,7 @@ def resumed(images: Path, tmp_path_factory: pytest.TempPathFactory) -> Resumed:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "make_scene", keep)
-        result = CliRunner().invoke(app.app, ["scene", "sfm", str(images), "-o", str(output), "--json"])
+        result = call("scene", "sfm", images, "-o", output, "--json")
     assert result.exit_code == 0, result.output
     return Resumed(process.returncode, seen, left, output, result, made[0])
 
@@ -90,7 +90,7 @@ def test_a_scene_and_its_report(resumed: Resumed) -> None:
 
 def test_lines_for_people(resumed: Resumed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline, "make_scene", lambda *_: resumed.made)
-    result = CliRunner().invoke(app.app, ["scene", "sfm", "images", "-o", str(tmp_path)])
+    result = call("scene", "sfm", "images", "-o", tmp_path)
     assert result.exit_code == 0
     assert result.stdout.startswith("5 of 5 panoramas have a pose")
     assert "the world: z up, units of no known scale" in result.stdout
@@ -98,7 +98,7 @@ def test_lines_for_people(resumed: Resumed, tmp_path: Path, monkeypatch: pytest.
 
 def test_four_places_end_with_one_line(tmp_path: Path) -> None:
     source = reduced("unconnected", 640, tmp_path / "images")
-    result = CliRunner().invoke(app.app, ["scene", "sfm", str(source), "-o", str(tmp_path / "scene")])
+    result = call("scene", "sfm", source, "-o", tmp_path / "scene")
     assert result.exit_code == 2
     assert not (tmp_path / "scene").exists()
     last = result.stderr.strip().splitlines()[-1]
@@ -107,8 +107,7 @@ def test_four_places_end_with_one_line(tmp_path: Path) -> None:
 
 
 def test_an_option_that_is_none(images: Path, tmp_path: Path) -> None:
-    arguments = ["scene", "sfm", str(images), "-o", str(tmp_path / "scene"), "--mapper", "magic"]
-    assert CliRunner().invoke(app.app, arguments).exit_code == 2
+    assert call("scene", "sfm", images, "-o", tmp_path / "scene", "--mapper", "magic").exit_code == 2
     assert list(tmp_path.iterdir()) == []
 
 

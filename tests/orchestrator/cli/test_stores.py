@@ -3,12 +3,11 @@
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app
 from panolog.orchestrator.storage.plan import local_folder, plan_from_json, plan_of, to_json
 from panolog.scene.errors import ConfigError
 from panolog.scene.stores.cache import FOLDER
+from tests.orchestrator.cli.program import call
 
 LOCAL = "takes files and folders of this machine only"
 
@@ -40,7 +39,7 @@ def test_a_url_that_cannot_be_used_is_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(FOLDER, str(tmp_path / "cache"))
-    end = CliRunner().invoke(app.app, words)
+    end = call(*words)
     assert (end.exit_code, end.stdout) == (2, "")
     said = [it for it in end.stderr.splitlines() if it.startswith("panolog: ")]
     assert len(said) == 1
