@@ -215,15 +215,6 @@ def test_a_folder_that_cannot_be_written_is_a_failed_run_with_a_reason(
     assert [end.outcome for end in harness.records(RunEnded)] == ["failed"]
 
 
-def test_a_checkpoint_that_a_kill_has_left_is_removed(harness: Harness) -> None:
-    harness.drive()
-    checkpoints = [harness.folder.checkpoint(task) for task in (COARSE, TaskId.block(0))]
-    for path in checkpoints:
-        path.touch()
-    harness.drive(resumed=True)
-    assert not any(path.exists() for path in checkpoints)
-
-
 @pytest.mark.parametrize("refine", [True, False])
 def test_every_ply_notes_the_offset_of_the_scene(tmp_path: Path, refine: bool) -> None:
     harness, offset = Harness(tmp_path, refine=refine), (465_000.0, 5_250_000.0, 408.0)

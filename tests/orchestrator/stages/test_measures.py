@@ -5,7 +5,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 
@@ -19,7 +18,6 @@ from panolog.orchestrator.run.records import (
     PlanSaved,
     SeamEvaluated,
 )
-from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.scene.errors import RunError
 from panolog.scene.files import Locate, here
 from panolog.scene.ply import read_ply
@@ -140,39 +138,6 @@ def test_a_shard_gets_its_own_panoramas_and_no_model_of_the_whole_place(tmp_path
     assert spec.seams.coarse == ModelFile(folder.seen_coarse(SHARDS[2]))
     assert noting.scene == files(harness.job.scene.train)
     assert noting.run == {folder.seen(SHARDS[2]), folder.seen_coarse(SHARDS[2])}
-
-
-@pytest.mark.parametrize("killed", SHARDS, ids=str)
-def test_a_killed_driver_leaves_the_shards_that_are_missing(tmp_path: Path, killed: TaskId) -> None:
-    harness, whole = measuring(tmp_path / "killed"), measuring(tmp_path / "whole")
-    whole.drive()
-
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        for event in well(spec):
-            yield event
-            if spec.task == killed:
-                raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        harness.drive(script)
-    done = [record.task for record in harness.records(MeasuresSaved)]
-    assert killed not in done and not harness.folder.metrics.exists()
-    assert harness.folder.seen(killed).exists()
-    assert harness.drive(resumed=True).outcome == "done"
-    assert harness.tasks == [task for task in SHARDS if task not in done]
-    assert outcome(harness) == outcome(whole)
-
-
-def test_a_driver_that_was_killed_after_the_last_shard_only_joins_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    harness = measuring(tmp_path)
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr(Evaluation, "join", Mock(side_effect=KeyboardInterrupt))
-        harness.drive()
-    assert len(harness.records(MeasuresSaved)) == 3
-    assert harness.drive(resumed=True).outcome == "done"
-    assert harness.tasks == []
 
 
 def test_a_worker_that_dies_measures_again(tmp_path: Path) -> None:

@@ -3,13 +3,10 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
-import pytest
 import torch
 
-from panolog.orchestrator.driver import results
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import ModelSaved, Noticed, PlanSaved
 from panolog.orchestrator.stages.partitioning import plan_records
@@ -57,21 +54,6 @@ def test_districts_are_trained_apart_and_joined(tmp_path: Path) -> None:
     torch.testing.assert_close(coarse.sh0[coarse.scene.stop :], models[0].sh0[models[0].scene.stop :] + 0.5)
     saved = [record for record in harness.records(ModelSaved) if record.task == COARSE]
     assert [(record.gaussians, record.path) for record in saved] == [(len(coarse), "coarse/model.ply")]
-
-
-def test_killed_before_the_union_it_ends_in_the_same_bytes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole, killed = halves(tmp_path / "whole"), halves(tmp_path / "killed")
-    whole.drive(shifted)
-    with monkeypatch.context() as patch:
-        patch.setattr(results, "join_districts", Mock(side_effect=KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            killed.drive(shifted)
-    assert not killed.folder.model(COARSE).exists()
-    assert killed.drive(shifted, resumed=True).outcome == "done"
-    assert not set(BOTH) & set(killed.tasks)
-    assert killed.folder.point_cloud.read_bytes() == whole.folder.point_cloud.read_bytes()
 
 
 def test_a_sky_that_has_lost_rows_does_not_count(tmp_path: Path) -> None:

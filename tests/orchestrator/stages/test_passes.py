@@ -3,12 +3,10 @@
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 import torch
 
-from panolog.orchestrator.driver import results
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.records import ModelSaved, Noticed
 from panolog.partition.plan import read_plan
@@ -76,20 +74,6 @@ def test_what_fails_in_a_pass_stays_as_it_was(tmp_path: Path, task: TaskId) -> N
     assert models[0].sh0.sum() < models[1].sh0.sum()
     assert harness.drive(resumed=True).outcome == "done"
     assert harness.folder.point_cloud.read_bytes() == whole.folder.point_cloud.read_bytes()
-
-
-@pytest.mark.parametrize("action", ["unite_blocks", "merge_run"])
-def test_killed_between_passes_it_ends_in_the_same_bytes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, action: str
-) -> None:
-    whole, killed = passing(tmp_path / "whole"), passing(tmp_path / "killed")
-    whole.drive()
-    with monkeypatch.context() as patch:
-        patch.setattr(results, action, Mock(side_effect=KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            killed.drive()
-    assert killed.drive(resumed=True).outcome == "done"
-    assert killed.folder.point_cloud.read_bytes() == whole.folder.point_cloud.read_bytes()
 
 
 def test_a_block_that_is_tried_again_is_in_all_that_follows(tmp_path: Path) -> None:
