@@ -41,8 +41,11 @@ def chromium() -> str:
 
 
 @contextmanager
-def software_page(url: str) -> Iterator[Page]:
-    """A page of 800×600 pixels in Debian's Chromium; at the end, nothing may have gone wrong in it."""
+def software_page(url: str, first: str = "") -> Iterator[Page]:
+    """A page of 800×600 pixels in Debian's Chromium; at the end, nothing may have gone wrong in it.
+
+    Args: first, a script that runs before those of the page.
+    """
     path, wrong = chromium(), list[str]()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", *SOFTWARE])
@@ -52,8 +55,10 @@ def software_page(url: str) -> Iterator[Page]:
             page.on(
                 "console", lambda message: wrong.append(message.text) if message.type == "error" else None
             )
+            page.add_init_script(first)
+            page.set_default_timeout(300_000)
             page.goto(url)
             yield page
         finally:
             browser.close()
-            assert not wrong  # which also explains what else has failed
+            assert wrong == []  # which also explains what else has failed

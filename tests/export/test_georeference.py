@@ -28,7 +28,7 @@ def test_east_north_up() -> None:
 
 
 def test_projected_coordinates() -> None:
-    pyproj = pytest.importorskip("pyproj")
+    pyproj = pytest.importorskip("pyproj", reason="pyproj is not installed")
     east, north = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(11.575, 48.137)
     place = Georeference(up=(0, 0, 1), middle=(5, 6, 7), offset=(east, north, 560), epsg=32632)
     ecef = place.to_ecef()

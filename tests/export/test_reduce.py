@@ -29,13 +29,6 @@ def all_of(source: Reduced) -> Splats:
     return Splats.joined(list(source.pieces()))
 
 
-def test_a_small_model_stays_as_it_is() -> None:
-    model = some(50)
-    reduced = Reduced(InMemory(model), 50)
-    assert (reduced.count, reduced.degree) == (50, 0)
-    assert (all_of(reduced).means == model.means).all()
-
-
 def test_of_a_large_model_those_remain_that_cover_most_in_their_order() -> None:
     model = some(2 * ROWS + 300)
     model.sh0[:, 0] = np.arange(len(model))
@@ -66,3 +59,4 @@ def test_a_model_in_one_point_has_an_extent() -> None:
     assert np.allclose(middle, model.means[0])
     assert radius == 1
     assert len(all_of(Reduced(InMemory(model), 2))) == 2
+    assert len(all_of(Reduced(InMemory(model), 5))) == 5

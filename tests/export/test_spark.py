@@ -11,7 +11,7 @@ from tests.export.browser import serving, software_page
 from tests.export.gaussians import C0, scattered
 from tests.export.peers import peer
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.nightly]
 
 PAGE = """<!doctype html>
 <link rel="icon" href="data:," />

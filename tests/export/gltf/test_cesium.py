@@ -21,16 +21,10 @@ from tests.export.gaussians import Triple, cluster, scattered
 from tests.export.gltf.reading import read_glb
 from tests.export.peers import peer
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.nightly]
 
 PLACE = (48.137, 11.575, 520.0)  # latitude, longitude, height
 EAST, NORTH, UP, TINY = (10.0, 0.0, 0.0), (0.0, 10.0, 0.0), (0.0, 0.0, 10.0), (0.0, 0.0, 0.0)
-SOFTWARE = (
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-)
 PAGE = Path(__file__).with_name("cesium.html")
 
 

@@ -1,13 +1,12 @@
 """3D Tiles: the structure that OGC 22-025r4 prescribes, content within its bounds, and levels of detail."""
 
-import hashlib
 import json
+import re
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -22,62 +21,23 @@ from tests.export.gaussians import matched, scattered
 from tests.export.gltf.reading import read_glb
 
 SPZ = "KHR_gaussian_splatting_compression_spz_2"
-# The properties of a tileset that are used here, as the specification's schemas require them. CesiumGS's own
-# validator is not on npm.
-NUMBERS = {"type": "array", "items": {"type": "number"}}
-SCHEMA: dict[str, Any] = {
-    "type": "object",
-    "required": ["asset", "geometricError", "root"],
-    "additionalProperties": False,
-    "properties": {
-        "asset": {
-            "type": "object",
-            "required": ["version"],
-            "properties": {"version": {"const": "1.1"}, "tilesetVersion": {"type": "string"}, "extras": {}},
-            "additionalProperties": False,
-        },
-        "geometricError": {"type": "number", "minimum": 0},
-        "root": {"allOf": [{"$ref": "#/$defs/tile"}, {"required": ["refine"]}]},
-        "extensionsUsed": {"type": "array", "items": {"type": "string"}, "uniqueItems": True, "minItems": 1},
-        "extensions": {"type": "object"},
-    },
-    "$defs": {
-        "tile": {
-            "type": "object",
-            "required": ["boundingVolume", "geometricError"],
-            "additionalProperties": False,
-            "properties": {
-                "boundingVolume": {
-                    "type": "object",
-                    "required": ["box"],
-                    "properties": {"box": {**NUMBERS, "minItems": 12, "maxItems": 12}},
-                    "additionalProperties": False,
-                },
-                "geometricError": {"type": "number", "minimum": 0},
-                "refine": {"enum": ["ADD", "REPLACE"]},
-                "transform": {**NUMBERS, "minItems": 16, "maxItems": 16},
-                "content": {
-                    "type": "object",
-                    "required": ["uri"],
-                    "properties": {"uri": {"type": "string", "pattern": "^[0-9-]+[.]glb$"}},
-                    "additionalProperties": False,
-                },
-                "children": {
-                    "type": "array",
-                    "items": {"$ref": "#/$defs/tile"},
-                    "minItems": 1,
-                    "uniqueItems": True,
-                },
-            },
-        }
-    },
-}
+TILE = {"boundingVolume", "geometricError", "refine", "transform", "content", "children"}
 
 
 def tileset(folder: Path) -> dict[str, Any]:
-    """The tileset, which fulfils the schema."""
+    """The tileset, which has what the specification's schemas require, and nothing else.
+
+    CesiumGS's own validator is not on npm.
+    """
     found: dict[str, Any] = json.loads((folder / "tileset.json").read_text())
-    jsonschema.validate(found, SCHEMA)
+    assert set(found) - {"extensionsUsed", "extensions"} == {"asset", "geometricError", "root"}
+    assert found["asset"]["version"] == "1.1" and found["root"]["refine"] in ("ADD", "REPLACE")
+    for tile in (found["root"], *(child for _, child in below(found["root"]))):
+        assert {"boundingVolume", "geometricError"} <= set(tile) <= TILE
+        assert set(tile["boundingVolume"]) == {"box"} and len(tile["boundingVolume"]["box"]) == 12
+        assert tile["geometricError"] >= 0 and len(tile.get("transform", range(16))) == 16
+        assert re.fullmatch("[0-9-]+[.]glb", tile.get("content", {"uri": "0.glb"})["uri"])
+        assert tile.get("children", True)
     return found
 
 
@@ -102,7 +62,7 @@ def corners(tile: dict[str, Any]) -> tuple[Any, Any]:
     return box[0] - np.diag(box[1:]), box[0] + np.diag(box[1:])
 
 
-def street(count: int = 20_000) -> Splats:
+def street(count: int = 12_000) -> Splats:
     """A long model, which is cut."""
     splats = scattered(count, 1, extent=1)
     return Splats(**splats.columns() | {"means": splats.means * np.array([100, 5, 20], np.float32)})
@@ -174,11 +134,11 @@ def test_the_transform_leads_to_the_earth(written: Path, tmp_path: Path) -> None
 
 def test_equal_models_are_equal_bytes(written: Path, tmp_path: Path) -> None:
     write_tiles(tmp_path / "again", InMemory(street()), to_ecef=enu_to_ecef(48, 11, 500), side=60, levels=3)
-    names = sorted(file.name for file in written.iterdir())
-    assert names == sorted(file.name for file in (tmp_path / "again").iterdir())
-    for name in names:
-        files = [(folder / name).read_bytes() for folder in (written, tmp_path / "again")]
-        assert len({hashlib.sha256(file).digest() for file in files}) == 1, name
+    first, second = (
+        {file.name: file.read_bytes() for file in folder.iterdir()}
+        for folder in (written, tmp_path / "again")
+    )
+    assert first == second
 
 
 def test_the_folder_appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,23 +156,17 @@ def test_the_folder_appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pyt
     assert [file.name for file in tmp_path.iterdir()] == ["empty"]
 
 
-@pytest.mark.parametrize("wrong", ["scaled", "mirrored", "sheared", "not finite", "small", "projective"])
-def test_transforms_that_are_none(tmp_path: Path, wrong: str) -> None:
-    matrix = enu_to_ecef(48, 11, 500)
-    match wrong:
-        case "scaled":
-            matrix[:3, :3] *= 1.01
-        case "mirrored":
-            matrix[:3, 0] *= -1
-        case "sheared":
-            matrix[0, 1] += 0.1
-        case "not finite":
-            matrix[0, 3] = np.nan
-        case "small":
-            matrix = matrix[:3]
-        case _:
-            matrix[3, 0] = 1
-    with pytest.raises(FormatError, match="no rotation and translation"):
-        write_tiles(tmp_path / "a", InMemory(scattered(100)), to_ecef=matrix)
+def test_transforms_that_are_none(tmp_path: Path) -> None:
+    right = enu_to_ecef(48, 11, 500)
+    place = np.diag([0, 0, 0, 1.0])
+    wrong = [
+        *(right @ np.diag([factor, 1, 1, 1]) for factor in (1.01, -1, np.nan)),
+        right + np.roll(place, 2),  # sheared
+        right + np.roll(place, -3),  # projective
+        right[:3],
+    ]
+    for matrix in wrong:
+        with pytest.raises(FormatError, match="no rotation and translation"):
+            write_tiles(tmp_path / "a", InMemory(scattered(100)), to_ecef=matrix)
     with pytest.raises(FormatError, match="no Gaussian"):
         write_tiles(tmp_path / "a", InMemory(scattered(0)), to_ecef=None)
