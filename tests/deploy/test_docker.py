@@ -14,7 +14,7 @@ pytestmark = pytest.mark.system
 
 def test_hadolint_accepts_it() -> None:
     ended = subprocess.run(
-        [BIN / "hadolint", DEPLOY / "Dockerfile"], check=False, capture_output=True, text=True, timeout=60
+        [BIN / "hadolint", DEPLOY / "Dockerfile"], check=False, capture_output=True, text=True
     )
     assert (ended.returncode, ended.stdout) == (0, ""), ended.stdout
 
@@ -37,6 +37,7 @@ def test_the_build_context_has_the_sources_of_the_wheel() -> None:
         assert any(fnmatch(name, pattern) or name.startswith(f"{pattern}/") for pattern in kept), name
 
 
+@pytest.mark.nightly  # most machines have no docker that builds
 def test_docker_itself_accepts_it() -> None:
     if shutil.which("docker") is None:
         pytest.skip("there is no docker on this machine")
@@ -45,5 +46,5 @@ def test_docker_itself_accepts_it() -> None:
     ).returncode:
         pytest.skip("docker cannot build on this machine: no daemon, or no buildx")
     command = ["docker", "build", "--check", "--file", "deploy/Dockerfile", "."]
-    ended = subprocess.run(command, check=False, cwd=ROOT, capture_output=True, text=True, timeout=280)
+    ended = subprocess.run(command, check=False, cwd=ROOT, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr

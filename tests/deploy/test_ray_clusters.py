@@ -1,11 +1,9 @@
 """The files for `ray up`: Ray's own schema, and what Ray does with them when SSH is a fake."""
 
-import copy
 import os
 import subprocess
 from pathlib import Path
 
-import jsonschema
 import pytest
 from ray.autoscaler._private.util import prepare_config, validate_config
 
@@ -19,19 +17,8 @@ NAMES = ("on-premises.yaml", "aws.yaml")
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_ray_accepts_it(name: str) -> None:
+def test_ray_accepts_it_and_every_ray_start_uses_the_token_and_notices_lost_machines(name: str) -> None:
     validate_config(prepare_config(load(name)))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_ray_would_refuse_a_wrong_key(name: str) -> None:
-    config = copy.deepcopy(load(name)) | {"setup_comands": []}
-    with pytest.raises(jsonschema.ValidationError, match="setup_comands"):
-        validate_config(prepare_config(config))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_every_ray_start_uses_the_token_and_notices_lost_machines(name: str) -> None:
     starts = [command for command in commands(load(name)) if "ray start" in command]
     assert len(starts) == 2
     for command in starts:
@@ -62,9 +49,7 @@ def test_ray_up_does_what_the_page_says(tmp_path: Path) -> None:
     ours = environment() | {"HOME": str(tmp_path), "RAY_TMPDIR": str(tmp_path / "ray")}
     ours["PATH"] = f"{tmp_path / 'bin'}{os.pathsep}{ours['PATH']}"
     command = [f"{BIN}/ray", "up", "--yes", "--no-config-cache", f"{DEPLOY}/on-premises.yaml"]
-    ended = subprocess.run(
-        command, check=False, cwd=tmp_path, env=ours, capture_output=True, text=True, timeout=120
-    )
+    ended = subprocess.run(command, check=False, cwd=tmp_path, env=ours, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     log = calls.read_text()
     steps = (

@@ -31,7 +31,7 @@ def started(tmp_path: Path, rank: int, *, exists: bool = False, heads: int = 1) 
         "RANK": str(rank),
         "HEAD": "10.0.0.4",
     }
-    subprocess.run([DEPLOY / "nodes.sh", SCENE, RUN, "--seed", "3"], env=environment, check=True, timeout=60)
+    subprocess.run([DEPLOY / "nodes.sh", SCENE, RUN, "--seed", "3"], env=environment, check=True)
     return calls.read_text().splitlines()
 
 
@@ -67,6 +67,7 @@ def test_the_tasks_start_it_with_their_rank(file: str, rank: str, commands: obje
     assert "make setup" in text
 
 
+@pytest.mark.nightly
 def test_skypilot_reads_its_task() -> None:
     sky = pytest.importorskip("sky", reason="skypilot is not installed")
     task = sky.Task.from_yaml(str(DEPLOY / "skypilot.yaml"))
@@ -74,6 +75,7 @@ def test_skypilot_reads_its_task() -> None:
     assert all(resources.use_spot for resources in task.resources)
 
 
+@pytest.mark.nightly
 def test_dstack_reads_its_task() -> None:
     models = pytest.importorskip(
         "dstack._internal.core.models.configurations", reason="dstack is not installed"

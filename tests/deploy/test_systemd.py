@@ -15,8 +15,6 @@ from panolog.orchestrator.cli import app
 from tests.deploy.files import DEPLOY
 
 UNIT = DEPLOY / "panolog@.service"
-
-
 QUEUE = DEPLOY / "panolog-queue.service"
 
 
@@ -27,6 +25,7 @@ def fields(path: Path = UNIT) -> configparser.ConfigParser:
     return unit
 
 
+@pytest.mark.nightly  # many machines have no systemd
 @pytest.mark.parametrize(
     ("unit", "name"), [(UNIT, "panolog@street.service"), (QUEUE, "panolog-queue.service")]
 )
@@ -37,13 +36,8 @@ def test_systemd_accepts_it(tmp_path: Path, unit: Path, name: str) -> None:
     # what this machine has: no user panolog, and no program below /opt
     text = unit.read_text().replace("User=panolog", "User=root")
     copy.write_text(text.replace("/opt/panolog/.venv/bin/panolog", "/bin/true"))
-    ended = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", copy],
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    command = ["systemd-analyze", "verify", "--man=no", copy]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True)
     about_it = [line for line in ended.stderr.splitlines() if "panolog" in line]
     assert (ended.returncode, about_it) == (0, []), ended.stderr
 
