@@ -1,10 +1,30 @@
-"""CPU tensors that behave as those on a GPU in one respect: numpy gets only copies of them on the CPU."""
+"""CPU tensors that behave as those on a GPU in one respect: numpy gets only copies of them on the CPU.
 
-from typing import Any
+And the marks of tests that need a real one.
+"""
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import pytest
+import torch
 from torch import Tensor
 
 from panolog.scene.images import Staged, Upload, View
+
+ON_A_CARD = (
+    pytest.mark.cuda,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA: no card"),
+)
+on_all_devices = pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=ON_A_CARD)])
+Test = TypeVar("Test", bound=Callable[..., None])
+
+
+def needs_a_card(test: Test) -> Test:
+    """Marks a test that runs on a card only."""
+    for mark in ON_A_CARD:
+        test = mark(test)
+    return test
 
 
 class OnDevice(Tensor):

@@ -47,16 +47,17 @@ def check_gradients(ours: Sequence[Tensor | None], truth: Sequence[Tensor | None
         assert (one - two).abs().max() <= 1e-3 * two.abs().max(), name
 
 
-def check_definition(scene: Gaussians, at: Camera, degree: int) -> None:
-    """The CPU's kernels against the definition of the scene's projection: values and gradients."""
+def check_definition(scene: Gaussians, at: Camera, degree: int, device: str = "cpu") -> None:
+    """The kernels of a device against the definition of the scene's projection: values and gradients."""
     definition = render_rays if scene.exact else render_reference
     keep = certain(scene, at)
     assert keep.float().mean() > 0.5
-    true_leaves, leaves = as_leaves(scene, torch.float64), as_leaves(scene, torch.float32)
+    true_leaves, leaves = as_leaves(scene, torch.float64), as_leaves(scene.to(device), torch.float32)
     true_screen = torch.zeros(len(scene), 2, dtype=torch.float64, requires_grad=True)
-    screen = torch.zeros(len(scene), 2, requires_grad=True)
+    screen = torch.zeros(len(scene), 2, device=device, requires_grad=True)
     truth = definition(true_leaves, wide(at), sh_degree=degree, near=NEAR, screen=true_screen)
-    ours = render(leaves, at, sh_degree=degree, near=NEAR, screen=screen)
+    made = render(leaves, at.to(device), sh_degree=degree, near=NEAR, screen=screen)
+    ours = Render(*(tensor.cpu() for tensor in made))
     check_images(ours, truth, keep)
     assert not (truth.visible & ~ours.visible).any()
 
@@ -64,7 +65,8 @@ def check_definition(scene: Gaussians, at: Camera, degree: int) -> None:
     for rendered in (truth, ours):
         _weighted(rendered, weights).backward()  # type: ignore[no-untyped-call]
     expected = [leaf.grad for leaf in (*true_leaves.tensors().values(), true_screen)]
-    check_gradients([leaf.grad for leaf in (*leaves.tensors().values(), screen)], expected)
+    found = [leaf.grad for leaf in (*leaves.tensors().values(), screen)]
+    check_gradients([None if gradient is None else gradient.cpu() for gradient in found], expected)
 
 
 def _weighted(rendered: Render, weights: list[Tensor]) -> Tensor:

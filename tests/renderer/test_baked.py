@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from panolog.renderer import ops
 from panolog.renderer.baked import SLACK, TILE, Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import Render, render
@@ -136,18 +135,6 @@ def test_what_is_owned_may_move_a_little_in_depth() -> None:
     )
     assert float(difference.abs().amax(2)[where].max()) < 2e-2
     assert float(difference.abs().amax(2)[where].mean()) < HALF
-
-
-def test_the_number_of_threads_changes_nothing() -> None:
-    at, scene = camera(128), replace(cloud(400), exact=True)
-    found = []
-    for threads in (1, 3):
-        ops.use_threads(threads)
-        exterior = baked(scene, 100, at)
-        image, by = gradients(first(scene, 100), at, active(exterior, at), exterior)
-        found.append([*exterior.arrays(), image.color, *by.values()])
-    ops.use_threads(None)
-    assert all(map(torch.equal, *found))
 
 
 def test_inverse_depths_of_any_unit_of_length_are_kept() -> None:

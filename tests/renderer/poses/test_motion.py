@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.motion import MOTION, MOTION_SUMS, Motion, moved
 from panolog.renderer.render import render
@@ -86,23 +85,6 @@ def test_the_definition_is_the_derivative_of_moved_cameras(exact: bool) -> None:
     step = 1e-7
     numeric = np.array([(value(step * e) - value(-step * e)) / (2 * step) for e in np.eye(MOTION)])
     assert numeric == pytest.approx(motion.grad.sum(0).numpy(), rel=1e-4, abs=1e-4 * np.abs(numeric).max())
-
-
-@pytest.mark.parametrize("exact", [False, True])
-def test_the_number_of_threads_changes_nothing(exact: bool) -> None:
-    at, sums = camera(202), []
-    for threads in (1, 3):
-        ops.use_threads(threads)
-        try:
-            motion = torch.zeros(MOTION_SUMS, dtype=torch.float64, requires_grad=True)
-            leaves = as_leaves(replace(cloud(5000), exact=exact), torch.float32)
-            made = render(leaves, at, near=NEAR, motion=motion)
-            (made.color.sum() + made.inverse_depth.sum()).backward()  # type: ignore[no-untyped-call]
-            sums.append(motion.grad)
-        finally:
-            ops.use_threads(None)
-    assert sums[0] is not None and sums[1] is not None and sums[0].any()
-    assert torch.equal(sums[0], sums[1])
 
 
 @pytest.mark.parametrize("exact", [False, True])
