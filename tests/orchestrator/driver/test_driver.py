@@ -89,7 +89,7 @@ def test_what_starts_is_decided_when_a_task_ends_not_at_each_checkpoint(
 
     def script(spec: TaskSpec) -> Iterator[Event]:
         if spec.task == COARSE:
-            yield from (Checkpoint(COARSE, iteration, {"x": torch.arange(3)}) for iteration in range(100))
+            yield from (Checkpoint(COARSE, iteration, {"x": torch.arange(3)}) for iteration in range(60))
         yield from well(spec)
 
     monkeypatch.setattr(policy, "ready", counted)
@@ -108,7 +108,9 @@ def test_a_dead_worker_goes_on_from_its_checkpoint(harness: Harness) -> None:
     assert (task.retries, task.reasons) == (1, (DIED.reason,))
 
 
-def test_a_block_that_keeps_failing_keeps_its_stage_one_gaussians(harness: Harness) -> None:
+def test_a_block_that_keeps_failing_keeps_its_stage_one_gaussians_until_it_is_resumed(
+    harness: Harness, tmp_path: Path
+) -> None:
     with pytest.raises(RunError, match="block 1 failed and keeps its Stage I Gaussians"):
         harness.drive(fails(TaskId.block(1), DIED, 99))
     assert harness.tasks.count(TaskId.block(1)) == 1 + harness.job.config.retries
@@ -119,16 +121,10 @@ def test_a_block_that_keeps_failing_keeps_its_stage_one_gaussians(harness: Harne
     kept = read_ply(harness.folder.kept(1))
     merged = read_ply(harness.folder.point_cloud)
     assert any(torch.equal(row, kept.sh0[0]) for row in merged.sh0)
-
-
-def test_resume_tries_a_failed_block_again_and_merges_anew(harness: Harness, tmp_path: Path) -> None:
-    with pytest.raises(RunError):
-        harness.drive(fails(TaskId.block(1), DIED, 99))
-    state = harness.drive(resumed=True)
+    assert harness.drive(resumed=True).outcome == "done"
     assert harness.tasks == [TaskId.block(1), EVAL]
-    assert state.outcome == "done"
-    (tmp_path / "other").mkdir()
-    undisturbed = Harness(tmp_path / "other")
+    undisturbed = harness.at(tmp_path / "other")
+    undisturbed.folder.root.mkdir()
     undisturbed.drive()
     assert harness.folder.point_cloud.read_bytes() == undisturbed.folder.point_cloud.read_bytes()
 
@@ -151,15 +147,12 @@ def test_wrong_input_that_a_second_attempt_does_not_confirm_is_none(harness: Har
     assert harness.drive(fails(COARSE, TRUNCATED, 1)).outcome == "done"
 
 
-@pytest.mark.parametrize("block", [0, 1])
-def test_a_block_with_wrong_input_holds_up_neither_the_others_nor_the_merge(
-    harness: Harness, block: int
-) -> None:
-    with pytest.raises(RunError, match=f"block {block} failed and keeps its Stage I Gaussians"):
-        harness.drive(fails(TaskId.block(block), TRUNCATED, 99))
-    assert harness.tasks.count(TaskId.block(block)) == 2  # the second confirms it
-    assert harness.state.status(TaskId.block(1 - block)) == Status.DONE
-    assert harness.folder.kept(block).is_file()
+def test_a_block_with_wrong_input_holds_up_neither_the_others_nor_the_merge(harness: Harness) -> None:
+    with pytest.raises(RunError, match="block 0 failed and keeps its Stage I Gaussians"):
+        harness.drive(fails(TaskId.block(0), TRUNCATED, 99))
+    assert harness.tasks.count(TaskId.block(0)) == 2  # the second confirms it
+    assert harness.state.status(TaskId.block(1)) == Status.DONE
+    assert harness.folder.kept(0).is_file()
     assert harness.folder.metrics.exists()
 
 
@@ -183,36 +176,12 @@ def test_a_worker_that_dies_after_its_result_has_done_its_work(harness: Harness)
     assert not list(harness.folder.root.rglob("checkpoint.safetensors"))
 
 
-def test_an_interrupted_run_says_so_and_goes_on(harness: Harness) -> None:
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == TaskId.block(0):
-            raise KeyboardInterrupt
-        yield from well(spec)
-
-    with pytest.raises(KeyboardInterrupt):
-        harness.drive(script)
-    assert harness.state.outcome == "interrupted"
-    assert harness.drive(resumed=True).outcome == "done"
-    assert COARSE not in harness.tasks
-
-
 def test_without_refinement_the_model_is_stage_one(tmp_path: Path) -> None:
     harness = Harness(tmp_path, refine=False)
     harness.drive()
     assert harness.tasks == [COARSE, EVAL]
     assert harness.folder.point_cloud.read_bytes() == harness.folder.model(COARSE).read_bytes()
-
-
-def test_a_folder_that_cannot_be_written_is_a_failed_run_with_a_reason(
-    harness: Harness, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(*_: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr("panolog.orchestrator.driver.driver.save", refused)
-    with pytest.raises(RunError, match="Permission denied"):
-        harness.drive()
-    assert [end.outcome for end in harness.records(RunEnded)] == ["failed"]
+    assert harness.folder.metrics.exists() and not harness.folder.seams.exists()
 
 
 @pytest.mark.parametrize("refine", [True, False])
@@ -294,9 +263,3 @@ def test_seams_are_recorded_and_written_with_the_metrics(harness: Harness) -> No
     assert [face.blocks for face in faces] == [(0, 1)]
     assert harness.records(SeamEvaluated) == [SeamEvaluated(EVAL, "0|1", faces[0].seam)]
     assert (harness.folder.seam(0, 1) / "merged.jpg").exists()
-
-
-def test_without_refinement_there_are_no_seams(tmp_path: Path) -> None:
-    harness = Harness(tmp_path, refine=False)
-    harness.drive()
-    assert harness.folder.metrics.exists() and not harness.folder.seams.exists()

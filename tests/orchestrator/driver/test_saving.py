@@ -1,7 +1,6 @@
 """Large messages on their way to the disk: how many are in memory, and who writes them when."""
 
 import threading
-import time
 import weakref
 from collections.abc import Iterator
 from dataclasses import replace
@@ -28,7 +27,7 @@ from panolog.workers.training import checkpoint
 from panolog.workers.training.config import CheckpointConfig
 from panolog.workers.training.saving import Outbox, Saver
 from panolog.workers.training.trainer import TrainSpec
-from tests.orchestrator.fakes import FakePool, Harness, trained, well
+from tests.orchestrator.fakes import FakePool, Harness, SetClock, trained, well
 
 MANY = Node("node", "host", cpus=16, memory=2**44)
 STATE = Checkpoint(COARSE, 7, {"x": torch.arange(1000)})
@@ -237,12 +236,8 @@ def test_saving_takes_at_most_its_share_of_the_time(monkeypatch: pytest.MonkeyPa
     periods, rest = len(saved) - 1, saved[-1] - saved[0]  # each begins with a checkpoint
     assert 0.019 < 2.0 * periods / rest <= 0.0201
     every = Saver(CheckpointConfig(every=10, share=1), None)
-    assert [i for i in range(1, 41) if every.due(i) and list(every.save(state, last=False))] == [
-        10,
-        20,
-        30,
-        40,
-    ]
+    due = [i for i in range(1, 41) if every.due(i) and list(every.save(state, last=False))]
+    assert due == [10, 20, 30, 40]
 
 
 def test_the_grace_follows_bytes_and_the_measured_rate() -> None:
@@ -259,16 +254,13 @@ def test_the_grace_follows_bytes_and_the_measured_rate() -> None:
 def test_a_stop_waits_for_the_last_of_many_checkpoints(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Longer than the fixed time of before, and each is recorded as it lands."""
+    """For as long as they take at the rate that was measured before, not for a fixed time."""
     harness = Harness(tmp_path, [MANY], blocks="2x2x1")
+    harness.clock = clock = SetClock()
     monkeypatch.setattr(writers, "GRACE_S", 0.0)
-    monkeypatch.setattr(writers, "_UNMEASURED", 10**5)
-    monkeypatch.setattr(writers.Writers, "measured", lambda *_: None)  # of this disk
-    seen = list[int]()
 
     def slow(folder: Any, event: Event, *rest: Any) -> Record:
-        seen.append(len(harness.records(CheckpointSaved)))
-        threading.Event().wait(0.1)
+        clock.sleep(1.0)
         return saving.save(folder, event, *rest)
 
     def script(spec: TaskSpec) -> Iterator[Event]:
@@ -278,16 +270,14 @@ def test_a_stop_waits_for_the_last_of_many_checkpoints(
         for iteration in range(1, 10**6):
             yield Progress(spec.task, iteration, 10**6, 1.0, gaussians=1000)
             if iteration == 3:
-                monkeypatch.setattr(driver_module, "save", slow)
                 harness.stop.requested = True
             if spec.task in harness.pool.stopped:
                 yield Checkpoint(spec.task, iteration, {"iteration": torch.tensor(iteration)})
                 return
 
-    began = time.monotonic()
+    monkeypatch.setattr(driver_module, "save", slow)
     with pytest.raises(KeyboardInterrupt):
         harness.drive(script)
-    assert time.monotonic() - began < 60
     stopped = harness.pool.stopped
     assert {c.task for c in harness.records(CheckpointSaved)} >= stopped
     assert len(stopped) >= LARGE
