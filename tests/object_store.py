@@ -2,6 +2,7 @@
 
 import http.client
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -24,6 +25,7 @@ _CODES: dict[str, tuple[int, bytes]] = {
     "error": (500, b"<Error><Code>InternalError</Code><Message>We had an error.</Message></Error>"),
 }
 _SLOW_S = 0.3
+_START_S = 300.0  # for a server
 
 
 @dataclass
@@ -96,18 +98,31 @@ def served(command: Callable[[int], list[str]], environment: dict[str, str]) -> 
         free.bind(("127.0.0.1", 0))
         port: int = free.getsockname()[1]
     process = subprocess.Popen(
-        command(port), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | environment
+        command(port),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | environment,
+        start_new_session=True,
     )
     try:
-        end = time.monotonic() + 60
-        while time.monotonic() < end and process.poll() is None:
-            with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
-                break
+        end = time.monotonic() + _START_S
+        while not _listens(port):
+            if process.poll() is not None or time.monotonic() > end:
+                raise RuntimeError(f"{process.args!r} does not listen on port {port}")
             time.sleep(0.05)
         yield port
     finally:
-        process.kill()
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # also what a program starts that is a script
         process.wait()
+
+
+def _listens(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), 1).close()
+    except OSError:
+        return False
+    return True
 
 
 def _call(

@@ -11,6 +11,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -72,6 +73,7 @@ def free_ports(count: int) -> list[int]:
 @contextmanager
 def all_end() -> Iterator[None]:
     """Ends all processes that begin meanwhile below this one, also those that their parents leave behind."""
+    resource_tracker.ensure_running()  # which serves this process until its end
     before = {process.pid for process in psutil.Process().children(recursive=True)}
     prctl = ctypes.CDLL(None).prctl
     prctl(_SUBREAPER, 1)  # orphans become ours, so that we can wait for them
@@ -84,6 +86,16 @@ def all_end() -> Iterator[None]:
                     process.kill()
             psutil.wait_procs(new, timeout=_TIMEOUT_S)
         prctl(_SUBREAPER, 0)
+
+
+def living(word: str) -> list[psutil.Process]:
+    """Our children with a word in their command line, but no zombie: another test may have left one."""
+    found = []
+    for child in psutil.Process().children():
+        with suppress(psutil.Error):  # it ends meanwhile
+            if word in child.cmdline() and child.status() != psutil.STATUS_ZOMBIE:
+                found.append(child)
+    return found
 
 
 def wait_until(holds: Callable[[], object], what: str, seconds: float = 120) -> None:
@@ -116,16 +128,8 @@ def ray_head() -> Iterator[Head]:
         command += [f"--port={gcs}", f"--dashboard-port={dashboard}", f"--metrics-export-port={metrics}"]
         command += [f"--dashboard-agent-listen-port={agent}", f"--ray-client-server-port={client}"]
         command += ["--min-worker-port=0", "--max-worker-port=0", "--object-store-memory=80000000"]
-        with Path(folder, "start.log").open("w") as log:
-            process = subprocess.Popen(
-                command, env=head.environment | {"RAY_AUTH_MODE": "token"}, stdout=log, stderr=log
-            )
-        try:
+        ours = head.environment | {"RAY_AUTH_MODE": "token"}
+        with Path(folder, "start.log").open("w") as log, all_end():
+            subprocess.Popen(command, env=ours, stdout=log, stderr=log)
             wait_until(lambda: read(f"{head.address}/api/gcs_healthz"), "the head is up")
             yield head
-        finally:
-            for one in psutil.Process(process.pid).children(recursive=True):
-                with suppress(psutil.NoSuchProcess):
-                    one.kill()
-            process.kill()
-            process.wait()

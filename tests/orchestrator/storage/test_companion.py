@@ -14,13 +14,13 @@ from panolog.orchestrator.storage.plan import Plan
 from panolog.scene.errors import RunError
 from panolog.scene.stores.store import open_store
 from tests.orchestrator.storage.stored_runs import Driver, fetched
-from tests.ray_head import wait_until
+from tests.ray_head import living, wait_until
 
 pytestmark = pytest.mark.system
 
 
 def plan_of(tmp_path: Path) -> Plan:
-    return Plan(tmp_path / "run", f"file://{tmp_path}/store", resumes=False, period=0.05, patience=2.0)
+    return Plan(tmp_path / "run", f"file://{tmp_path}/store", resumes=False, period=0.05, patience=300.0)
 
 
 def blocked(path: Path) -> set[int]:
@@ -32,9 +32,8 @@ def blocked(path: Path) -> set[int]:
 
 def mirror() -> psutil.Process:
     """The process of the mirror that is a child of this one."""
-    found = [it for it in psutil.Process().children() if "panolog.orchestrator.storage" in it.cmdline()]
-    assert len(found) == 1
-    return found[0]
+    (found,) = living("panolog.orchestrator.storage")
+    return found
 
 
 def test_a_mirror_that_is_killed_is_replaced_and_nothing_is_lost(
