@@ -5,9 +5,10 @@ import logging
 import os
 import platform
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
+from torch.torch_version import TorchVersion
 
 from panolog.renderer import _core, ops
 from panolog.renderer.unused_gpu import unused_gpu
@@ -55,7 +56,7 @@ def prepare(threads: int) -> None:
     in every iteration. Changes malloc of the whole process: for dedicated processes such as workers. Called
     before each task, it returns the memory that the previous one left.
     """
-    _use_expandable_segments()
+    os.environ.update(growing_segments(os.environ, platform.release(), torch.__version__))
     ops.use_threads(threads)
     torch.set_num_threads(1)
     _core.keep_memory()
@@ -69,15 +70,17 @@ def release_memory() -> None:
     _core.release_memory()
 
 
-def _use_expandable_segments() -> None:
-    """Torch's memory on a GPU in segments that grow, unless the user has set something else.
+def growing_segments(given: Mapping[str, str], release: str, version: TorchVersion) -> dict[str, str]:
+    """The environment in which torch's memory on a GPU is in segments that grow; what the user has set stays.
 
     After a densification everything is a little larger than the blocks that it had. Without this option
     torch keeps those and allocates others, until the GPU is full.
+
+    Args: given, the environment; release, of the system; version, of torch.
     """
     current, former = "PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF"
-    if current in os.environ or former in os.environ:
-        return
-    if "microsoft" in platform.release().lower():  # WSL: the first allocation fails, pytorch/pytorch#192330
-        return
-    os.environ[current if torch.__version__ >= "2.9" else former] = "expandable_segments:True"
+    if current in given or former in given:
+        return {}
+    if "microsoft" in release.lower():  # WSL: the first allocation fails, pytorch/pytorch#192330
+        return {}
+    return {current if version >= "2.9" else former: "expandable_segments:True"}

@@ -6,14 +6,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.torch_version import TorchVersion
 
 from panolog.orchestrator.commands.doctor import diagnose
 from panolog.orchestrator.run.config import RunConfig
-from panolog.renderer import process
-from panolog.renderer.process import choose_device
+from panolog.renderer.process import choose_device, growing_segments
 from panolog.renderer.unused_gpu import unused_gpu
 from panolog.scene.errors import DeviceError
 from tests.nvidia_smi import print_gpus
+from tests.on_device import needs_a_card
 
 CARD = "NVIDIA GeForce RTX 4090"
 
@@ -56,37 +57,30 @@ def test_the_doctor_says_it_too(old_driver: Path) -> None:
     assert (gpu.value, gpu.ok, gpu.fatal, gpu.fix) == ("none that torch can use", False, False, OLD)
 
 
-def test_a_torch_without_cuda(old_driver: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.version, "cuda", None)
-    assert unused_gpu() == (
-        f"{CARD} is not used: torch {torch.__version__} is built without CUDA: install another build, see"
-        " https://pytorch.org"
-    )
+TOO_OLD = "the NVIDIA driver {} is too old for torch {} with CUDA {}: update it to {} or later"
+UNKNOWN = "CUDA unknown error - this may be due to an incorrectly set up environment"
 
 
 @pytest.mark.parametrize(
-    ("version", "cuda", "needed"), [("579.9", "13.2", 580), ("470.1", "12.6", 525), ("390.1", "11.8", 450)]
+    ("cuda", "driver", "why"),
+    [
+        (None, "580.65.06", f"torch {torch.__version__} is built without CUDA: install another build"),
+        ("13.2", "579.9", TOO_OLD.format("579.9", torch.__version__, "13.2", 580)),
+        ("12.6", "470.1", TOO_OLD.format("470.1", torch.__version__, "12.6", 525)),
+        ("11.8", "390.1", TOO_OLD.format("390.1", torch.__version__, "11.8", 450)),
+        ("13.0", "580.65.06", f"{UNKNOWN} (driver 580.65.06, CUDA 13.0)"),
+    ],
 )
-def test_the_driver_that_each_cuda_needs(
-    old_driver: Path, monkeypatch: pytest.MonkeyPatch, version: str, cuda: str, needed: int
-) -> None:
-    monkeypatch.setattr(torch.version, "cuda", cuda)
-    old_driver.write_text(f"{CARD}, {version}\n")
-    assert f"with CUDA {cuda}: update it to {needed} or later" in (unused_gpu() or "")
-
-
-def test_where_the_driver_is_new_enough_torch_says_why(
-    old_driver: Path, monkeypatch: pytest.MonkeyPatch
+def test_why_a_gpu_is_not_used(
+    old_driver: Path, monkeypatch: pytest.MonkeyPatch, cuda: str | None, driver: str, why: str
 ) -> None:
     def init() -> None:
-        raise RuntimeError("CUDA unknown error - this may be due to an incorrectly set up environment\nmore")
+        raise RuntimeError(f"{UNKNOWN}\nmore")
 
     monkeypatch.setattr(torch.cuda, "init", init)
-    old_driver.write_text(f"{CARD}, 580.65.06\n")
-    assert unused_gpu() == (
-        f"{CARD} is not used: CUDA unknown error - this may be due to an incorrectly set up environment"
-        " (driver 580.65.06, CUDA 13.0)"
-    )
+    monkeypatch.setattr(torch.version, "cuda", cuda)
+    old_driver.write_text(f"{CARD}, {driver}\n")
+    assert (unused_gpu() or "").startswith(f"{CARD} is not used: {why}")
 
 
 @pytest.mark.parametrize("output", ["", "No devices were found\n"])
@@ -119,72 +113,54 @@ NATIVE, GROW = "6.8.0-generic", "expandable_segments:True"
         ("2.13.0", NATIVE, {}, {"PYTORCH_ALLOC_CONF": GROW}),
         ("2.6.0", NATIVE, {}, {"PYTORCH_CUDA_ALLOC_CONF": GROW}),
         ("2.13.0", "5.15.90.1-microsoft-standard-WSL2", {}, {}),
-        ("2.13.0", NATIVE, {"PYTORCH_ALLOC_CONF": "x"}, {"PYTORCH_ALLOC_CONF": "x"}),
-        ("2.13.0", NATIVE, {"PYTORCH_CUDA_ALLOC_CONF": ""}, {"PYTORCH_CUDA_ALLOC_CONF": ""}),
+        ("2.13.0", NATIVE, {"PYTORCH_ALLOC_CONF": "x"}, {}),
+        ("2.13.0", NATIVE, {"PYTORCH_CUDA_ALLOC_CONF": ""}, {}),
     ],
 )
 def test_segments_of_a_gpu_grow_unless_the_user_has_set_something_else(
-    monkeypatch: pytest.MonkeyPatch,
-    version: str,
-    release: str,
-    given: dict[str, str],
-    expected: dict[str, str],
+    version: str, release: str, given: dict[str, str], expected: dict[str, str]
 ) -> None:
-    environment = dict(given)
-    monkeypatch.setattr("os.environ", environment)
-    monkeypatch.setattr("platform.release", lambda: release)
-    monkeypatch.setattr(torch, "__version__", torch.torch_version.TorchVersion(version))
-    process._use_expandable_segments()
-    assert environment == expected
+    assert growing_segments(given, release, TorchVersion(version)) == expected
 
 
-PROBE = """
-import torch
-from panolog.renderer.process import prepare
-prepare(1)
-print(torch.cuda.is_initialized(), end=" ")
-if torch.cuda.is_available():
-    x = torch.zeros(10**7, device="cuda")
-    print(all(segment["is_expandable"] for segment in torch.cuda.memory_snapshot()))
-"""
-
-
-def probe() -> list[str]:
-    done = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, text=True, check=True)
-    return done.stdout.split()
-
-
-def test_a_worker_has_set_it_before_anything_is_on_a_gpu() -> None:
-    assert probe()[0] == "False"
-
-
-@pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA card")
-def test_on_a_card_segments_grow() -> None:
-    assert probe()[1] == "True"
-
-
-STEP = """
+WORKER = """
 import sys
 
 import torch
 
 from panolog.renderer.adam import adam_
 from panolog.renderer.losses import photometric_loss
+from panolog.renderer.process import prepare
 from panolog.renderer.render import render
 from tests.renderer.hard_scenes import as_leaves, camera, cloud
 
+prepare(1)
+before = torch.cuda.is_initialized()
 at = camera()
 model = as_leaves(cloud(20), torch.float32)
 target = torch.zeros(at.height, at.width, 3, dtype=torch.uint8)
 photometric_loss(render(model, at, near=0.01).color, target, None, 0.2).loss.backward()
 moments = torch.zeros_like(model.means), torch.zeros_like(model.means)
 adam_(model.means.detach(), model.means.grad, *moments, lr=0.1, step=1, rows=20)
-print([name for name in ("torch._dynamo", "torch._inductor", "sympy") if name in sys.modules])
+imported = [name for name in ("torch._dynamo", "torch._inductor", "sympy") if name in sys.modules]
+grow = None
+if torch.cuda.is_available():
+    x = torch.zeros(10**7, device="cuda")
+    grow = all(segment["is_expandable"] for segment in torch.cuda.memory_snapshot())
+print((before, imported, grow))
 """
 
 
-def test_an_iteration_does_not_import_the_compiler_of_torch() -> None:
-    """It took 100 MB and some seconds of each worker."""
-    found = subprocess.run([sys.executable, "-c", STEP], check=True, capture_output=True, text=True)
-    assert found.stdout == "[]\n"
+def worker() -> str:
+    """Of a process that computes an iteration: whether CUDA is in use before it, what is imported, a card."""
+    return subprocess.run([sys.executable, "-c", WORKER], check=True, capture_output=True, text=True).stdout
+
+
+def test_an_iteration_needs_no_gpu_and_not_the_compiler_of_torch() -> None:
+    """It took 100 MB and some seconds of each worker. Settings of a GPU come before anything is on it."""
+    assert worker().startswith("(False, [], ")
+
+
+@needs_a_card
+def test_on_a_card_segments_grow() -> None:
+    assert worker().endswith("True)\n")

@@ -24,10 +24,10 @@ def adam(threads: int, count: int = COUNT) -> bytes:
     return values.tobytes()
 
 
-@pytest.mark.parametrize("threads", [2, 3, 16])
+@pytest.mark.parametrize("threads", [2, 5])
 def test_any_number_of_threads_gives_the_same_bytes(threads: int) -> None:
     alone = adam(1)
-    assert all(adam(threads) == alone for _ in range(50))
+    assert all(adam(threads) == alone for _ in range(20))
 
 
 def test_threads_that_compute_at_once_have_helpers_of_their_own() -> None:
