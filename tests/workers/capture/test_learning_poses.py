@@ -1,110 +1,62 @@
-"""Trainings that refine poses: the same bytes after a stop and for any threads, on a card as on the CPU."""
+"""Trainings that refine poses, on a card as on the CPU."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from panolog.renderer import ops
-from panolog.scene.gaussians import Gaussians
 from panolog.workers.capture.captured import Captured, joined
-from panolog.workers.capture.config import PosesConfig
-from panolog.workers.events import Checkpoint, Event, Trained
-from panolog.workers.specs import Value
-from panolog.workers.tasks import COARSE
-from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.trainer import TrainSpec, train
+from panolog.workers.training.trainer import TrainSpec
 from tests.renderer.cuda.stubbed import stubbed
 from tests.workers.small import WIDTH, small_scene
 from tests.workers.training.test_pipeline import Emulated
+from tests.workers.trainings import coarse_of, end, settings
 
-SETTINGS = {
-    "sky": {"count": 20},
-    "densify": {"until": 0},
-    "checkpoint": {"every": 4, "share": 1},
-    "poses": {"refine": True, "begin": 0.1, "visits": 0},
-}
+POSES = {"refine": True, "begin": 0.1, "visits": 0}
 
 
 @pytest.fixture(scope="module")
 def spec(tmp_path_factory: pytest.TempPathFactory) -> TrainSpec:
     scene = small_scene(tmp_path_factory.mktemp("scene"), points=60)
-    return TrainSpec(
-        task=COARSE,
-        scene=Value(scene),
-        views=scene.train,
-        width=WIDTH // 2,
-        iterations=14,
-        config=TrainConfig.model_validate(SETTINGS),
-        seed=3,
-    )
-
-
-def learnt(events: Sequence[Event]) -> tuple[Gaussians, Captured]:
-    last = events[-1]
-    assert isinstance(last, Trained) and last.captured is not None
-    return last.gaussians, last.captured
-
-
-def poses(captured: Captured) -> np.ndarray:
-    assert captured.poses is not None
-    return captured.poses
-
-
-def same(one: Sequence[Event], two: Sequence[Event]) -> bool:
-    (model, captured), (other, found) = learnt(one), learnt(two)
-    tensors = other.tensors()
-    alike = all(torch.equal(tensor, tensors[name]) for name, tensor in model.tensors().items())
-    return alike and poses(captured).tobytes() == poses(found).tobytes()
+    config = settings(sky={"count": 20}, densify={"until": 0}, poses=POSES)
+    return coarse_of(scene, config, width=WIDTH // 2, iterations=14)
 
 
 @pytest.fixture(scope="module")
-def events(spec: TrainSpec) -> list[Event]:
-    return list(train(spec))
+def learnt(spec: TrainSpec) -> Captured:
+    captured = end(spec).captured
+    assert captured is not None
+    return captured
 
 
-def test_cameras_move(spec: TrainSpec, events: list[Event]) -> None:
-    scene, (_, captured) = spec.scene.load(), learnt(events)
-    before = np.stack([np.column_stack((p.rotation, p.translation)) for p in scene.panoramas])[captured.rows]
-    assert captured.rows.tolist() == sorted(spec.views)
-    assert 1e-5 < np.abs(poses(captured) - before).max() < 0.1
-    turned = poses(captured)[:, :, :3]
+def poses(captured: Captured | None) -> np.ndarray:
+    assert captured is not None and captured.poses is not None
+    return captured.poses
+
+
+def before(spec: TrainSpec) -> np.ndarray:
+    """(4, 3, 4) poses of the views as they are given."""
+    panoramas = spec.scene.load().panoramas
+    return np.stack(
+        [np.column_stack((panoramas[row].rotation, panoramas[row].translation)) for row in range(4)]
+    )
+
+
+def test_cameras_move(spec: TrainSpec, learnt: Captured) -> None:
+    assert learnt.rows.tolist() == sorted(spec.views) == [0, 1, 2, 3]
+    assert 1e-5 < np.abs(poses(learnt) - before(spec)).max() < 0.1
+    turned = poses(learnt)[:, :, :3]
     assert np.einsum("nij,nkj->nik", turned, turned) == pytest.approx(np.tile(np.eye(3), (len(turned), 1, 1)))
-
-
-def test_a_resumed_training_ends_with_the_same_bytes(spec: TrainSpec, events: list[Event]) -> None:
-    saved = [event for event in events if isinstance(event, Checkpoint)]
-    assert len(saved) >= 2
-    for checkpoint in saved[:2]:
-        assert same(events, list(train(replace(spec, checkpoint=Value(checkpoint)))))
-
-
-def test_the_number_of_threads_changes_nothing(spec: TrainSpec, events: list[Event]) -> None:
-    ops.use_threads(3)
-    try:
-        assert same(events, list(train(spec)))
-    finally:
-        ops.use_threads(None)
-
-
-def test_poses_that_stay_are_not_captured(spec: TrainSpec) -> None:
-    still = spec.config.model_copy(update={"poses": PosesConfig(refine=False)})
-    last = list(train(replace(spec, config=still)))[-1]
-    assert isinstance(last, Trained) and last.captured is None
+    still = replace(spec, config=settings(poses={"refine": False}), iterations=2)
+    assert end(still).captured is None
 
 
 @pytest.mark.system
-def test_a_card_learns_as_the_cpu(spec: TrainSpec, events: list[Event]) -> None:
+def test_a_card_learns_as_the_cpu(spec: TrainSpec, learnt: Captured) -> None:
     """Steps come some iterations later there, before the view is seen again."""
     with stubbed(Emulated()):
-        ours = poses(learnt(list(train(spec)))[1])
-    theirs, scene = poses(learnt(events)[1]), spec.scene.load()
-    before = np.stack([np.column_stack((p.rotation, p.translation)) for p in scene.panoramas])[
-        list(spec.views)
-    ]
-    assert np.abs(ours - theirs).max() < 0.5 * np.abs(theirs - before).max()
+        ours = poses(end(spec).captured)
+    assert np.abs(ours - poses(learnt)).max() < 0.5 * np.abs(poses(learnt) - before(spec)).max()
 
 
 def test_districts_join_their_poses() -> None:

@@ -7,34 +7,24 @@ from typing import Any
 import pytest
 import torch
 
-from panolog.partition.bounds import aabb
-from panolog.partition.cells import Cell, Grid
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
-from panolog.workers.events import Checkpoint, Event, Trained
 from panolog.workers.specs import Value
-from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.optimizer import Average
 from panolog.workers.training.schedule import AVERAGED, Schedule
-from panolog.workers.training.trainer import TrainSpec, train
+from panolog.workers.training.trainer import train
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.cuda.stubbed import stubbed
 from tests.workers.small import WIDTH, small_scene
+from tests.workers.trainings import block_of, checkpoints, coarse_of, same, settings, trained, unchanged
 
 ITERATIONS = 24
+CALM = {"reset": {"quiet": 1.0}}
 
 
-def config(average: float, **settings: Any) -> TrainConfig:
-    given = {
-        "sky": {"count": 60},
-        "densify": {"every_floor": 4, "start": 0, "gradient": 1e-6, "max_gaussians": 260},
-        "reset": {"every_floor": 9, "opacity": 0.05},
-        "optimizer": {"average": average},
-        "checkpoint": {"every": 1, "share": 1},
-        **settings,
-    }
-    return TrainConfig.model_validate(given)
+def config(average: float, **groups: Any) -> TrainConfig:
+    return settings(optimizer={"average": average}, checkpoint={"every": 1}, **groups)
 
 
 @pytest.fixture(scope="module")
@@ -42,28 +32,10 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return small_scene(tmp_path_factory.mktemp("scene"))
 
 
-def coarse(scene: Scene, chosen: TrainConfig) -> TrainSpec:
-    return TrainSpec(
-        task=COARSE,
-        scene=Value(scene),
-        views=scene.train,
-        width=WIDTH,
-        iterations=ITERATIONS,
-        config=chosen,
-        seed=3,
-    )
-
-
-def trained(events: list[Event]) -> Gaussians:
-    last = events[-1]
-    assert isinstance(last, Trained)
-    return last.gaussians
-
-
-def models(events: list[Event]) -> list[dict[str, torch.Tensor]]:
-    """After each iteration but the last."""
-    found = [event for event in events if isinstance(event, Checkpoint)]
-    return [{name: event.tensors[name] for name in ("means", "shN", "opacities")} for event in found]
+@pytest.fixture(scope="module")
+def last(scene: Scene) -> Gaussians:
+    """The model without an average."""
+    return trained(coarse_of(scene, config(0.0)))
 
 
 @pytest.mark.parametrize("iterations", [10, 24, 500, 30_000])
@@ -83,70 +55,62 @@ def test_none_counts_in_a_run_without_an_average() -> None:
 
 
 def test_the_model_is_the_mean_of_the_last_ones(scene: Scene) -> None:
-    calm = {"reset": {"quiet": 1.0}}
-    events = list(train(coarse(scene, config(0.25, **calm))))
-    last, found = (
-        trained(list(train(coarse(scene, config(0.0, **calm))))).tensors(),
-        trained(events).tensors(),
-    )
-    states = [*models(events), last][-6:]
+    events = list(train(coarse_of(scene, config(0.25, **CALM))))
+    last = trained(coarse_of(scene, config(0.0, **CALM))).tensors()
+    found = trained(events).tensors()
+    states = [*(event.tensors for event in checkpoints(events)), last][-6:]
     for name in ("means", "shN", "opacities"):
         expected = torch.stack([state[name].double() for state in states]).mean(0)
         assert torch.allclose(found[name].double(), expected, rtol=1e-6, atol=1e-7)
         assert not torch.equal(found[name], last[name])
 
 
-def test_a_resume_within_the_average_ends_in_the_same_bytes(scene: Scene) -> None:
-    spec = coarse(scene, config(0.25))
-    events = list(train(spec))
-    whole = trained(events).tensors()
-    for event in [event for event in events if isinstance(event, Checkpoint)][-4:]:
-        before = {name: tensor.clone() for name, tensor in event.tensors.items()}
-        again = trained(list(train(replace(spec, checkpoint=Value(event))))).tensors()
-        assert all(torch.equal(again[name], whole[name]) for name in whole)
-        assert all(torch.equal(event.tensors[name], tensor) for name, tensor in before.items())
+def test_a_resume_does_not_change_what_it_started_from(scene: Scene) -> None:
+    spec = coarse_of(scene, config(0.25))
+    *_, event = checkpoints(train(spec))
+    before = {name: tensor.clone() for name, tensor in event.tensors.items()}
+    list(train(replace(spec, checkpoint=Value(event))))
+    assert unchanged(before, event.tensors)
 
 
 def test_only_models_with_the_same_rows_count(scene: Scene) -> None:
     """Densification goes on until 20 of 24 iterations, resets until 18."""
-    settings = {"densify": {"every_floor": 4, "start": 0, "until": 26_000, "gradient": 1e-6}}
-    long = trained(list(train(coarse(scene, config(0.99, **settings)))))
-    short = trained(list(train(coarse(scene, config(4 / ITERATIONS, **settings)))))
-    assert all(map(torch.equal, long.tensors().values(), short.tensors().values()))
+    densify = {"until": 26_000, "max_gaussians": 0}
+    long, short = (
+        trained(coarse_of(scene, config(part, densify=densify))) for part in (0.99, 4 / ITERATIONS)
+    )
+    assert same(long, short)
 
 
-def test_the_sky_stays_where_it_is(scene: Scene) -> None:
-    averaged, last = (trained(list(train(coarse(scene, config(part))))) for part in (0.25, 0.0))
+def test_the_sky_stays_where_it_is(scene: Scene, last: Gaussians) -> None:
+    averaged = trained(coarse_of(scene, config(0.25)))
     assert averaged.sky == last.sky == 60
     assert torch.equal(averaged.means[-60:], last.means[-60:])
 
 
-def test_a_block_is_averaged_too(scene: Scene) -> None:
-    initial = trained(list(train(coarse(scene, config(0.0)))))
-    cell = Cell(aabb(scene.centers, 5.0), Grid((2, 1, 1)), 1)
+def test_a_block_is_averaged_too(scene: Scene, last: Gaussians) -> None:
+    settings = {"stage2": {"exterior": "baked"}, "densify": {"until": 0}}
     blocks = []
     for part in (0.25, 0.0):
-        settings = {"stage2": {"exterior": "baked"}, "densify": {"until": 0}}
-        block = replace(coarse(scene, config(part, **settings)), task=TaskId.block(1), views=(0, 2))
-        blocks.append(trained(list(train(replace(block, initial=Value(initial), cell=cell)))))
+        spec = coarse_of(scene, config(part, **settings))
+        blocks.append(trained(block_of(spec, last)))
     assert abs(len(blocks[0]) - len(blocks[1])) < 5 and len(blocks[0])
     assert not torch.equal(blocks[0].sh0[:5], blocks[1].sh0[:5])
 
 
 def test_it_is_averaged_on_a_card_as_on_the_cpu(scene: Scene) -> None:
-    settings = {"sky": {"count": 10}, "densify": {"until": 0}, "reset": {"quiet": 1.0}}
-    spec = replace(coarse(scene, config(0.5, **settings)), width=WIDTH // 2, iterations=6)
-    expected = trained(list(train(spec)))
+    chosen = config(0.5, sky={"count": 10}, densify={"until": 0}, **CALM)
+    spec = coarse_of(scene, chosen, width=WIDTH // 2, iterations=6)
+    expected = trained(spec)
     with stubbed(EmulatedLaunch()):
-        found = trained(list(train(spec)))
+        found = trained(spec)
     assert len(found) == len(expected)
     assert torch.allclose(found.means, expected.means, atol=1e-3)
 
 
-def test_without_models_the_average_is_the_latest(scene: Scene) -> None:
+def test_without_models_the_average_is_the_latest(last: Gaussians) -> None:
     average = Average()
-    model = trained(list(train(coarse(scene, config(0.0)))))
-    assert average.take(model) is model and not average.tensors()
-    average.add(model)
+    assert average.take(last) is last and not average.tensors()
+    average.add(last)
     average.clear()
-    assert average.take(model) is model
+    assert average.take(last) is last

@@ -2,30 +2,25 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from panolog.partition.bounds import aabb
-from panolog.partition.cells import Cell, Grid
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians, logit
-from panolog.scene.model import Scene
-from panolog.workers.events import Checkpoint, Trained
 from panolog.workers.growth import population
-from panolog.workers.specs import Value
-from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training.config import DensifyConfig, TrainConfig
 from panolog.workers.training.densify import Statistics
 from panolog.workers.training.optimizer import ModelState
 from panolog.workers.training.relocate import MOST, Room, relocate, shares
 from panolog.workers.training.schedule import Schedule
-from panolog.workers.training.trainer import TrainSpec, train
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.cuda.stubbed import stubbed
 from tests.workers.small import WIDTH, small_scene
+from tests.workers.trainings import coarse_of, trained
 
 STILL = DensifyConfig(method="relocate", opacity_decay=0, noise=0)  # only what keeps the picture
 
@@ -215,55 +210,11 @@ CONFIG = TrainConfig.model_validate(
 )
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return small_scene(tmp_path_factory.mktemp("scene"), points=60)
-
-
-@pytest.fixture(scope="module")
-def coarse(scene: Scene) -> TrainSpec:
-    return TrainSpec(
-        task=COARSE, scene=Value(scene), views=scene.train, width=WIDTH, iterations=24, config=CONFIG, seed=3
-    )
-
-
-def trained(spec: TrainSpec) -> tuple[dict[str, bytes], list[Checkpoint]]:
-    events = list(train(spec))
-    last = events[-1]
-    assert isinstance(last, Trained)
-    return (
-        {name: tensor.numpy().tobytes() for name, tensor in last.gaussians.tensors().items()},
-        [event for event in events if isinstance(event, Checkpoint)],
-    )
-
-
-def block_of(coarse: TrainSpec) -> TrainSpec:
-    *_, last = train(coarse)
-    assert isinstance(last, Trained)
-    cell = Cell(aabb(coarse.scene.load().centers, 5.0), Grid((2, 1, 1)), 1)
-    return replace(coarse, task=TaskId.block(1), initial=Value(last.gaussians), cell=cell)
-
-
-@pytest.mark.parametrize("projection", ["affine", "exact"])
-@pytest.mark.parametrize("stage", ["coarse", "block"])
-def test_a_resume_is_exact(stage: str, projection: str, coarse: TrainSpec) -> None:
-    coarse = replace(coarse, config=coarse.config.model_copy(update={"projection": projection}))
-    spec = coarse if stage == "coarse" else block_of(coarse)
-    whole, checkpoints = trained(spec)
-    assert len(checkpoints) == 4
-    for checkpoint in checkpoints:
-        assert trained(replace(spec, checkpoint=Value(checkpoint)))[0] == whole
-
-
-def test_training_ends_with_the_budget(coarse: TrainSpec) -> None:
-    whole, _ = trained(coarse)
+def test_training_ends_with_the_budget(tmp_path: Path) -> None:
+    coarse = coarse_of(small_scene(tmp_path, points=60), CONFIG)
     schedule = Schedule(CONFIG, 24, extent=1.0, refine=False)
-    assert len(whole["opacities"]) // 4 == schedule.budget(24, 60, WIDTH * WIDTH // 2) + 20 > 100
-
-
-@pytest.mark.system
-def test_it_trains_as_on_a_card(coarse: TrainSpec) -> None:
+    assert len(trained(coarse)) == schedule.budget(24, 60, WIDTH * WIDTH // 2) + 20 > 100
     with stubbed(EmulatedLaunch()):
-        whole, _ = trained(replace(coarse, width=WIDTH // 2, iterations=9))
-    schedule = Schedule(CONFIG, 9, extent=1.0, refine=False)
-    assert len(whole["opacities"]) // 4 == schedule.budget(9, 60, WIDTH * WIDTH // 8) + 20 > 80
+        on_card = trained(replace(coarse, width=WIDTH // 2, iterations=9))
+    schedule = replace(schedule, iterations=9)
+    assert len(on_card) == schedule.budget(9, 60, WIDTH * WIDTH // 8) + 20 > 80

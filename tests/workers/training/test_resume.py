@@ -1,0 +1,101 @@
+"""A training that goes on from a checkpoint ends with the bytes of an undisturbed one, for any threads."""
+
+import pickle
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from panolog.renderer import ops
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.model import Scene
+from panolog.workers.events import Checkpoint, Event
+from panolog.workers.specs import Value
+from panolog.workers.training.trainer import TrainSpec, train
+from tests.workers.small import small_scene
+from tests.workers.trainings import block_of, checkpoints, coarse_of, content, end, same, settings, trained
+
+Groups = dict[str, Any]
+RELOCATED: Groups = {
+    **{"method": "relocate", "until": 25_000, "growth": 0.3, "weight": "gradient", "long_axis": True},
+    **{"measure": "angle", "views": "contribution", "max_gaussians": 0},
+}
+POSES = {"refine": True, "begin": 0.1, "visits": 0}
+COARSE: dict[str, Groups] = {
+    "usual": {},
+    "pyramid": {"pyramid": {"steps": (0.3, 0.7)}},  # with checkpoints at both sides of each step
+    "distance": {"densify": {"large": "distance", "percent_dense": 0.2}},
+    "averaged": {"optimizer": {"average": 0.25}},
+    "relocated": {"densify": RELOCATED},
+    "relocated, exact": {"densify": RELOCATED, "projection": "exact"},
+    "poses": {"densify": {"until": 0}, "poses": POSES, "exposure": {"learn": True, "begin": 0}},
+}
+BLOCKS: dict[str, Groups] = {
+    "full": {},
+    "full, relocated, exact": {"densify": RELOCATED, "projection": "exact"},
+    "frozen": {"stage2": {"exterior": "frozen"}},
+    "frozen, relocated": {"stage2": {"exterior": "frozen"}, "densify": RELOCATED},
+    "baked": {"stage2": {"exterior": "baked"}},
+    "baked, relocated, exact": {
+        "stage2": {"exterior": "baked"},
+        "densify": RELOCATED,
+        "projection": "exact",
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return small_scene(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture(scope="module")
+def initial(scene: Scene) -> Gaussians:
+    return trained(coarse_of(scene))
+
+
+def until_saved(stream: Iterator[Event]) -> Event:
+    """The next checkpoint, or the end."""
+    for event in stream:
+        if isinstance(event, Checkpoint):
+            break
+    stream.close()  # type: ignore[attr-defined]
+    return event
+
+
+def resumed(spec: TrainSpec) -> Gaussians:
+    """The end of a task, which resumes from each checkpoint to the next, and from the last one to it."""
+    events = list(train(spec))
+    saved = checkpoints(events)
+    assert [event.iteration for event in saved] == [5, 10, 15, 20]
+    for checkpoint, following in zip(saved, [*saved[1:], events[-1]], strict=True):
+        again: TrainSpec = pickle.loads(pickle.dumps(replace(spec, checkpoint=Value(checkpoint))))
+        assert content(until_saved(train(again))) == content(following), checkpoint.iteration
+    return trained(events)
+
+
+@pytest.mark.parametrize("name", COARSE)
+def test_stage_one(name: str, scene: Scene, initial: Gaussians) -> None:
+    found = resumed(coarse_of(scene, settings(**COARSE[name])))
+    assert same(found, initial) == (name == "usual")
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_a_block(name: str, scene: Scene, initial: Gaussians) -> None:
+    assert len(resumed(block_of(coarse_of(scene), initial, **BLOCKS[name])))
+
+
+@pytest.mark.parametrize("name", ["usual", "poses"])
+def test_the_number_of_threads_does_not_matter(name: str, scene: Scene) -> None:
+    spec, before, found = coarse_of(scene, settings(**COARSE[name])), torch.get_num_threads(), []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            ops.use_threads(count)
+            found.append(content(end(spec)))
+    finally:
+        torch.set_num_threads(before)
+        ops.use_threads(None)
+    assert found[0] == found[1]
