@@ -4,7 +4,8 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import supervise
 from panolog.orchestrator.commands.supervise import Supervised, cause
 from panolog.orchestrator.run.records import Outcome, RunBegan
-from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.run.state import RunState, ignore
 
 # A driver that records its beginning, perhaps a checkpoint and its end, and then ends as its line says.
 DRIVER = """
@@ -51,6 +52,7 @@ class Script:
         self.root, self._log = folder / "run", folder / "drivers"
         self._log.touch()
         self.said: list[str] = []
+        self.when_said: Callable[[str], None] = ignore
         self._monkeypatch = monkeypatch
         monkeypatch.setattr(supervise, "_FIRST_S", 0.0)
 
@@ -58,7 +60,11 @@ class Script:
         text = DRIVER.format(root=str(self.root), log=str(self._log), lines=lines)
         self._monkeypatch.setattr(supervise, "_PROGRAM", (sys.executable, "-c", text))
         first, options = ["run", "scene", "-o", "run"], ["--nice", "3"]
-        return supervise.supervise(Supervised(self.root, first, options, address, limit, self.said.append))
+        return supervise.supervise(Supervised(self.root, first, options, address, limit, self._say))
+
+    def _say(self, line: str) -> None:
+        self.said.append(line)
+        self.when_said(line)
 
     @property
     def drivers(self) -> list[str]:
@@ -144,19 +150,17 @@ def test_the_head_of_the_cluster_gets_time_to_come_back(
     script: Script, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervise, "_HEAD_POLL_S", 0.01)
-    head = socket.socket()
-    head.bind(("127.0.0.1", 0))
-    address = f"127.0.0.1:{head.getsockname()[1]}"
-    timer = threading.Timer(0.5, head.listen)
-    timer.start()
-    assert script.run("lost 1", "dies 0", address=address) == 0
-    assert script.said[-1] == f"waiting at most 30:00 for the cluster at {address}"
-    timer.join()
-    head.close()
-    monkeypatch.setattr(supervise, "_HEAD_S", 0.1)
-    monkeypatch.setenv("RAY_ADDRESS", address)
-    assert script.run("", "", "lost 1", address="auto") == 1
-    assert script.said[-1].startswith(f"the cluster at {address} does not answer: `panolog resume ")
+    with closing(socket.socket()) as head, closing(socket.socket()) as gone:
+        for bound in (head, gone):  # nobody else has their ports, and who does not listen does not answer
+            bound.bind(("127.0.0.1", 0))
+        address, other = (f"127.0.0.1:{bound.getsockname()[1]}" for bound in (head, gone))
+        script.when_said = lambda line: head.listen() if address in line else None
+        assert script.run("lost 1", "dies 0", address=address) == 0
+        assert script.said[-1] == f"waiting at most 30:00 for the cluster at {address}"
+        monkeypatch.setattr(supervise, "_HEAD_S", 0.1)
+        monkeypatch.setenv("RAY_ADDRESS", other)
+        assert script.run("", "", "lost 1", address="auto") == 1
+    assert script.said[-1].startswith(f"the cluster at {other} does not answer: `panolog resume ")
 
 
 SUPERVISOR = """

@@ -92,10 +92,13 @@ def cost(state: RunState) -> float:
     return state.money.used.cost
 
 
-def test_a_limit_of_cost_ends_stage_two_and_merges_what_there_is(tmp_path: Path) -> None:
-    whole = Harness(tmp_path_of(tmp_path, "whole"))
-    whole.drive()
+def test_a_limit_merges_what_there_is_and_a_higher_one_completes_the_run_with_the_same_bytes(
+    tmp_path: Path,
+) -> None:
     harness = Limited(tmp_path, BudgetSet(max_cost=100.0, prices=PRICES))
+    whole = harness.at(tmp_path / "whole")
+    whole.folder.root.mkdir()
+    whole.drive()
     state = harness.drive(slow(harness, {COARSE: 20, BLOCK: 500, EVAL: 10}))
     assert (state.outcome, state.status(BLOCK)) == (Outcome.LIMITED, Status.WAITING)
     assert "the limit of 100 USD is reached" in state.reason
@@ -109,19 +112,6 @@ def test_a_limit_of_cost_ends_stage_two_and_merges_what_there_is(tmp_path: Path)
     early = merged.sh0[:, 0, 0] < other.sh0[:, 0, 0] - 6
     assert 0 < int(early.sum()) < len(merged)  # one block is that of its checkpoint, which is darker
     assert harness.state == state
-
-
-def tmp_path_of(folder: Path, name: str) -> Path:
-    path = folder / name
-    path.mkdir()
-    return path
-
-
-def test_a_higher_limit_completes_the_run_with_the_same_bytes(tmp_path: Path) -> None:
-    whole = Harness(tmp_path_of(tmp_path, "whole"))
-    whole.drive()
-    harness = Limited(tmp_path, BudgetSet(max_cost=100.0, prices=PRICES))
-    harness.drive(slow(harness, {COARSE: 20, BLOCK: 500, EVAL: 10}))
     harness.passes(1000)  # nothing is counted while no driver is at work
     harness.begin(BudgetSet(max_cost=1000.0, prices=PRICES))
     assert harness.state.status(MERGE) == Status.WAITING

@@ -2,13 +2,10 @@
 
 import math
 from collections.abc import Callable, Iterator, Set
-from contextlib import closing
 from dataclasses import asdict, dataclass
 
 import pytest
 
-from panolog.orchestrator.driver.driver import Driver
-from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.estimates.calibration import Basis
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Message
 from panolog.orchestrator.run import control, lock
@@ -17,12 +14,10 @@ from panolog.orchestrator.run.records import (
     EvaluationSaved,
     Failure,
     ModelSaved,
-    RunBegan,
     TaskFailed,
     TaskYielded,
 )
 from panolog.orchestrator.run.state import RunState, Status
-from panolog.orchestrator.run.store import Database
 from panolog.workers.events import Checkpoint, Event, Progress
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, TaskId
@@ -100,9 +95,8 @@ class TimedPool(SetClock, FakePool):
 
 
 def drive(harness: Harness, pool: TimedPool) -> RunState:
-    with closing(Database(harness.folder.database)) as database:
-        database.append([RunBegan("host", 1, resumed=False)])
-        return Driver(harness.job, Journal(database), pool, stop=harness.stop, clock=pool).run()
+    harness.clock = pool
+    return harness.drive(pool=pool)
 
 
 def once(task: TaskId, *events: Event | Silence) -> Timed:

@@ -1,18 +1,12 @@
 """A driver whose machines come when it requests them."""
 
 from collections.abc import Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
 
-from panolog.orchestrator.commands.delivery import deliver
-from panolog.orchestrator.driver.driver import Driver, Hooks
-from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.driver.requests import Stop
+from panolog.orchestrator.driver.driver import Hooks
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.scaling import Group, Growth
-from panolog.orchestrator.run.records import Noticed, RunBegan, RunContinued, RunWaiting
-from panolog.orchestrator.run.state import RunState
-from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.run.records import Noticed, RunContinued, RunWaiting
 from panolog.workers.events import Event
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE
@@ -51,17 +45,11 @@ class GrowingPool(FakePool):
             self.requests.append(self.wanted)
 
 
-def drive(harness: Harness, pool: FakePool, clock: SetClock) -> RunState:
-    with closing(Database(harness.folder.database, clock)) as database:
-        database.append([RunBegan("host", 1, resumed=False)])
-        journal, hooks = Journal(database, clock=clock), Hooks(lambda *_: None, deliver)
-        return Driver(harness.job, journal, pool, hooks, Stop(), clock).run()
-
-
 def test_a_run_that_begins_without_a_machine_requests_one_and_says_what_it_waits_for(tmp_path: Path) -> None:
-    harness, clock = Harness(tmp_path), SetClock()
+    harness = Harness(tmp_path)
+    harness.clock = clock = SetClock()
     pool = GrowingPool(clock, startup=120)
-    drive(harness, pool, clock)
+    harness.drive(pool=pool)
     waits = [record.reason for record in harness.records(RunWaiting)]
     assert waits[0].startswith("waiting for machines: 1 of small (1 core, 1024.0 GiB), requested from Ray's")
     assert [record.seconds for record in harness.records(RunContinued)] == [120]
@@ -72,19 +60,18 @@ def test_a_run_that_begins_without_a_machine_requests_one_and_says_what_it_waits
 
 
 def test_nothing_is_requested_while_the_driver_works(tmp_path: Path) -> None:
-    harness, clock = Harness(tmp_path), SetClock()
+    harness = Harness(tmp_path)
+    harness.clock = clock = SetClock()
     pool = GrowingPool(clock, startup=120)
     during = list[dict[str, int]]()
-    with closing(Database(harness.folder.database, clock)) as database:
-        database.append([RunBegan("host", 1, resumed=False)])
-        hooks = Hooks(lambda *_: during.append(dict(pool.wanted)), deliver)
-        Driver(harness.job, Journal(database, clock=clock), pool, hooks, Stop(), clock).run()
+    harness.drive(pool=pool, hooks=Hooks(lambda *_: during.append(dict(pool.wanted))))
     assert during == [{}]
     assert {} in pool.requests[1:]
 
 
 def test_why_no_machine_comes_is_said_again_when_it_changes(tmp_path: Path) -> None:
-    harness, clock = Harness(tmp_path), SetClock()
+    harness = Harness(tmp_path)
+    harness.clock = clock = SetClock()
     pool = GrowingPool(clock, startup=20)
     left = ["no spot machines left", "quota exceeded"]
 
@@ -95,16 +82,17 @@ def test_why_no_machine_comes_is_said_again_when_it_changes(tmp_path: Path) -> N
             pool.join(GROUP.node(0))
 
     pool.when_waiting(join)
-    drive(harness, pool, clock)
+    harness.drive(pool=pool)
     waits = [record.reason.rpartition("; ")[2] for record in harness.records(RunWaiting)]
     assert waits[1:3] == ["it reports: no spot machines left", "it reports: quota exceeded"]
 
 
 def test_a_cluster_without_an_autoscaler_says_that_it_has_no_machine(tmp_path: Path) -> None:
-    harness, clock = Harness(tmp_path), SetClock()
+    harness = Harness(tmp_path)
+    harness.clock = SetClock()
     pool = FakePool(well, [])
     pool.when_waiting(lambda: pool.join(Node("a", "host", 1, 2**40)) if not pool.nodes() else None)
-    drive(harness, pool, clock)
+    harness.drive(pool=pool)
     (waiting,) = harness.records(RunWaiting)
     assert waiting.reason == "waiting for a machine with a core: the cluster has none now"
     assert harness.state.task(COARSE).attempts == 1
