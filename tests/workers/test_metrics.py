@@ -210,10 +210,10 @@ class Vgg(torch.nn.Module):
         return torch.stack([lin((x - y) ** 2).mean() for lin, x, y in pairs]).sum()
 
 
-@pytest.mark.parametrize(
-    "size",
-    [(100, 200), *(pytest.param(size, marks=pytest.mark.nightly) for size in ((250, 512), (256, 530)))],
-)
+LARGE = [pytest.param(size, marks=pytest.mark.nightly) for size in ((250, 512), (256, 530))]
+
+
+@pytest.mark.parametrize("size", [(100, 200), *LARGE])
 def test_lpips_by_tiles_is_that_of_the_whole(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     """In double precision, where nothing hides a tile that sees too little."""
     lpips = Lpips(Vgg().eval().double(), torch.device("cpu"))
