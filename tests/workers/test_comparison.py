@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from panolog.partition.bounds import aabb
-from panolog.partition.cells import Cell, Grid
 from panolog.renderer.render import render_bytes
 from panolog.scene.errors import SceneError
 from panolog.scene.gaussians import Gaussians
@@ -19,14 +17,14 @@ from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply, read_ply_chunks, write_ply, write_ply_parts
 from panolog.workers.comparison import squared_error, with_block
-from panolog.workers.events import Checkpoint, Event, LeftOut, Notice, Trained
+from panolog.workers.events import Checkpoint, LeftOut, Trained
 from panolog.workers.merge import retained
 from panolog.workers.metrics import decibel, measure
 from panolog.workers.specs import ModelFile, Value
-from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
+from tests.workers.trainings import block_of, bytes_of, checkpoints, coarse_of, notices, trained
 
 CONFIG = TrainConfig.model_validate(
     {"sky": {"count": 60}, "checkpoint": {"every": 5, "share": 1}, "preview": {"every": 50}}
@@ -41,14 +39,10 @@ def scene(tmp_path: Path) -> Scene:
 @pytest.fixture
 def block(scene: Scene) -> TrainSpec:
     """A block of the cameras 0 and 2 that improves a model of three iterations, for 1 and 3 too."""
-    coarse = TrainSpec(
-        task=COARSE, scene=Value(scene), views=scene.train, width=WIDTH, iterations=3, config=CONFIG, seed=3
-    )
-    cell = Cell(aabb(scene.centers, 5.0), Grid((2, 1, 1)), 1)
-    path = scene.root / "coarse.ply"
-    write_ply(path, trained(list(train(coarse))))
-    block = replace(coarse, task=TaskId.block(1), initial=ModelFile(path), cell=cell)
-    return replace(block, views=(0, 2), compared=(3, 1), iterations=30)
+    coarse, path = coarse_of(scene, CONFIG, iterations=3), scene.root / "coarse.ply"
+    model = trained(coarse)
+    write_ply(path, model)
+    return replace(block_of(coarse, model), initial=ModelFile(path), compared=(3, 1), iterations=30)
 
 
 @pytest.fixture
@@ -61,16 +55,7 @@ def misled(block: TrainSpec) -> TrainSpec:
     return block
 
 
-def trained(events: list[Event]) -> Gaussians:
-    assert isinstance(events[-1], Trained)
-    return events[-1].gaussians
-
-
-def bytes_of(gaussians: Gaussians) -> list[bytes]:
-    return [tensor.numpy().tobytes() for tensor in gaussians.tensors().values()]
-
-
-def coarse_of(spec: TrainSpec) -> Gaussians:
+def before(spec: TrainSpec) -> Gaussians:
     assert spec.initial is not None
     return spec.initial.load()
 
@@ -78,11 +63,7 @@ def coarse_of(spec: TrainSpec) -> Gaussians:
 def kept(spec: TrainSpec) -> Gaussians:
     """What the merge takes for a block that is not trained."""
     assert spec.cell is not None
-    return retained(coarse_of(spec), spec.cell, 0.0)
-
-
-def notices(events: list[Event]) -> list[str]:
-    return [event.message for event in events if type(event) is Notice and "keeps" in event.message]
+    return retained(before(spec), spec.cell, 0.0)
 
 
 def stop_at(call: int) -> Callable[[], bool]:
@@ -124,8 +105,7 @@ def test_its_file_is_that_of_a_block_that_is_not_trained(misled: TrainSpec, tmp_
 
 def test_a_resumed_task_decides_alike(misled: TrainSpec) -> None:
     events = list(train(misled))
-    found = [event for event in events if isinstance(event, Checkpoint)]
-    for checkpoint in found[::2]:
+    for checkpoint in checkpoints(events)[::2]:
         again = list(train(replace(misled, checkpoint=Value(checkpoint))))
         assert bytes_of(trained(again)) == bytes_of(trained(events)) and notices(again) == notices(events)
 
@@ -159,7 +139,7 @@ def test_a_panorama_that_cannot_be_read_is_an_error(misled: TrainSpec) -> None:
 
 
 def test_the_error_is_that_of_ws_psnr(block: TrainSpec) -> None:
-    scene, model = block.scene.load(), coarse_of(block)
+    scene, model = block.scene.load(), before(block)
     for row in scene.train:
         panorama, view = scene.panoramas[row], load_view(scene.panoramas[row], row, WIDTH)
         assert view.mask is not None and not view.mask.all()
@@ -170,7 +150,7 @@ def test_the_error_is_that_of_ws_psnr(block: TrainSpec) -> None:
 
 
 def test_colours_are_compared_as_the_exposure_has_them(block: TrainSpec, scene: Scene) -> None:
-    model, panorama = coarse_of(block), scene.panoramas[0]
+    model, panorama = before(block), scene.panoramas[0]
     image = render_bytes(model, panorama.rotation, panorama.translation, WIDTH, 0.01)
     affine = torch.tensor([[0.5, 0.6, 0.7], [0.05, 0.1, 0.0]])
     photograph = (image * affine[0] + 255 * affine[1]).round().to(torch.uint8)
@@ -181,7 +161,7 @@ def test_colours_are_compared_as_the_exposure_has_them(block: TrainSpec, scene: 
 
 def test_a_model_with_a_block_has_all_others_and_the_sky(block: TrainSpec) -> None:
     assert block.cell is not None
-    coarse = coarse_of(block)
+    coarse = before(block)
     within = block.cell.contains(coarse.means.numpy())
     within[coarse.scene.stop :] = False
     brighter = replace(kept(block), sh0=kept(block).sh0 + 1)

@@ -17,14 +17,15 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import load_layers, load_view
 from panolog.scene.model import Scene
 from panolog.workers.evaluation import EvaluateSpec, evaluate
-from panolog.workers.events import Evaluated, Scored, Trained
+from panolog.workers.events import Evaluated, Scored
 from panolog.workers.scoring import ScoreSpec, score
 from panolog.workers.specs import Value
-from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.tasks import TaskId
 from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.initialise import scene_gaussians, sky_gaussians
-from panolog.workers.training.trainer import TrainSpec, train
+from tests.workers import trainings
 from tests.workers.small import WIDTH, small_scene
+from tests.workers.trainings import coarse_of, same
 
 IGNORED, SSIM_REACH = 12, 5  # rows
 CONFIG = TrainConfig.model_validate({"sky": {"count": 40}, "depth": {"w0": 0.5, "wT": 0.4}})
@@ -63,23 +64,7 @@ def spoilt(tmp_path: Path) -> Scene:
 
 
 def trained(scene: Scene) -> Gaussians:
-    *_, last = train(
-        TrainSpec(
-            task=COARSE,
-            scene=Value(scene),
-            views=scene.train,
-            width=WIDTH,
-            iterations=8,
-            config=CONFIG,
-            seed=3,
-        )
-    )
-    assert isinstance(last, Trained)
-    return last.gaussians
-
-
-def same(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(x, b.tensors()[name]) for name, x in a.tensors().items())
+    return trainings.trained(coarse_of(scene, CONFIG, iterations=8))
 
 
 def without_masks(scene: Scene) -> Scene:
@@ -101,19 +86,21 @@ def transparent(scene: Scene) -> Scene:
     return replace(scene, panoramas=tuple(panoramas))
 
 
-def test_what_is_transparent_is_as_if_it_were_masked(clean: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def metrics(scene: Scene, model: Gaussians) -> dict[str, float | None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("panolog.workers.evaluation.load_lpips", lambda _: (None, None))
+        spec = EvaluateSpec(scene=Value(scene), views=(4,), width=WIDTH, model=Value(model), near=0.01)
+        return next(event.metrics for event in evaluate(spec) if isinstance(event, Evaluated))
+
+
+def test_what_is_transparent_is_as_if_it_were_masked(clean: Scene) -> None:
     other = transparent(clean)
     view, same_view = (load_layers(it.panoramas[1], 1, WIDTH) for it in (clean, other))
     assert view.mask is not None and same_view.mask is not None and torch.equal(view.mask, same_view.mask)
     assert align_depth(clean, view, 0) == align_depth(other, same_view, 0)
     assert same(trained(clean), trained(other))
-    monkeypatch.setattr("panolog.workers.evaluation.load_lpips", lambda _: (None, None))
-    model = Value(scene_gaussians(clean))
-    found = []
-    for scene in (clean, other):
-        events = evaluate(EvaluateSpec(scene=Value(scene), views=(4,), width=WIDTH, model=model, near=0.01))
-        found.append(next(event.metrics for event in events if isinstance(event, Evaluated)))
-    assert found[0] == found[1]
+    model = scene_gaussians(clean)
+    assert metrics(clean, model) == metrics(other, model)
 
 
 def test_alignment(clean: Scene, spoilt: Scene) -> None:
@@ -160,14 +147,7 @@ def test_scores(clean: Scene, spoilt: Scene) -> None:
     assert not torch.equal(scores(without_masks(clean)), scores(without_masks(spoilt)))
 
 
-def test_metrics(clean: Scene, spoilt: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("panolog.workers.evaluation.load_lpips", lambda _: (None, None))
-
-    def metrics(scene: Scene) -> dict[str, float | None]:
-        model = Value(scene_gaussians(clean))
-        spec = EvaluateSpec(scene=Value(scene), views=(4,), width=WIDTH, model=model, near=0.01)
-        events = evaluate(spec)
-        return next(event.metrics for event in events if isinstance(event, Evaluated))
-
-    assert metrics(clean) == metrics(spoilt)
-    assert metrics(without_masks(clean)) != metrics(without_masks(spoilt))
+def test_metrics(clean: Scene, spoilt: Scene) -> None:
+    model = scene_gaussians(clean)
+    assert metrics(clean, model) == metrics(spoilt, model)
+    assert metrics(without_masks(clean), model) != metrics(without_masks(spoilt), model)

@@ -10,12 +10,11 @@ import torch
 
 from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.scene.errors import ImageError, SceneError
-from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache
 from panolog.scene.model import Scene
 from panolog.scene.ply import write_ply
 from panolog.workers.evaluation import EvaluateSpec, evaluate
-from panolog.workers.events import Checkpoint, Evaluated, Event, LeftOut, Preview, Scored, Trained
+from panolog.workers.events import Checkpoint, Evaluated, Event, LeftOut, Preview, Scored
 from panolog.workers.scoring import ScoreSpec, score
 from panolog.workers.sound_views import SoundViews
 from panolog.workers.specs import Value
@@ -24,6 +23,7 @@ from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
 from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
+from tests.workers.trainings import checkpoints, coarse_of, same, trained
 
 CONFIG = TrainConfig.model_validate(
     {"sky": {"count": 60}, "checkpoint": {"every": 3, "share": 1}, "preview": {"every": 4}}
@@ -37,14 +37,7 @@ def truncate(scene: Scene, row: int) -> None:
 
 
 def spec_of(scene: Scene, config: TrainConfig = CONFIG) -> TrainSpec:
-    return TrainSpec(
-        task=COARSE, scene=Value(scene), views=(0, 1, 2, 3), width=WIDTH, iterations=12, config=config, seed=3
-    )
-
-
-def trained(events: list[Event]) -> Gaussians:
-    assert isinstance(events[-1], Trained)
-    return events[-1].gaussians
+    return coarse_of(scene, config, iterations=12)
 
 
 @pytest.mark.parametrize("row", range(4))
@@ -65,9 +58,7 @@ def test_a_panorama_that_is_damaged_in_the_middle_of_a_training_is_left_out_from
     scene = small_scene(tmp_path)
     cache = CONFIG.cache.model_copy(update={"memory": 1e-9})  # each is decoded whenever it is needed
     events = train(spec_of(scene, CONFIG.model_copy(update={"cache": cache})))
-    before: list[
-        Event
-    ] = []  # to the first checkpoint: how many reports of progress precede it depends on the time
+    before: list[Event] = []  # to the first checkpoint
     while not any(isinstance(event, Checkpoint) for event in before):
         before.append(next(events))
     truncate(scene, 1)
@@ -85,15 +76,12 @@ def test_a_resumed_training_leaves_the_same_out_and_ends_with_the_same_bytes(
     truncate(scene, row)
     spec = spec_of(scene)
     whole = list(train(spec))
-    saved = [event for event in whole if isinstance(event, Checkpoint)]
+    saved = checkpoints(whole)
     assert [event.iteration for event in saved] == [3, 6, 9]
     for checkpoint in saved:
         resumed = list(train(replace(spec, checkpoint=Value(checkpoint))))
         assert not any(isinstance(event, LeftOut) for event in resumed)  # the checkpoint knows
-        for one, other in zip(
-            trained(whole).tensors().values(), trained(resumed).tensors().values(), strict=True
-        ):
-            assert torch.equal(one, other)
+        assert same(trained(whole), trained(resumed))
 
 
 def test_what_a_checkpoint_leaves_out_stays_left_out(tmp_path: Path) -> None:
