@@ -110,7 +110,7 @@ def test_a_resumed_task_decides_alike(misled: TrainSpec) -> None:
         assert bytes_of(trained(again)) == bytes_of(trained(events)) and notices(again) == notices(events)
 
 
-@pytest.mark.parametrize("renders", range(4))
+@pytest.mark.parametrize("renders", [0, 3])
 def test_a_stop_during_the_comparison_leaves_a_checkpoint(misled: TrainSpec, renders: int) -> None:
     stopped = list(train(misled, stop_at(misled.iterations + renders)))  # one call for each iteration
     last = stopped[-1]
