@@ -19,14 +19,13 @@ from panolog.orchestrator.run.state import RunState, ignore, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
+from tests.orchestrator.whole_runs.test_whole_runs import SETS
 from tests.ray_head import environment, wait_until
 
 pytestmark = pytest.mark.system
 
-SETTINGS = ("sky.count=100", "checkpoint.every=20", "checkpoint.share=1", "densify.start=10", "width=64")
-FLAGS = {"iterations": 120, "device": "cpu", "blocks": "1x1x1"}
+SETTINGS = (*SETS, "iterations=120", "blocks=1x1x1", "width=64")
 OPTIONS = [word for setting in SETTINGS for word in ("--set", setting)]
-OPTIONS += [word for name, value in FLAGS.items() for word in (f"--{name}", str(value))]
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +88,7 @@ def test_a_run_whose_driver_is_killed_and_loses_ray_ends_with_the_same_bytes(
     assert [record.outcome for record in records if isinstance(record, RunEnded)] == ["done"]
     calm = tmp_path / "calm"
     with local_pool() as pool:
-        session.start(scene, calm, load_config(None, SETTINGS, FLAGS), None, ignore, pool)
+        session.start(scene, calm, load_config(sets=SETTINGS), None, ignore, pool)
     assert (root / "point_cloud.ply").read_bytes() == (calm / "point_cloud.ply").read_bytes()
 
 

@@ -1,10 +1,11 @@
 """Whole runs through Ray, undisturbed and with killed workers, and without Ray: the same bytes."""
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,17 +19,22 @@ from typer.testing import CliRunner
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.cluster import connection
 from panolog.orchestrator.commands import session
-from panolog.orchestrator.driver.local_pool import local_pool
+from panolog.orchestrator.driver.local_pool import LocalPool, local_pool
 from panolog.orchestrator.money.limits import Wanted
 from panolog.orchestrator.money.prices import read_prices
+from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import CheckpointSaved, Stored, TaskStarted
+from panolog.orchestrator.run.records import CheckpointSaved, RunBegan, Stored, TaskStarted
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
+from panolog.orchestrator.storage.layout import OBJECTS, current
+from panolog.orchestrator.storage.lease import holder
 from panolog.scene.ply import ply_header
+from panolog.scene.stores.store import open_store
 from panolog.synthetic.make import make_town
-from panolog.workers.tasks import COARSE, EVAL, TaskId
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from tests.examples.test_examples import example
 
 pytestmark = pytest.mark.system
@@ -226,6 +232,46 @@ def resumed(root: Path, *limit: object) -> str:
     result = CliRunner().invoke(app.app, ["resume", str(root), *words])
     assert result.exit_code == 0, result.output
     return result.stderr
+
+
+class Interrupted(LocalPool):
+    """Ctrl-C when Stage I has ended."""
+
+    def start(self, placement: Placement, spec: TaskSpec) -> None:
+        if spec.task.stage == Stage.BLOCK:
+            raise KeyboardInterrupt
+        super().start(placement, spec)
+
+
+def test_a_run_in_a_store_goes_on_in_an_empty_folder(
+    runs: tuple[Path, Ended, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PANOLOG_STORE_CACHE", str(tmp_path / "cache"))
+    calm, run = runs[0], f"file://{tmp_path}/store"
+    first, second = tmp_path / "first", tmp_path / "second"
+    for words, pool, code in (
+        (
+            ["run", (calm.parent / "town").as_uri(), "-o", run, "--local", first, *SETTINGS],
+            Interrupted(),
+            130,
+        ),
+        (["resume", run, "--local", second], LocalPool(), 0),
+    ):
+        with closing(pool):
+            monkeypatch.setattr(connection, "connect", lambda *_, pool=pool: nullcontext(pool))
+            ended = CliRunner().invoke(app.app, list(map(str, words)))
+        assert ended.exit_code == code, ended.output
+        shutil.rmtree(first, ignore_errors=True)
+    records = [stored.record for stored in read_records(RunFolder(second).database)]
+    assert [record.resumed for record in records if isinstance(record, RunBegan)] == [False, True]
+    same_bytes(second, calm)
+    store = open_store(run)
+    assert store.read("point_cloud.ply") == (calm / "point_cloud.ply").read_bytes()
+    assert holder(store) == ""
+    manifest = current(store)
+    assert manifest is not None
+    assert not any(name.endswith("checkpoint.safetensors") for name in manifest.files)
+    assert set(store.list(f"{OBJECTS}/coarse/model.ply")) == {manifest.files["coarse/model.ply"].key}
 
 
 def call(*arguments: object) -> Any:
