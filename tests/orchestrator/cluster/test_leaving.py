@@ -1,9 +1,9 @@
 """Nodes of a real Ray cluster that announce that they leave: by their provider, and by draining."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from time import monotonic
+from tempfile import TemporaryDirectory
 
 import pytest
 import ray
@@ -20,6 +20,7 @@ from panolog.scene.errors import ClusterError
 from panolog.workers.events import Checkpoint
 from tests.metadata_service import Metadata, metadata
 from tests.orchestrator.scripted import TASK, Works
+from tests.ray_head import all_end, wait_until
 
 pytestmark = pytest.mark.system
 
@@ -38,7 +39,7 @@ class Spot:
         assert isinstance(self.message(), Hello)
 
     def message(self) -> Message:
-        assert self.pool.ready(60) == [TASK]
+        assert self.pool.ready(300) == [TASK]
         return self.pool.take(TASK)
 
     def end(self) -> None:
@@ -55,28 +56,33 @@ class Spot:
         return notice.kind if notice else None
 
 
-@pytest.fixture
-def spot(monkeypatch: pytest.MonkeyPatch) -> Iterator[Spot]:
-    with metadata("amazon") as service:
-        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """A head without cores, which this process is connected to."""
+    with TemporaryDirectory(prefix="leaving-", dir="/tmp", ignore_cleanup_errors=True) as folder, all_end():
+        head = {"num_cpus": 0, "include_dashboard": False, "temp_dir": folder}
+        found = Cluster(initialize_head=True, head_node_args=head)
         try:
-            monkeypatch.setenv(VARIABLE, service.url)
-            node = cluster.add_node(num_cpus=1)
-            monkeypatch.delenv(VARIABLE)
-            cluster.wait_for_nodes()
-            ray.init(address=cluster.address, log_to_driver=False)
-            pool = RayPool(None, "test")
-            yield Spot(pool, node.node_id, service)
-            pool.close()
+            ray.init(address=found.address, log_to_driver=False)
+            yield found
         finally:
             ray.shutdown()
-            cluster.shutdown()  # type: ignore[no-untyped-call]
+            found.shutdown()  # type: ignore[no-untyped-call]
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    end = monotonic() + 60
-    while not condition():
-        assert monotonic() < end, "it does not happen"
+@pytest.fixture
+def spot(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spot]:
+    with metadata("amazon") as service:
+        monkeypatch.setenv(VARIABLE, service.url)
+        node = cluster.add_node(num_cpus=1)
+        monkeypatch.delenv(VARIABLE)
+        cluster.wait_for_nodes(timeout=120)
+        pool = RayPool(None, "test")
+        try:
+            yield Spot(pool, node.node_id, service)
+        finally:
+            pool.close()
+            cluster.remove_node(node)
 
 
 def test_a_provider_takes_a_node_away(spot: Spot) -> None:
@@ -84,10 +90,10 @@ def test_a_provider_takes_a_node_away(spot: Spot) -> None:
     assert spot.kind() is None
     (known,) = spot.pool._agents._known.values()
     ray.kill(known.actor, no_restart=False)  # it comes back
-    spot.service.spot(120)
-    wait_until(lambda: spot.kind() == Leaving.PREEMPTION)
+    spot.service.spot(7200)
+    wait_until(lambda: spot.kind() == Leaving.PREEMPTION, "the notice")
     notice = spot.pool.notices()[spot.node]
-    assert notice.seconds == pytest.approx(120, abs=30)
+    assert notice.seconds == pytest.approx(7200, abs=1200)
     spot.end()
     assert spot.kind() == Leaving.PREEMPTION  # known as long as the node is there
 
@@ -97,12 +103,12 @@ def test_a_node_drains_while_its_task_saves_and_then_ends(spot: Spot) -> None:
         leave(1)
     spot.begin()
     with ThreadPoolExecutor(1) as threads:
-        left = threads.submit(leave, 120, spot.node[:12])
-        wait_until(lambda: spot.kind() == Leaving.DRAIN)
+        left = threads.submit(leave, 600, spot.node[:12])
+        wait_until(lambda: spot.kind() == Leaving.DRAIN, "the drain")
         assert not left.done()
         spot.end()  # Ray starts no task there any more: the agent stops this one
-        wait_until(lambda: spot.kind() is None)  # its agent has ended too, so the node has
-        assert left.result(60)
+        wait_until(lambda: spot.kind() is None, "its end")  # its agent has ended too, so the node has
+        assert left.result(300)
     assert spot.node not in {raylet.node for raylet in raylets()}
 
 
@@ -113,7 +119,7 @@ def test_an_agent_ends_where_nothing_runs_so_that_the_node_is_idle(
     spot.begin()
     spot.end()
     spot.kind()
-    assert leave(60, spot.node)  # nothing holds it
+    assert leave(600, spot.node)  # nothing holds it
 
 
 def test_where_ray_does_not_run_there_is_no_node(monkeypatch: pytest.MonkeyPatch) -> None:

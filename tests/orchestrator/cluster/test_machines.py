@@ -1,7 +1,6 @@
 """A run on three hosts that share nothing, and one of them loses its network in the middle of a block."""
 
 import json
-import secrets
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,6 +10,9 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
+from panolog.orchestrator.commands import session
+from panolog.orchestrator.driver.local_pool import local_pool
+from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
@@ -20,28 +22,20 @@ from panolog.orchestrator.run.records import (
     TaskStarted,
     Transferred,
 )
+from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from tests.orchestrator.cluster.hosts import Hosts, NoHostsError
-from tests.ray_head import BIN, environment, recovery, wait_until
+from tests.ray_head import BIN, cluster_environment, environment, wait_until
 
 pytestmark = pytest.mark.system
 
 HEAD, ADDRESS = "10.77.0.1", "10.77.0.1:6379"
 WORKERS = {"one": "10.77.0.2", "two": "10.77.0.3"}
-SETTINGS: tuple[str, ...] = ("--iterations", "60", "--device", "cpu")
-SETTINGS += tuple(
-    word
-    for setting in (
-        "sky.count=100",
-        "checkpoint.every=5",
-        "checkpoint.share=1",
-        "densify.start=10",
-        "densify.every_floor=5",
-    )
-    for word in ("--set", setting)
-)
+SETS = ("sky.count=100", "checkpoint.every=5", "checkpoint.share=1", "densify.start=10", "iterations=20")
+SETS += ("device=cpu", "densify.every_floor=5")
+SETTINGS = tuple(word for setting in SETS for word in ("--set", setting))
 
 # The driver waits for the test to cut a cable after the first checkpoint of a block on the host "two", before
 # it reads on, so the worker cannot come to its end; and to connect it again after the failure.
@@ -88,15 +82,14 @@ class Cluster:
     def __init__(self, hosts: Hosts, folder: Path) -> None:
         self.hosts = hosts
         self.folder = folder
-        self.environment = environment() | recovery() | {"RAY_AUTH_MODE": "token"}
-        self.environment["RAY_AUTH_TOKEN"] = secrets.token_hex(16)
+        self.environment = cluster_environment()
 
     def start(self) -> None:
         """Returns when all three have said that they run."""
         self._ray("head", HEAD, "--head", "--port=6379", "--num-cpus=0", "--include-dashboard=false")
         for host, address in WORKERS.items():
             self._ray(host, address, f"--address={ADDRESS}", "--num-cpus=1")
-        wait_until(lambda: all(self.starts(host) for host in ("head", *WORKERS)), "three hosts with Ray", 120)
+        wait_until(lambda: all(self.starts(host) for host in ("head", *WORKERS)), "three hosts with Ray", 240)
 
     def starts(self, host: str) -> int:
         """How often Ray has been started there."""
@@ -160,13 +153,11 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
 def test_a_host_loses_its_network_and_gets_it_back(cluster: Cluster, tmp_path: Path) -> None:
     scene = make_town(tmp_path / "town", panoramas=9, width=64, points=300)
     calm, run = tmp_path / "calm", tmp_path / "run"
-    command = [BIN / "panolog", "run", scene, "-o", calm, *SETTINGS]
-    with (tmp_path / "calm.log").open("w") as log:
-        undisturbed = subprocess.Popen(list(map(str, command)), stderr=log, env=environment())
+    with local_pool() as pool:
+        session.start(scene, calm, load_config(sets=SETS), None, ignore, pool)
     cluster.start()
     for host in WORKERS:
         assert cluster.hosts.launch(host, "test", "-e", scene).wait() == 1
-    assert undisturbed.wait() == 0, (tmp_path / "calm.log").read_text()
     errors = tmp_path / "run.log"
     assert cluster.drive("run", scene, "-o", run, *SETTINGS, errors=errors) == 0, errors.read_text()
 

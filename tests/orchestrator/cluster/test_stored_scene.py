@@ -14,7 +14,8 @@ from panolog.workers.tasks import COARSE
 from tests.orchestrator.cluster.test_machines import HEAD, WORKERS, Cluster, three_hosts
 from tests.ray_head import BIN
 
-pytestmark = pytest.mark.system
+# The cache and the reading of scenes through it have tests of their own: this is both on hosts.
+pytestmark = [pytest.mark.system, pytest.mark.nightly]
 
 PORT, URL = 5000, "s3://places/town"
 PROVIDER = {
@@ -24,20 +25,8 @@ PROVIDER = {
     "AWS_DEFAULT_REGION": "us-east-1",
     "AWS_EC2_METADATA_DISABLED": "true",
 }
-SETTINGS = (
-    "--iterations",
-    "20",
-    "--width",
-    "64",
-    "--device",
-    "cpu",
-    "--blocks",
-    "2x1x1",
-    "--set",
-    "sky.count=100",
-    "--set",
-    "deliver=false",
-)
+SETTINGS = ("--iterations", "20", "--width", "64", "--device", "cpu", "--blocks", "2x1x1")
+SETTINGS += ("--set", "sky.count=100", "--set", "deliver=false")
 # Waits for the server, makes the bucket and stores a folder.
 STORE = """
 import socket, sys, time
