@@ -13,9 +13,7 @@ from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import session
-from panolog.orchestrator.preparation.settings import (
-    Options,
-)
+from panolog.orchestrator.preparation.settings import Options
 from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.state import ignore
 from panolog.prepare.sfm.pipeline import SfmSettings, WithMasks, panoramas_in_folder, workspace_folder

@@ -21,7 +21,7 @@ from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.views.preparation import prepared_share, view_preparation
 from panolog.orchestrator.views.timing import progress_of
 from panolog.workers.tasks import PREPARE
-from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium, opened
+from tests.orchestrator.dashboard.browser import PHONE, chromium, opened
 from tests.orchestrator.dashboard.served import EVIL, POST, Served, append, serving, write_run
 from tests.visual import legible
 
@@ -116,16 +116,12 @@ def huge(path: Path) -> None:
 
 @pytest.mark.parametrize("spoil", [pipe, link, huge, lambda path: path.write_bytes(b"{")])
 def test_files_made_to_do_harm_show_nothing(spoil: Callable[[Path], None], folder: RunFolder) -> None:
-    for path in (settings_path(folder), notes.progress_path(folder), notes.result_path(folder, Step.SFM)):
-        spoil(path)
-        with serving(folder.root.parent) as server:
-            page = server.get(f"/api/runs/{server.id('walk')}")
-            assert page["preparation"] is None
-            assert page["summary"]["status"] == "stopped"
-        break
-    spoiled = write_preparing(folder.root.parent / "other")
-    spoil(notes.progress_path(spoiled))
+    spoil(settings_path(folder))
+    spoil(notes.progress_path(write_preparing(folder.root.parent / "other")))
     with serving(folder.root.parent) as server:
+        page = server.get(f"/api/runs/{server.id('walk')}")
+        assert page["preparation"] is None
+        assert page["summary"]["status"] == "stopped"
         view = server.get(f"/api/runs/{server.id('other')}")["preparation"]
         assert [step["status"] for step in view["steps"]] == ["done", "waiting", "waiting"]
 
@@ -146,38 +142,25 @@ def test_a_run_without_its_scene_can_be_resumed_only_if_it_makes_it(
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("width", [DESK, PHONE])
-def test_the_page_has_steps_numbers_and_pictures(width: int, folder: RunFolder, served: Served) -> None:
-    url = f"{served.url}/runs/{served.id('walk')}"
-    with lock.hold(folder.lock), chromium() as browser, opened(browser, url, width=width) as page:
+def test_the_page_has_steps_numbers_pictures_and_then_exposures(folder: RunFolder, served: Served) -> None:
+    url, path = (f"{served.url}/runs/{served.id('walk')}", f"/api/runs/{served.id('walk')}/exposure")
+    assert served.client.get(path).status_code == 404
+    with lock.hold(folder.lock), chromium() as browser, opened(browser, url, width=PHONE) as page:
         card = page.locator("#preparation")
-        expect(card.locator(".step[data-status='running'] .step-note")).to_have_text(
-            "running · depth 3 of 10"
-        )
+        running = card.locator(".step[data-status='running'] .step-note")
+        expect(running).to_have_text("running · depth 3 of 10")
+        expect(page.locator("#exposure")).to_be_hidden()
         note(folder, 9)
-        expect(card.locator(".step[data-status='running'] .step-note")).to_have_text(
-            "running · depth 9 of 10"
-        )
+        expect(running).to_have_text("running · depth 9 of 10")
         expect(card).to_contain_text(EVIL)
         expect(card.locator("#kept")).to_contain_text("Without a pose2")
         expect(card.locator("img")).to_have_js_property("naturalWidth", 60)
-        assert legible.sideways(page) == legible.low_contrast_in_both_themes(page) == []
-
-
-@pytest.mark.system
-def test_the_page_draws_exposures_once_there_are_some(folder: RunFolder, served: Served) -> None:
-    url = f"{served.url}/runs/{served.id('walk')}"
-    path = f"/api/runs/{served.id('walk')}/exposure"
-    assert served.client.get(path).status_code == 404
-    with lock.hold(folder.lock), chromium() as browser, opened(browser, url) as page:
-        expect(page.locator("#steps .step")).to_have_count(3)
-        expect(page.locator("#exposure")).to_be_hidden()
         known = [
             {"name": EVIL, "stops": at / 4, "gain": [1.0, 1.1, 1.2], "black": [0, 0, 0]} for at in range(5)
         ]
         write_json(folder.root / "exposure.json", {"panoramas": known})
-        expect(page.locator("#exposure-plot .scatterlayer .trace")).to_have_count(4, timeout=30_000)
-        assert legible.sideways(page) == []
+        expect(page.locator("#exposure-plot .scatterlayer .trace")).to_have_count(4)
+        assert legible.sideways(page) == legible.low_contrast_in_both_themes(page) == []
 
 
 def test_the_progress_of_a_run_grows_with_each_part_of_the_preparation(tmp_path: Path) -> None:

@@ -12,12 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from panolog.orchestrator.commands.supervise import progress_made
 from panolog.orchestrator.preparation import notes
-from panolog.orchestrator.preparation.settings import (
-    Step,
-    read_settings,
-)
+from panolog.orchestrator.preparation.settings import Step, read_settings
 from panolog.orchestrator.run import control
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import PENDING, read_info
@@ -27,13 +23,7 @@ from panolog.orchestrator.run.store import read_records
 from panolog.prepare.sfm.pipeline import workspace_folder
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
-from tests.orchestrator.preparation.fake_sfm import (
-    FakeSfm,
-    Killed,
-    call,
-    resume,
-    start,
-)
+from tests.orchestrator.preparation.fake_sfm import FakeSfm, Killed, call, resume, start
 from tests.prepare.networks.networks import given, red_depth
 
 
@@ -124,7 +114,7 @@ def test_a_request_to_stop_is_taken_in_the_preparation(raw: Path, sfm: FakeSfm, 
     def stop(at: str) -> None:
         if at == "poses":
             control.send(RunFolder(root), "stop")
-            waited.wait(60)  # a signal ends it
+            waited.wait(300)  # a signal ends it
 
     sfm.at = stop
     with pytest.raises(KeyboardInterrupt):
@@ -199,10 +189,6 @@ def test_masks_of_the_source_are_joined_with_what_is_wanted(town: Path, sfm: Fak
     assert joined[-1].max() == other[-1].max() == 0
     assert joined[0, 8:].min() == other[0].min() == 255
     assert {it.name for it in (tmp_path / "run" / "prepare").iterdir() if it.is_dir()} == set()
-
-
-def test_a_step_that_is_done_counts_as_progress_of_a_supervised_run(calm: RunFolder, tmp_path: Path) -> None:
-    assert progress_made(calm.root) != progress_made(tmp_path)
 
 
 def test_depth_is_estimated_if_a_network_is_given(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:

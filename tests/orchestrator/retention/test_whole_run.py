@@ -19,9 +19,9 @@ from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, TaskId
 
 pytestmark = pytest.mark.system
-SETTINGS = ("sky.count=100", "checkpoint.every=20", "checkpoint.share=1", "width=64", "densify.start=10")
+SETTINGS = ("sky.count=100", "checkpoint.every=10", "checkpoint.share=1", "width=64", "densify.start=10")
 KEPT = ("retention.checkpoints=3", "retention.models=false")
-FLAGS = {"iterations": 120, "device": "cpu", "blocks": "2x1x1"}
+FLAGS = {"iterations": 50, "device": "cpu", "blocks": "2x1x1"}
 
 
 def panolog(*words: object) -> str:

@@ -11,9 +11,7 @@ from panolog.orchestrator.run.records import CheckpointSaved, Outcome, Record, R
 from panolog.orchestrator.run.state import replay
 from panolog.orchestrator.run.store import Database, read_milestones
 from panolog.orchestrator.storage.fetch import bring
-from panolog.orchestrator.storage.layout import (
-    current,
-)
+from panolog.orchestrator.storage.layout import current
 from panolog.orchestrator.storage.lease import Lease, take
 from panolog.orchestrator.storage.mirror import Mirror
 from panolog.scene.files import write_bytes
@@ -61,7 +59,7 @@ def rounds(mirror: Mirror) -> None:
     """As many rounds as it takes, as when the driver has ended."""
     over = threading.Event()
     over.set()
-    mirror.follow(over, threading.Event(), 0.01, 5.0)
+    mirror.follow(over, threading.Event(), 0.01, 300.0)
 
 
 def fetched(store: Store, root: Path) -> RunFolder:

@@ -108,7 +108,10 @@ def test_a_missing_bucket_is_the_users_at_once(server: CloudStore) -> None:
 
 
 def test_a_scene_is_read_through_the_cache(server: CloudStore, tmp_path: Path) -> None:
-    root, place = large_scene(tmp_path / "place"), open_store(server.url("place"), 5.0)
+    root, place = (
+        large_scene(tmp_path / "place", ("a.jpg", "b.jpg", "c.jpg")),
+        open_store(server.url("place"), 5.0),
+    )
     for path in root.rglob("*"):
         if path.is_file():
             place.put(path, path.relative_to(root).as_posix())
