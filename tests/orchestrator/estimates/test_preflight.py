@@ -100,16 +100,22 @@ def test_a_value_that_is_proposed_fits_and_a_larger_one_would_not(
     assert not fits(float(found[1]) + more)
 
 
-def growing(scene: Scene, **settings: Any) -> Preflight:
+def growing(scene: Scene, times: int = 500, **settings: Any) -> Preflight:
     """A job whose Stage I is expected to come to many Gaussians, on a machine with plenty of memory."""
-    cloud = replace(scene, points=scene.points.repeat(500, axis=0))
+    cloud = replace(scene, points=scene.points.repeat(times, axis=0))
     return examined(cloud, **settings)
 
 
 @pytest.mark.parametrize(("recipe", "blocks"), [("paper", "2x1x1"), ("paper", "auto"), ("panolog", "2x1x1")])
 def test_a_task_grows_to_what_its_memory_takes(scene: Scene, recipe: str, blocks: str) -> None:
     """Where the place cannot be divided further."""
-    whole = {"recipe": recipe, "blocks": blocks, "stage2": {"detail": 1.0}, "partition": {"min_cameras": 4}}
+    whole: dict[str, Any] = {
+        "times": 100,
+        "recipe": recipe,
+        "blocks": blocks,
+        "stage2": {"detail": 1.0},
+        "partition": {"min_cameras": 4},
+    }
     free = growing(scene, **whole)
     need = max(stage.host for stage in free.estimate.stages) / 2**30
     assert free.config.densify.max_gaussians == 0 and "max_gaussians" not in free.summary()
@@ -123,7 +129,7 @@ def test_a_task_grows_to_what_its_memory_takes(scene: Scene, recipe: str, blocks
         assert max(stage.host for stage in found.estimate.stages) <= memory * 2**30
         caps.append(found.config.densify.max_gaussians)
         assert f"at most {caps[-1]:,} scene Gaussians" in found.summary()
-    assert 100_000 <= caps[0] < caps[1]
+    assert 20_000 <= caps[0] < caps[1]
     assert growing(scene, **whole, memory=2 * need).config == free.config.model_copy(
         update={"memory": 2 * need}
     )
