@@ -1,9 +1,11 @@
 """Nodes of a real Ray cluster that announce that they leave: by their provider, and by draining."""
 
+import shutil
+import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from tempfile import TemporaryDirectory
+from pathlib import Path
 
 import pytest
 import ray
@@ -59,8 +61,8 @@ class Spot:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
     """A head without cores, which this process is connected to."""
-    with TemporaryDirectory(prefix="leaving-", dir="/tmp", ignore_cleanup_errors=True) as folder, all_end():
-        head = {"num_cpus": 0, "include_dashboard": False, "temp_dir": folder}
+    with all_end():
+        head = {"num_cpus": 0, "include_dashboard": False}
         found = Cluster(initialize_head=True, head_node_args=head)
         try:
             ray.init(address=found.address, log_to_driver=False)
@@ -68,6 +70,7 @@ def cluster() -> Iterator[Cluster]:
         finally:
             ray.shutdown()
             found.shutdown()  # type: ignore[no-untyped-call]
+    shutil.rmtree(Path(tempfile.gettempdir(), "ray"), ignore_errors=True)
 
 
 @pytest.fixture
