@@ -174,7 +174,7 @@ def test_an_address_that_is_none_is_named(monkeypatch: pytest.MonkeyPatch, url: 
 
 
 def wait_for(watch: Watch, seen: Leaving | None) -> LeaveNotice | None:
-    return watch.wait(seen, 20)
+    return watch.wait(seen, 60)
 
 
 @azure
@@ -197,11 +197,11 @@ def test_a_service_that_fails_withdraws_nothing(served: Metadata, monkeypatch: p
         assert wait_for(watch, None) == LeaveNotice(Leaving.REBALANCE, None)
         served.status = 503
         served.looked.clear()
-        assert served.looked.wait(20)
+        assert served.looked.wait(60)
         before = len(served.requests)
         while len(served.requests) < before + 5:
             served.looked.clear()
-            assert served.looked.wait(20)
+            assert served.looked.wait(60)
         assert watch.notice() == LeaveNotice(Leaving.REBALANCE, None)
         served.status = 0
         del served.values[REBALANCE]
@@ -213,7 +213,7 @@ def test_a_service_that_fails_withdraws_nothing(served: Metadata, monkeypatch: p
         before = len(served.requests)
         while len(served.requests) < before + 5:
             served.looked.clear()
-            assert served.looked.wait(20)
+            assert served.looked.wait(60)
         later = watch.notice()
         assert later is not None and later.seconds is not None and found.seconds is not None
         assert later.seconds < found.seconds
@@ -228,7 +228,7 @@ def test_where_there_is_no_provider_the_thread_ends() -> None:
     watch = Watch(lambda: None)
     for thread in threading.enumerate():
         if thread.name == "leave notices":
-            thread.join(20)
+            thread.join(60)
     assert threading.active_count() <= before
     assert watch.notice() is None
 
