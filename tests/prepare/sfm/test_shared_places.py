@@ -1,4 +1,4 @@
-"""Structure from motion of the places in the shared data; a file of their own, because they take long."""
+"""Structure from motion of the places in the shared data."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from panolog.scene.write import no_progress
 from tests.data import reduced, shared
 from tests.prepare.sfm.accuracy import drift, length
 
-pytestmark = pytest.mark.system
+pytestmark = pytest.mark.nightly
 
 
 def test_the_flat_comes_out_as_it_is_known(tmp_path: Path) -> None:

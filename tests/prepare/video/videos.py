@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 WIDTH, HEIGHT = 512, 256
-_SIDE, _UP, _DOWN, _END = 4.0, 6.0, 1.7, 200.0  # metres from the camera to the walls of the street
+SIDE, UP, DOWN, END = 4.0, 6.0, 1.7, 200.0  # metres from the camera to the walls of the street
 _TEXEL = 0.06  # metres
 _TEXTURE = 1024
 
@@ -48,7 +48,7 @@ def render(shot: Shot, width: int = WIDTH, *, bearer: bool = True) -> Image:
     """(width / 2, width, 3) BGR of a shot; who bears the camera covers its nadir and moves with it."""
     rays, local = _rays(width, shot.turn)
     position = np.array([0.0, 0.0, shot.along])
-    prefetch, behind = np.array([_SIDE, _DOWN, _END]), np.array([-_SIDE, -_UP, -_END])
+    prefetch, behind = np.array([SIDE, DOWN, END]), np.array([-SIDE, -UP, -END])
     with np.errstate(divide="ignore"):
         distance = np.where(rays > 0, prefetch / rays, behind / rays)
     nearest = distance.argmin(axis=1)

@@ -1,0 +1,72 @@
+"""What panoramas are taken from: folders with layers, and what is refused in one line."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from panolog.prepare.sfm.pipeline import SfmSettings, make_scene, panoramas_in_folder
+from panolog.scene.errors import InputError
+from panolog.scene.write import no_progress
+
+
+def _pictures(folder: Path, *shapes: tuple[int, int]) -> None:
+    folder.mkdir(parents=True)
+    for number, shape in enumerate(shapes or [(64, 128)] * 2):
+        cv2.imwrite(str(folder / f"{number}.png"), np.full(shape, 90, np.uint8))
+
+
+@pytest.mark.parametrize(
+    "what, message",
+    [
+        ("nothing", "there is no such folder or video"),
+        ("one", "1 panoramas"),
+        ("flat", "not 2:1"),
+        ("sizes", "all panoramas must have one size"),
+        ("damaged", "truncated"),
+        ("another format", r"1\.png: COLMAP cannot read this image; save it as"),
+        ("taken", "already exists"),
+    ],
+)
+def test_refusals(what: str, message: str, tmp_path: Path) -> None:
+    folder, output = tmp_path / "images", tmp_path / "scene"
+    shapes = {"one": [(64, 128)], "flat": [(64, 128), (64, 100)], "sizes": [(64, 128), (32, 64)]}
+    if what != "nothing":
+        _pictures(folder, *shapes.get(what, []))
+    if what == "damaged":
+        (folder / "1.png").write_bytes((folder / "1.png").read_bytes()[:80])
+    if what == "another format":
+        (folder / "1.png").write_bytes(bytes(cv2.imencode(".webp", np.full((64, 128), 90, np.uint8))[1]))
+    if what == "taken":
+        output.mkdir()
+        (output / "mine").touch()
+    with pytest.raises(InputError, match=message):
+        make_scene(folder, output, SfmSettings(), no_progress)
+    assert sorted(path.name for path in output.rglob("*")) == (["mine"] if what == "taken" else [])
+
+
+@pytest.mark.system
+def test_pictures_of_nothing_are_refused(tmp_path: Path) -> None:
+    _pictures(tmp_path / "images")
+    with pytest.raises(InputError, match="no features"):
+        make_scene(tmp_path / "images", tmp_path / "scene", SfmSettings(), no_progress)
+    assert not (tmp_path / "scene").exists()
+
+
+def test_a_scene_inside_of_its_source(tmp_path: Path) -> None:
+    _pictures(tmp_path / "images")
+    with pytest.raises(InputError, match="give a folder elsewhere"):
+        make_scene(tmp_path / "images", tmp_path / "images" / "scene", SfmSettings(), no_progress)
+
+
+@pytest.mark.parametrize(
+    "pictures, given", [("place/images", "place"), ("place/images", "place/images"), ("place", "place")]
+)
+def test_where_pictures_and_masks_are(pictures: str, given: str, tmp_path: Path) -> None:
+    _pictures(tmp_path / pictures)
+    _pictures(tmp_path / "place" / "masks")
+    panoramas, layers = panoramas_in_folder(tmp_path / given)
+    assert [panorama.name for panorama in panoramas] == ["0.png", "1.png"]
+    assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
+    assert layers["depths"] == [None, None]

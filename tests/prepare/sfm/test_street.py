@@ -1,0 +1,158 @@
+"""From panoramas to a scene: a rendered street, the one place that `make test` reconstructs."""
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from panolog.prepare.sfm.pipeline import SfmSettings, make_scene, workspace_folder
+from panolog.prepare.sfm.reconstruct import LayerFiles
+from panolog.prepare.sfm.report import SfmReport
+from panolog.scene.model import Scene
+from panolog.scene.read import read_scene
+from panolog.scene.write import no_progress
+from tests.prepare.sfm.accuracy import drift
+from tests.prepare.video.containers import add_spherical, add_track, equirectangular
+from tests.prepare.video.sensors import gps5, grav, payload
+from tests.prepare.video.videos import Shot, render, walk, write_video
+
+pytestmark = pytest.mark.system
+
+WIDTH, COUNT = 640, 7
+NAMES = [f"pano {number}.{suffix}" for number, suffix in enumerate(["webp", "WEBP", *["png"] * (COUNT - 2)])]
+HIDDEN = WIDTH // 4  # columns under a mask
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """The street as a scene, and what two interrupted jobs on it have left."""
+
+    source: Path  # panoramas with masks
+    shots: list[Shot]
+    featured: Path  # the workspace before matching
+    matched: Path  # and before mapping
+    report: SfmReport
+    scene: Scene
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Walls of random patches, and the operator; each job goes on where the last one was stopped."""
+    source, jobs, shots = (
+        tmp_path_factory.mktemp("street"),
+        tmp_path_factory.mktemp("jobs"),
+        walk([0.9] * COUNT),
+    )
+    (source / "images").mkdir()
+    (source / "masks").mkdir()
+    mask = np.full((WIDTH // 2, WIDTH), 255, np.uint8)
+    mask[:, :HIDDEN] = 0
+    for name, shot in zip(NAMES, shots, strict=True):
+        kind, lossless = Path(name).suffix.lower(), [cv2.IMWRITE_WEBP_QUALITY, 101]
+        encoded = cv2.imencode(kind, render(shot, WIDTH), lossless if kind == ".webp" else [])[1]
+        (source / "images" / name).write_bytes(bytes(encoded))
+        cv2.imwrite(str(source / "masks" / Path(name).with_suffix(".png")), mask)
+    output = jobs / "scene"
+    _interrupted(source, output, "matches")
+    featured = Path(shutil.copytree(workspace_folder(output), jobs / "featured", symlinks=True))
+    settings = SfmSettings(distance=(NAMES[0], NAMES[-1], shots[-1].along - shots[0].along))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("panolog.prepare.sfm.features.features_of", None)  # the features are there
+        _interrupted(source, output, "poses")
+        matched = Path(shutil.copytree(workspace_folder(output), jobs / "matched", symlinks=True))
+        _interrupted(source, output, "poses", least=3)
+        assert not output.exists()
+        report = make_scene(source, output, settings, no_progress)
+    assert not workspace_folder(output).exists()
+    return Made(source, shots, featured, matched, report, read_scene(output))
+
+
+def test_poses_are_those_of_the_street_in_metres(street: Made) -> None:
+    made, centers = street.report, street.scene.centers
+    assert [panorama.name for panorama in street.scene.panoramas] == NAMES
+    truth = np.array([[0, 0, shot.along] for shot in street.shots])
+    assert drift(centers, truth) < 0.01 * np.ptp(truth)
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    assert steps == pytest.approx(0.9, rel=0.03)
+    assert made.world.frame == "upright" and made.world.metric
+    spread = np.ptp(centers, axis=0)
+    assert spread[2] < 0.05 * spread.max()  # z is up, but for the mean sway of the camera
+    assert len(made.found.missing) == 0
+    assert np.concatenate(made.found.model.errors(WIDTH)).mean() < 0.5
+
+
+def test_nothing_is_seen_under_a_mask(street: Made) -> None:
+    seen = np.concatenate([where for _, where in street.report.found.model.sightings])
+    assert len(seen) > 500
+    assert seen[:, 0].min() >= HIDDEN / WIDTH
+    assert all(panorama.mask is not None for panorama in street.scene.panoramas)
+
+
+def test_features_of_other_masks_are_not_used(street: Made, tmp_path: Path) -> None:
+    other = tmp_path / "mask.png"
+    cv2.imwrite(str(other), np.zeros((WIDTH // 2, WIDTH), np.uint8))
+    both: list[tuple[LayerFiles, int]] = [({}, COUNT), ({"masks": [other] * COUNT}, 0)]
+    for layers, wanted in both:
+        output = tmp_path / f"scene {wanted}"
+        shutil.copytree(street.featured, workspace_folder(output), symlinks=True)
+        assert _interrupted(street.source, output, "features", layers=layers) == wanted
+
+
+def test_an_interruption_changes_nothing(street: Made, tmp_path: Path) -> None:
+    output = tmp_path / "scene"
+    shutil.copytree(street.matched, workspace_folder(output), symlinks=True)
+    again = make_scene(street.source, output, SfmSettings(distance=None), no_progress).found.model
+    first = street.report.found.model
+    assert again.rows == first.rows and len(again.points) == len(first.points)
+    for (rows, where), (others, there) in zip(again.sightings, first.sightings, strict=True):
+        assert np.array_equal(rows, others) and np.array_equal(where, there)
+
+
+def test_a_cropped_video_with_gps_and_gravity_becomes_a_scene_with_masks_in_metres(tmp_path: Path) -> None:
+    shots = [replace(shot, turn=(shot.turn[0], 12.0, shot.turn[2])) for shot in walk([0.4] * 12)]
+    rows = slice(WIDTH // 16, 3 * WIDTH // 8)  # without an eighth above, a quarter below
+    images = [np.ascontiguousarray(render(shot, WIDTH)[rows]) for shot in shots]
+    video = write_video(tmp_path / "walk.mp4", images, fourcc="mp4v")
+    add_spherical(video, equirectangular(0.0, 0.125, 0.0, 0.25))
+    metres, step = 20.0, 1_000 // 30  # of a metre of the street; milliseconds
+    places = [np.array([47.0 + metres * shot.along / 111_000, 8.0, 400.0]) for shot in shots]
+    ups = [-Rotation.from_euler("YXZ", shot.turn, degrees=True).as_matrix()[1] for shot in shots]
+    samples = [
+        (number * step, payload(gps5(place[None]), grav(up[None])))
+        for number, (place, up) in enumerate(zip(places, ups, strict=True))
+    ]
+    add_track(video, b"gpmd", samples, len(samples) * step)
+    made = make_scene(video, tmp_path / "scene", SfmSettings(frames=6), no_progress)
+    scene = read_scene(tmp_path / "scene")
+    numbers = [int(panorama.stem.rsplit("_", 1)[1]) for panorama in scene.panoramas]
+    assert 4 <= len(numbers) <= 6
+    assert made.world.frame == "enu" and made.world.up.source == "files"
+    north = metres * np.array([shots[number].along for number in numbers])
+    off = scene.centers - np.stack([0 * north, north, 0 * north], axis=1)
+    assert np.abs(off - off.mean(axis=0)).max() < 0.03 * np.ptp(north)
+    assert made.world.gps is not None
+    assert made.world.gps.fixes.origin.latitude == pytest.approx(47, abs=0.01)
+    assert (scene.width, scene.height) == (WIDTH, WIDTH // 2)
+    for panorama in scene.panoramas:
+        mask = cv2.imread(str(panorama.mask), cv2.IMREAD_UNCHANGED)
+        assert mask is not None and (mask[rows] == 255).all() and mask.sum() == 255 * mask[rows].size
+
+
+def _interrupted(
+    source: Path, output: Path, stage: str, least: int = 0, layers: LayerFiles | None = None
+) -> int:
+    """Interrupts a job in a stage, when `least` of its steps are done; returns how many were."""
+    steps = []
+
+    def interrupt(what: str, done: int, _: int) -> None:
+        if what == stage and done >= least:
+            steps.append(done)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_scene(source, output, SfmSettings(), interrupt, lambda _, found: {**found, **(layers or {})})
+    return steps[0]
