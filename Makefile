@@ -4,6 +4,7 @@ PYTHON ?= python3
 TORCH ?= default
 BIN := .venv/bin
 READY := .venv/ready
+PEERS := build/peers/ready
 TSC := node_modules/typescript/bin/tsc
 INPUTS := Makefile pyproject.toml constraints.txt CMakeLists.txt $(shell find renderer/csrc -type f) \
 	$(wildcard */__init__.py */*/__init__.py)
@@ -36,18 +37,25 @@ export CHECK
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: setup demo test check lint types wheel wheel-check bench clean help
+.PHONY: setup demo test check nightly stress lint types wheel wheel-check bench clean help
 
 setup: $(READY)  ## make .venv with everything to run, test and lint (TORCH=cpu: without CUDA)
 
 demo: $(READY)  ## reconstruct a small town end to end, on the CPU, into runs/demo
 	$(BIN)/panolog demo -o runs/demo
 
-test: $(READY)  ## run all tests
-	$(PYTEST) $(OPTIONS)
+test: $(READY)  ## run the tests
+	$(PYTEST) -m "not nightly" $(OPTIONS)
 
 check: lint  ## lint, and run the unit tests: those without Ray, browser and whole runs
-	$(PYTEST) -m "not system"
+	$(PYTEST) -m "not system and not nightly"
+
+nightly: $(READY) $(PEERS)  ## run the heavy tests that `make test` leaves out (FILES=... some of them)
+	@$(PIP) --group nightly
+	$(PYTEST) -m nightly $(OPTIONS) $(FILES)
+
+stress: $(READY)  ## run the tests beside load, in random order and on one core (FILES=... some of them)
+	$(BIN)/python -m tests.stress $(OPTIONS) $(FILES)
 
 lint: $(READY) $(TSC)  ## check style, types of Python and of the scripts, and the direction of imports
 	$(BIN)/ruff check
@@ -91,6 +99,12 @@ $(READY): $(INPUTS)
 	@$(PIP) --upgrade pip
 	@$(PIP) --group build
 	@$(PIP) --group dev --no-build-isolation --editable .
+	@touch $@
+
+# Launchers that read files of deploy/ in tests. They pin versions of what PanoLOG needs too, so they have a place of their own.
+$(PEERS): pyproject.toml
+	$(PYTHON) -m venv build/peers
+	build/peers/bin/pip --disable-pip-version-check install --quiet --group launchers
 	@touch $@
 
 # For lint alone: running and testing PanoLOG needs nothing from npm.

@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections import defaultdict
+import random
+from collections import Counter, defaultdict
 from pathlib import Path
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # before torch is imported: the processes share the cores
@@ -13,9 +14,7 @@ from hypothesis import settings
 
 from tests import leaks
 
-_DURATIONS = Path(__file__).with_name(
-    "durations.json"
-)  # seconds of each file that takes long, in `make test`
+_DURATIONS = Path(__file__).with_name("durations.json")  # seconds of each long file, in `make test`
 _LONG_S = 3.0  # seconds from which on a file takes long
 _SHOWN = 10  # files in the summary
 
@@ -25,7 +24,8 @@ settings.load_profile("panolog")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Adds an option of ours."""
+    """Adds options of ours."""
+    parser.addoption("--shuffle", type=int, metavar="SEED", help="run files and their tests in another order")
     parser.addoption(
         "--write-durations",
         action="store_true",
@@ -38,14 +38,25 @@ def pytest_configure(config: pytest.Config) -> None:
     leaks.configure(config)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Files that take longest come first: with several processes none of them is left alone at the end."""
-    recorded: dict[str, float] = json.loads(_DURATIONS.read_text())
-    items.sort(key=lambda item: -recorded.get(_file(item.nodeid), 0.0))
+    order: dict[str, float] = {file: -seconds for file, seconds in json.loads(_DURATIONS.read_text()).items()}
+    if (seed := config.getoption("--shuffle")) is not None:
+        chance = random.Random(seed)
+        chance.shuffle(items)
+        order = {file: chance.random() for file in sorted({_file(item.nodeid) for item in items})}
+    items.sort(key=lambda item: order.get(_file(item.nodeid), 0.0))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Shows the slowest files of a run of many."""
+    """Shows what was skipped and why, and the slowest files of a run of many."""
+    reasons = Counter(
+        report.longrepr[2] for report in terminalreporter.stats.get("skipped", ()) if report.longrepr
+    )
+    if reasons:
+        terminalreporter.section("skipped")
+    for reason, count in reasons.most_common():
+        terminalreporter.write_line(f"{count:7d}    {reason.removeprefix('Skipped: ')}")
     seconds: dict[str, float] = defaultdict(float)
     for reports in terminalreporter.stats.values():
         for report in reports:
