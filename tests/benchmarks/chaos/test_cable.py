@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -29,39 +28,29 @@ print(time.monotonic() - began)
 """
 
 
-@pytest.fixture
-def cable(tmp_path: Path) -> Iterator[Cable]:
-    (tmp_path / "file").touch()
-    with laid(tmp_path) as made:
-        if made is None:
-            pytest.skip("a cable needs root and /dev/net/tun")
-        command = [*made.enter, sys.executable, "-c", ECHO]
-        with subprocess.Popen(command, stdout=subprocess.PIPE) as server:
-            assert server.stdout is not None
-            server.stdout.readline()
-            yield made
-            server.kill()
-
-
-def echo(cable: Cable, patience: float = 10.0) -> float | None:
+def echo(cable: Cable, patience: float = 60.0) -> float | None:
     """Seconds until an answer, or None if none came."""
     command = [sys.executable, "-c", SEND, cable.far, str(patience)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     return None if done.returncode else float(done.stdout)
 
 
-def test_packets_are_delayed_and_lost_until_the_cable_is_good_again(cable: Cable) -> None:
-    assert echo(cable) is not None
-    cable.disturb(0.0, 0.1)
-    answer = echo(cable)
-    assert answer is not None and answer >= 0.2  # there and back
-    cable.disturb(1.0, 0.0)
-    assert echo(cable, 0.2) is None
-    cable.disturb(0.0, 0.0)
-    assert echo(cable) is not None
-
-
-def test_a_folder_looks_empty_on_the_host(cable: Cable, tmp_path: Path) -> None:
-    listed = subprocess.run([*cable.enter, "ls", tmp_path], capture_output=True, text=True, check=True)
-    assert listed.stdout == ""
+@pytest.mark.nightly
+def test_packets_are_delayed_and_lost_to_a_host_that_sees_an_empty_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with laid(tmp_path) as cable:
+        if cable is None:
+            pytest.skip("a cable needs root and /dev/net/tun")
+        assert subprocess.run([*cable.enter, "ls", tmp_path], capture_output=True, check=True).stdout == b""
+        with subprocess.Popen([*cable.enter, sys.executable, "-c", ECHO], stdout=subprocess.PIPE) as server:
+            assert server.stdout is not None
+            server.stdout.readline()
+            assert echo(cable) is not None
+            cable.disturb(0.0, 0.1)
+            assert (echo(cable) or 0) >= 0.2  # there and back
+            cable.disturb(1.0, 0.0)
+            assert echo(cable, 0.2) is None
+            cable.disturb(0.0, 0.0)
+            assert echo(cable) is not None
+            server.kill()
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -1,0 +1,72 @@
+"""What benchmarks compute from what they have measured, and the loads that they make."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.contention import Phase, rows
+from benchmarks.dashboard.simulated_run import RunSize, write_run
+from benchmarks.driver_scale.__main__ import lost
+from benchmarks.driver_scale.simulated_pool import grid
+from benchmarks.merge_scale import SKY, _check, fill, measure
+from benchmarks.overhead import Turn, Turns
+from benchmarks.processes import in_fresh_process, peak_memory
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import Progressed, Stored
+from panolog.orchestrator.run.state import Status, replay
+from panolog.orchestrator.run.store import read_milestones
+from panolog.orchestrator.run.thinning import DENSE
+from panolog.scene.errors import InputError, RunError
+from panolog.scene.ply import join_ply, ply_header
+from panolog.workers.tasks import TaskId
+
+ZERO, ONE = TaskId.block(0), TaskId.block(1)
+
+
+def test_rates_among_other_processes_have_medians_spread_and_ratios() -> None:
+    phases = [Phase(0, 2, (9.0, 10.0, 12.0)), Phase(1, 2, (5.0, 7.0, 4.0))]
+    assert rows(phases) == [(0, 2, 10.0, 9.0, 12.0, 1.0), (1, 2, 5.0, 4.0, 7.0, 0.5)]
+
+
+def test_the_cost_is_that_of_both_runs_and_the_noise_is_between_them() -> None:
+    first, plain, second = (Turn(name, s, s, 0, {}) for name, s in (("run", 11), ("plain", 10), ("run", 10)))
+    turns = Turns((first, plain, second))
+    assert (turns.cost, turns.noise) == pytest.approx((0.05, 0.1))
+
+
+def test_lost_repeated_and_late_events_are_counted() -> None:
+    received = [(ZERO, 1), (ZERO, 2), (ONE, 1), (ONE, 3)]
+    records = [Stored(i, 0.0, Progressed(task, n, 9, 1.0)) for i, (task, n) in enumerate(received)]
+    assert lost({ZERO: 2, ONE: 1}, records) == 0
+    assert lost({ZERO: 3, ONE: 3, TaskId.block(2): 1}, records) == 3
+    assert lost({ZERO: 2, ONE: 3}, records[::-1]) == 3
+    kept = [Stored(i, 0.0, Progressed(ZERO, i, 300, 1.0)) for i in (*range(1, DENSE + 1), 200, 300)]
+    assert lost({ZERO: 300}, kept) == 0
+    assert lost({ZERO: 300}, kept[:-1]) == 1
+
+
+def test_grids_are_as_cubic_as_they_can_be() -> None:
+    assert [str(grid(blocks)) for blocks in (1, 12, 7, 1000)] == ["1x1x1", "3x2x2", "7x1x1", "10x10x10"]
+
+
+def test_a_simulated_run_is_a_run(tmp_path: Path) -> None:
+    state = replay(read_milestones(write_run(tmp_path / "run", RunSize(8, 400, 3)).database))
+    statuses = [state.status(TaskId.block(block)) for block in range(8)]
+    assert statuses == [Status.DONE] * 6 + [Status.RUNNING] * 2
+
+
+def test_a_wrong_merge_and_a_full_disk_are_noticed(tmp_path: Path) -> None:
+    first, *rest = fill(RunFolder(tmp_path), 3, 500, seed=1)
+    wrong = [(path, range(ply_header(path)[0])) for path in [*rest[:-1], first, rest[-1]]]
+    join_ply(tmp_path / "wrong.ply", wrong, sky=SKY)
+    with pytest.raises(RunError, match="differs"):
+        _check([first, *rest], tmp_path / "wrong.ply")
+    with pytest.raises(InputError, match="free disk"):
+        measure(tmp_path, blocks=1, gaussians=10**13, seed=0)
+
+
+def test_a_fresh_process_shares_no_memory_and_its_error_comes_back() -> None:
+    held = bytes(range(256)) * 2**18  # 64 MiB, all pages written
+    assert peak_memory() > len(held)
+    with pytest.raises(ValueError, match="invalid literal"):
+        in_fresh_process(int, "nothing")
