@@ -19,7 +19,7 @@ HEAD, SECOND, DRIVER = GROUPS = "head", "second", "driver"  # of processes that 
 THIRD, FOURTH = "third", "fourth"
 _TMP = "/tmp"  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _NO_WORK = ("ray::IDLE", "ray::Agent", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
-_TIMEOUT_S = 120.0  # for a node to start
+_TIMEOUT_S = 600.0  # for a node to start, also on a busy machine
 _POLL_S = 0.05  # between two checks of a process table or a port
 
 
