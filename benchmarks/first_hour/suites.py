@@ -76,7 +76,7 @@ def tests(context: Context) -> Outcome:
         found, whole = run(context, [*PYTEST, *plugin], left, {_DONE: names})
         suite.add(found)
     if len(suite.failed) > 1 and any(_STICKY in reason for reason in suite.failed.values()):
-        suite.alone = dict(_alone(context, suite.failed, ends))
+        suite.alone = dict(alone(context, suite.failed, ends))
     return judged(context, suite, (BY_HAND,), whole=whole)
 
 
@@ -127,7 +127,7 @@ def read_log(text: str) -> Suite:
     return suite
 
 
-def _alone(context: Context, failed: Mapping[str, str], ends: float) -> Iterator[tuple[str, bool]]:
+def alone(context: Context, failed: Mapping[str, str], ends: float) -> Iterator[tuple[str, bool]]:
     """Each failed test in a process of its own, as long as there is time; whether it passes there."""
     for name in failed:
         if (left := ends - time.monotonic()) <= 0:

@@ -17,8 +17,8 @@ from pathlib import Path
 from benchmarks.first_hour.outcome import ROOT, Context, Outcome, python, result_file
 
 MODULE = "benchmarks.first_hour.step"
-_TICK_S = 10.0  # between two lines of progress
-_GRACE_S = 10.0  # for a process to end after a signal
+TICK_S = 10.0  # between two lines of progress
+GRACE_S = 10.0  # for a process to end after a signal
 _REASON = 300  # characters of a reason
 
 
@@ -31,17 +31,19 @@ class Ran:
     limit: float  # seconds
 
 
-def run(context: Context, tick: Callable[[float, str], None]) -> Ran:
+def run(
+    context: Context, tick: Callable[[float, str], None], clock: Callable[[], float] = time.monotonic
+) -> Ran:
     """Runs a step in a new folder until it ends or its limit is over; a KeyboardInterrupt ends it too.
 
-    Args: tick, called now and then with the seconds so far and the last line of the log.
+    Args: tick, called now and then with the seconds so far and the last line of the log; clock, in seconds.
     """
     shutil.rmtree(context.work, ignore_errors=True)
     context.work.mkdir()
     log = log_file(context)
     command = python("-m", MODULE, json.dumps(asdict(context)))
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-    began = time.monotonic()
+    began = clock()
     with log.open("wb") as out:
         process = subprocess.Popen(
             command,
@@ -53,10 +55,12 @@ def run(context: Context, tick: Callable[[float, str], None]) -> Ran:
             start_new_session=True,
         )
         try:
-            code = _wait(process, began, context.seconds, lambda took: tick(took, last_line(log)))
+            code = _wait(
+                process, began + context.seconds, clock, lambda: tick(clock() - began, last_line(log))
+            )
         finally:
             _end(process)
-    return Ran(_outcome(context, code, log), time.monotonic() - began, context.seconds)
+    return Ran(_outcome(context, code, log), clock() - began, context.seconds)
 
 
 def log_file(context: Context) -> Path:
@@ -71,13 +75,13 @@ def last_line(log: Path) -> str:
 
 
 def _wait(
-    process: subprocess.Popen[bytes], began: float, limit: float, tick: Callable[[float], None]
+    process: subprocess.Popen[bytes], end: float, clock: Callable[[], float], tick: Callable[[], None]
 ) -> int | None:
-    """The exit code of a process, or None if it still runs after so many seconds."""
-    while (left := began + limit - time.monotonic()) > 0:
+    """The exit code of a process, or None if it still runs at the end."""
+    while (left := end - clock()) > 0:
         with suppress(subprocess.TimeoutExpired):
-            return process.wait(min(_TICK_S, left))
-        tick(time.monotonic() - began)
+            return process.wait(min(TICK_S, left))
+        tick()
     return process.poll()
 
 
@@ -87,10 +91,10 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGTERM)
             with suppress(subprocess.TimeoutExpired):
-                process.wait(_GRACE_S)
+                process.wait(GRACE_S)
         os.killpg(process.pid, signal.SIGKILL)
     with suppress(subprocess.TimeoutExpired):
-        process.wait(_GRACE_S)
+        process.wait(GRACE_S)
 
 
 def _outcome(context: Context, code: int | None, log: Path) -> Outcome:

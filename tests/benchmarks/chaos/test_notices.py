@@ -1,11 +1,7 @@
-"""Nodes that leave: what the benchmark computes and reports, and one run of it."""
-
-from pathlib import Path
-
-import pytest
+"""Nodes that leave: what the benchmark computes and reports."""
 
 from benchmarks.chaos.notice_costs import NoticeCost, notice_cost
-from benchmarks.chaos.notices import Outcome, Planned, Run, notices, plans, seconds_of
+from benchmarks.chaos.notices import Outcome, Run, plans, seconds_of
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
     Failure,
@@ -81,13 +77,3 @@ def test_all_lengths_of_notice_come_equally_often() -> None:
     planned = list(plans(6, 0, (120.0, 30.0, 0.0)))
     assert [plan.seconds for plan in planned] == [120.0, 30.0, 0.0] * 2
     assert seconds_of("120,0") == (120.0, 0.0)
-
-
-@pytest.mark.system
-def test_a_task_moves_and_nothing_is_trained_twice(tmp_path: Path) -> None:
-    outcome = notices(tmp_path, [Planned(120.0, 0.1)], sizes=(3,), iterations=700)
-    calm, moved = outcome.runs
-    assert moved.digest == calm.digest, moved.end
-    assert moved.cost is not None
-    assert moved.cost.redone == 0
-    assert moved.cost.checkpoint is not None

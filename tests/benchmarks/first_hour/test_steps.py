@@ -62,7 +62,7 @@ def test_a_scene_is_trained_on_the_cpu_only_if_there_is_time(
     assert quality.scene(Context("scene", str(tmp_path), "cuda", 300)).reason == "no --scene DIR was given"
 
 
-@pytest.mark.system
+@pytest.mark.nightly
 def test_a_rehearsal(tmp_path: Path) -> None:
     """In real processes, on the CPU; without a card a run on one says so in every step."""
     folder = tmp_path / "cpu"

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,52 +13,20 @@ from benchmarks.first_hour import __main__ as program
 from benchmarks.first_hour import supervise
 from benchmarks.first_hour.outcome import ROOT, Context
 from benchmarks.first_hour.steps import STEPS, limit
+from tests.ray_head import wait_until
 
 Fake = Callable[[str], None]  # makes the process of each step run this code
 
 PASSES = "context.save(Outcome('passed', '7 ms'))"
 HANGS = """
 context.save(Outcome('passed', '3 of 9 rows'))
-child = subprocess.Popen(['sleep', '600'])
-Path(context.work, 'pid').write_text(str(child.pid))
-signal.pause()
+print('block 1 of 2', flush=True)
+child = subprocess.Popen(['sleep', '6000'])
+Path(context.work, 'made').write_text(str(child.pid))
+Path(context.work, 'made').rename(Path(context.work, 'pid'))
 """
-
-
-def run(folder: Path, seconds: float = 60.0) -> supervise.Ran:
-    return supervise.run(Context("tests", str(folder), "cpu", seconds), lambda *_: None)
-
-
-def test_what_a_step_saves_is_its_outcome(tmp_path: Path, fake: Fake) -> None:
-    fake(PASSES)
-    ran = run(tmp_path)
-    assert (ran.outcome.ending, ran.outcome.figure, ran.outcome.reason) == ("passed", "7 ms", "")
-
-
-@pytest.mark.parametrize(
-    ("code", "reason"),
-    [
-        ("raise ValueError('no kernel')", "ValueError: no kernel"),
-        ("sys.exit(3)", "ended with exit code 3"),
-        ("os.kill(os.getpid(), signal.SIGSEGV)", "ended by SIGSEGV"),
-        ("pass", "it left no result"),
-    ],
-)
-def test_a_step_that_fails_says_why(tmp_path: Path, fake: Fake, code: str, reason: str) -> None:
-    fake(code)
-    ran = run(tmp_path)
-    assert (ran.outcome.ending, ran.outcome.reason) == ("failed", reason)
-
-
-def test_a_step_that_hangs_is_stopped_with_what_it_started(tmp_path: Path, fake: Fake) -> None:
-    """What it has measured so far is kept."""
-    fake(HANGS)
-    ran = run(tmp_path, seconds=6.0)
-    assert ran.outcome.ending == "failed"
-    assert ran.outcome.reason == "stopped after its limit of 6 s"
-    assert ran.outcome.figure == "3 of 9 rows"
-    assert ran.seconds < 30
-    wait_for(lambda: ended(int((tmp_path / "tests" / "pid").read_text())))
+PAUSES = f"{HANGS}signal.pause()"
+IGNORES = f"signal.signal(signal.SIGTERM, signal.SIG_IGN){HANGS}while True: signal.pause()"
 
 
 def ended(pid: int) -> bool:
@@ -70,30 +37,43 @@ def ended(pid: int) -> bool:
         return True
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    """Looks every 50 ms, for a minute at most."""
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
-def test_a_step_that_ignores_the_end_is_killed(
-    tmp_path: Path, fake: Fake, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("code", "ending", "reason"),
+    [
+        (PASSES, "passed", ""),
+        ("raise ValueError('no kernel')", "failed", "ValueError: no kernel"),
+        ("sys.exit(3)", "failed", "ended with exit code 3"),
+        ("os.kill(os.getpid(), signal.SIGSEGV)", "failed", "ended by SIGSEGV"),
+        ("pass", "failed", "it left no result"),
+    ],
+)
+def test_a_step_leaves_its_outcome_or_says_why(
+    tmp_path: Path, fake: Fake, code: str, ending: str, reason: str
 ) -> None:
-    monkeypatch.setattr(supervise, "_GRACE_S", 0.2)
-    fake("signal.signal(signal.SIGTERM, signal.SIG_IGN)\nwhile True: signal.pause()")
-    assert run(tmp_path, seconds=5.0).outcome.reason == "stopped after its limit of 5 s"
+    fake(code)
+    outcome = supervise.run(Context("tests", str(tmp_path), "cpu", 600), lambda *_: None).outcome
+    assert (outcome.ending, outcome.reason) == (ending, reason)
 
 
-def test_progress_is_the_last_line_of_the_log(
-    tmp_path: Path, fake: Fake, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("code", [PAUSES, IGNORES])
+def test_a_step_that_hangs_is_stopped_with_what_it_started(
+    code: str, tmp_path: Path, fake: Fake, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervise, "_TICK_S", 0.2)
-    fake("print('block 1 of 2', flush=True)\nsignal.pause()")
-    seen: list[str] = []
-    supervise.run(Context("tests", str(tmp_path), "cpu", 6.0), lambda _, line: seen.append(line))
-    assert "block 1 of 2" in seen
+    """What it has measured so far is kept; the last line of its log is its progress."""
+    monkeypatch.setattr(supervise, "TICK_S", 0.1)
+    monkeypatch.setattr(supervise, "GRACE_S", 0.2 if code is IGNORES else 60.0)
+    fake(code)
+    pid, seen = tmp_path / "tests" / "pid", list[str]()
+
+    def clock() -> float:
+        """The limit is over when the step hangs."""
+        return 601.0 if pid.exists() and "block 1 of 2" in seen else 0.0
+
+    context = Context("tests", str(tmp_path), "cpu", 600)
+    outcome = supervise.run(context, lambda _, line: seen.append(line), clock).outcome
+    assert (outcome.ending, outcome.figure) == ("failed", "3 of 9 rows")
+    assert outcome.reason == "stopped after its limit of 600 s"
+    wait_until(lambda: ended(int(pid.read_text())), "what it has started is ended")
 
 
 def test_steps_share_the_time_that_is_left() -> None:
@@ -120,12 +100,9 @@ def test_the_page_has_every_step_and_the_exit_code_is_that_of_a_failure(tmp_path
     assert {name: step["ending"] for name, step in steps.items()} == {"demo": "passed", "gsplat": "skipped"}
 
 
-def test_a_killed_program_keeps_what_was_done(tmp_path: Path, fake: Fake) -> None:
-    """Its step ends with it; the next start has the results of before."""
-    fake(PASSES)
+def test_a_killed_program_ends_its_step_and_keeps_what_was_done(tmp_path: Path, fake: Fake) -> None:
+    fake(PAUSES)
     folder = tmp_path / "out"
-    assert program.main(["-o", str(folder), "--device", "cpu", "--only", "machine"]) == 0
-    fake(HANGS)
     code = (
         "import sys; from benchmarks.first_hour import __main__, supervise;"
         f"supervise.MODULE = 'faked_step'; sys.exit(__main__.main({['-o', str(folder), '--device', 'cpu']}))"
@@ -133,9 +110,9 @@ def test_a_killed_program_keeps_what_was_done(tmp_path: Path, fake: Fake) -> Non
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([os.environ["PYTHONPATH"], str(ROOT)])}
     with subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE) as process:
         pid = folder / "machine" / "pid"
-        wait_for(pid.exists)
+        wait_until(pid.exists, "the first step hangs")
         process.kill()
-    wait_for(lambda: ended(int(pid.read_text())))
+    wait_until(lambda: ended(int(pid.read_text())), "the step and what it has started are ended")
     steps = json.loads((folder / "first-hour.json").read_bytes())["steps"]
     assert steps["machine"]["reason"].startswith("not finished")
     assert "not finished" in (folder / "first-hour.md").read_text()
@@ -143,9 +120,8 @@ def test_a_killed_program_keeps_what_was_done(tmp_path: Path, fake: Fake) -> Non
 
 def test_steps_without_time_are_skipped(tmp_path: Path, fake: Fake) -> None:
     fake(PASSES)
-    folder = tmp_path / "out"
-    assert program.main(["-o", str(folder), "--device", "cpu", "--minutes", "0.01"]) == 0
-    steps = json.loads((folder / "first-hour.json").read_bytes())["steps"]
+    assert program.main(["-o", str(tmp_path / "out"), "--device", "cpu", "--minutes", "0.01"]) == 0
+    steps = json.loads((tmp_path / "out" / "first-hour.json").read_bytes())["steps"]
     assert {step["reason"] for step in steps.values()} == {"no time was left of --minutes 0.01"}
     assert list(steps) == list(STEPS)
 

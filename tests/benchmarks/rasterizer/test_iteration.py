@@ -5,6 +5,7 @@ import torch
 
 from benchmarks.rasterizer.cases import CaseSpec, street_case
 from benchmarks.rasterizer.iteration import Times, TrainingStep, measure, stages
+from panolog.renderer import ops
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.cuda.stubbed import stubbed
 
@@ -39,7 +40,7 @@ def test_an_iteration_on_a_card_leaves_the_model_too(block: str | None) -> None:
 def test_parts_are_those_of_the_iteration() -> None:
     times = measure(street_case(200, 64), threads=1, repeats=1)
     assert all(milliseconds > 0 for milliseconds in vars(times).values())
-    assert torch.get_num_threads() == 1
+    assert ops.threads() == 1
 
 
 def test_the_share_of_rasterization_is_one_of_the_parts() -> None:
