@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import closing
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,12 @@ from panolog.orchestrator.driver.requests import Stop
 from panolog.orchestrator.resources.delivery import announced
 from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message
-from panolog.orchestrator.run.clock import CLOCK
+from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message, Pool
+from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Failure, RunBegan
-from panolog.orchestrator.run.state import RunState, replay
+from panolog.orchestrator.run.state import OnChange, RunState, ignore, replay
 from panolog.orchestrator.run.store import Database, read_milestones, read_records
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.workers.evaluation import EvaluateSpec
@@ -211,14 +212,35 @@ class Harness:
         self.job = Job(self.folder, small_scene(folder / "scene"), config)
         self.pool = FakePool(well, nodes)
         self.stop = Stop()
-        self.clock = CLOCK
+        self.clock: Clock = CLOCK
 
-    def drive(self, script: Script = well, *, resumed: bool = False) -> RunState:
-        self.pool, self.stop = FakePool(script, self.nodes), Stop()
-        with closing(Database(self.folder.database, self.clock)) as database:
-            database.append([RunBegan("host", 1, resumed)])
-            journal, hooks = Journal(database, clock=self.clock), Hooks(deliver=deliver)
-            return Driver(self.job, journal, self.pool, hooks, self.stop, self.clock).run()
+    def drive(
+        self,
+        script: Script = well,
+        *,
+        resumed: bool = False,
+        pool: Pool | None = None,
+        hooks: Hooks = Hooks(deliver=deliver),  # noqa: B008  # it is frozen
+        on_change: OnChange = ignore,
+        database: Callable[[Path, Clock], Database] = Database,
+    ) -> RunState:
+        """Runs one driver to its end. Args: pool, in place of the one that runs the script."""
+        self.stop = Stop()
+        if pool is None:
+            pool = FakePool(script, self.nodes)
+        if isinstance(pool, FakePool):
+            self.pool = pool
+        with closing(database(self.folder.database, self.clock)) as opened:
+            opened.append([RunBegan("host", 1, resumed)])
+            journal = Journal(opened, on_change, self.clock)
+            return Driver(self.job, journal, pool, hooks, self.stop, self.clock).run()
+
+    def at(self, root: Path) -> "Harness":
+        """The same job in another run folder."""
+        other = copy(self)
+        other.folder = RunFolder(root)
+        other.job = replace(self.job, folder=other.folder)
+        return other
 
     def attempts(self, task: TaskId) -> list[tuple[Placement, TaskSpec]]:
         """Placement and spec of each attempt of the last driver at a task."""
