@@ -1,3 +1,5 @@
+"""Blocks and districts that cost about the same, cut where cameras can be separated."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -5,13 +7,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from panolog.partition.balance import Budget, balance, fewest_blocks
-from panolog.partition.bounds import aabb
+from panolog.partition.bounds import aabb, margin
 from panolog.partition.cells import Cells, Cuts, Grid
 from panolog.partition.contraction import contract
+from panolog.partition.districts import make_districts
 
 RANDOM = np.random.default_rng(0)
 STREET = np.stack([np.linspace(0, 100, 64), np.zeros(64), 1.7 + 0.01 * RANDOM.normal(size=64)], axis=1)
 FIELD = np.concatenate([RANDOM.uniform(0, 50, (256, 2)), 1.7 + 0.01 * RANDOM.normal(size=(256, 1))], axis=1)
+WIDE = np.concatenate([RANDOM.uniform(0, 200, (400, 2)), RANDOM.normal(2, 0.1, (400, 1))], axis=1)
 CLOUD = RANDOM.uniform(-20, 120, (5000, 3))
 CORNER = 200 * RANDOM.random((400, 1)) ** 3 * [1, 0, 0] + 60 * RANDOM.random((400, 1)) ** 2 * [0, 1, 0]
 
@@ -97,3 +101,36 @@ def test_a_budget_that_nothing_meets_gives_the_best_there_is() -> None:
 def test_a_budget_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="has no room"):
         Budget(cameras=0)
+
+
+def test_one_district_has_all_cameras() -> None:
+    assert make_districts(WIDE, WIDE, 5.0, 1).cameras.all()
+
+
+@pytest.mark.parametrize("count", [2, 4, 9])
+def test_a_camera_trains_the_districts_within_the_margin(count: int) -> None:
+    districts = make_districts(WIDE, WIDE, 2.0, count)
+    assert districts.count == count
+    own = np.stack([districts.cell(district).contains(WIDE) for district in range(count)])
+    assert (own.sum(axis=0) == 1).all()
+    away = np.array([[np.linalg.norm(WIDE[mine] - center, axis=1).min() for center in WIDE] for mine in own])
+    near = margin(WIDE, 2.0)
+    assert away[districts.cameras].max() < 6 * near  # a district's cameras do not reach its very edge
+    assert districts.cameras[away < near / 2].all()
+
+
+def test_districts_have_a_part_of_the_cameras_each() -> None:
+    districts = make_districts(WIDE, WIDE, 1.0, 8)
+    assert districts.cameras.sum(axis=1).max() < 0.35 * len(WIDE)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(3, 40), st.integers(1, 12), st.floats(0, 8))
+def test_every_camera_trains_the_district_that_it_stands_in(
+    seed: int, cameras: int, count: int, rho_tri: float
+) -> None:
+    random = np.random.default_rng(seed)
+    centers = random.normal(size=(4, 3))[random.integers(0, 4, cameras)] + random.normal(0, 0.1, (cameras, 3))
+    districts = make_districts(centers, centers[:0], rho_tri, count)
+    own = np.stack([districts.cell(district).contains(centers) for district in range(districts.count)])
+    assert not (own & ~districts.cameras).any()

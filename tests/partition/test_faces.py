@@ -1,16 +1,15 @@
-"""Faces between cells: what lies on both sides of them, and which cameras are at them."""
+"""Faces between cells: their sides, the cameras at them, and the regions that train once more."""
 
 from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from panolog.partition.bounds import Aabb
 from panolog.partition.cells import Cells, Cuts, Grid
-from panolog.partition.contraction import expand
+from panolog.partition.contraction import contract, expand
 from panolog.partition.faces import (
-    Plane,
     between,
     cameras_at,
     most_seen,
@@ -20,10 +19,11 @@ from panolog.partition.faces import (
     views_at,
 )
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
+from panolog.partition.regions import Regions
 
 BOX = Aabb(np.array([-8.0, -4.0, -4.0]), np.array([8.0, 4.0, 4.0]))
 T_JUNCTION = Cuts((("x", 0.5, 1), ("y", 0.4, 1), ("z", 0.6, 1)))
-PARTITIONS = [Grid((2, 1, 1)), Grid((3, 2, 2)), Grid((5, 1, 3), "box"), T_JUNCTION]
+PARTITIONS: list[Cells] = [Grid((2, 1, 1)), Grid((3, 2, 2)), Grid((5, 1, 3), "box"), T_JUNCTION]
 
 
 @pytest.mark.parametrize("cells", PARTITIONS, ids=str)
@@ -140,11 +140,6 @@ def test_planes_within_a_block_are_among_its_cameras_and_away_from_its_faces(
         assert len(cameras_at(plan, plane)) == 6
 
 
-def test_a_face_without_cameras_on_one_side_has_no_seam(walk: Callable[..., Plan]) -> None:
-    plan = walk(Grid((1, 2, 1)))
-    assert planes_between(plan.grid) and seams_of(plan) == ()
-
-
 def test_the_faces_near_most_cameras_are_taken(walk: Callable[..., Plan]) -> None:
     plan = walk(Grid((4, 1, 1), "box"))
     faces = seams_of(plan)
@@ -153,13 +148,54 @@ def test_the_faces_near_most_cameras_are_taken(walk: Callable[..., Plan]) -> Non
     assert most_seen(plan, faces, 0) == ()
 
 
-def test_faces_between_blocks_that_nothing_has_trained_have_no_seam(walk: Callable[..., Plan]) -> None:
-    plan = walk(Grid((2, 1, 1)), cameras=4)
-    assert not plan.trained.any() or seams_of(plan)
-    untrained = walk(Grid((2, 1, 1)), seen=0, cameras=4)
+def test_where_a_side_has_no_cameras_or_was_not_trained_there_is_no_seam(walk: Callable[..., Plan]) -> None:
+    trained, untrained = (walk(Grid((2, 1, 1)), seen=seen, cameras=4) for seen in (1, 0))
+    assert trained.trained.all() and len(seams_of(trained)) == 1
     assert not untrained.trained.any() and seams_of(untrained) == ()
+    beside = walk(Grid((1, 2, 1)))  # all cameras are on one side
+    assert planes_between(beside.grid) and seams_of(beside) == ()
 
 
-def test_equal_planes_are_equal_keys() -> None:
-    first, again = (planes_between(Grid((3, 1, 1))) for _ in range(2))
-    assert len({*first, *again}) == 2 and isinstance(first[0], Plane)
+def places(seed: int = 0) -> NDArray[np.float64]:
+    """Within the box, and far outside of it."""
+    random = np.random.default_rng(seed)
+    inside = random.uniform(BOX.lower, BOX.upper, (2000, 3))
+    return np.concatenate([inside, random.normal(scale=60.0, size=(500, 3))])
+
+
+@pytest.mark.parametrize("cells", PARTITIONS, ids=str)
+def test_every_place_is_in_one_region(cells: Cells) -> None:
+    faces = planes_between(cells)
+    regions, points = Regions(BOX, cells, faces, reach=1.0), places()
+    inside = np.stack([regions.margin(face).contains(points) for face in range(len(faces))])
+    rest = regions.of(points) >= len(faces)  # of their cells
+    assert (inside.sum(axis=0) == ~rest).all()
+    assert inside.any(axis=1).all() and rest.any()
+
+
+@pytest.mark.parametrize("cells", PARTITIONS, ids=str)
+def test_a_margin_has_what_is_nearer_to_its_face_than_the_reach_and_to_no_other_of_its_cell(
+    cells: Cells,
+) -> None:
+    faces, points = planes_between(cells), places(1)
+    regions = Regions(BOX, cells, faces, reach=1.0)
+    found, own = regions.of(points), cells.block_of(contract(points, BOX))
+    for point, region, cell in zip(points, found, own, strict=True):
+        offsets = [abs(face.offsets(point[None], BOX)[0]) for face in faces]
+        around = {i: offsets[i] for i, face in enumerate(faces) if cell in (face.below, face.above)}
+        near = {i: offset for i, offset in around.items() if offset < 1.0}
+        if region >= len(faces):
+            assert not near and region == len(faces) + cell
+        else:
+            assert near[region] == min(near.values())
+
+
+def test_without_faces_the_regions_are_the_cells() -> None:
+    cells, points = Grid((3, 2, 2)), places(2)
+    regions = Regions(BOX, cells, (), reach=1.0)
+    np.testing.assert_array_equal(regions.of(points), cells.block_of(contract(points, BOX)))
+
+
+def test_a_place_that_is_not_finite_is_refused() -> None:
+    with pytest.raises(ValueError, match="finite"):
+        Regions(BOX, Grid((2, 1, 1)), (), reach=1.0).of([[0.0, np.nan, 0.0]])

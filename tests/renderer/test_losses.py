@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -137,7 +138,7 @@ def agrees_with_the_definition(
     [{"mask": torch.ones(24, 48, dtype=torch.bool)}, {"exposure": torch.tensor([[1.0] * 3, [0.0] * 3])}],
     ids=["a mask that covers nothing", "an exposure of one"],
 )
-def test_what_says_nothing_changes_no_byte(given: dict[str, Tensor]) -> None:
+def test_what_says_nothing_changes_no_byte(given: dict[str, Any]) -> None:
     color, target, _ = example()
     target[:, ::5] = 255
     found = []

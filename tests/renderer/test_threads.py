@@ -28,9 +28,10 @@ def rendering(exact: bool, own: int | None = None) -> list[Tensor]:
     motion = torch.zeros(MOTION_SUMS, dtype=torch.float64, requires_grad=True)
     made = render(leaves, at, near=NEAR, screen=screen, motion=motion, exterior=exterior)
     (made.color.square().sum() + made.inverse_depth.sum()).backward()  # type: ignore[no-untyped-call]
-    learnt = [tensor.grad for tensor in (*leaves.tensors().values(), screen, motion)]
-    assert all(gradient is not None and gradient.any() for gradient in learnt)
-    return [*made[:3], *filter(None.__ne__, learnt), *(exterior.arrays() if exterior else [])]
+    learning = (*leaves.tensors().values(), screen, motion)
+    learnt = [tensor.grad for tensor in learning if tensor.grad is not None and tensor.grad.any()]
+    assert len(learnt) == len(learning)
+    return [*made[:3], *learnt, *(exterior.arrays() if exterior else [])]
 
 
 def losses(exposure: Tensor | None, mask: Callable[[Tensor], Tensor]) -> list[Tensor]:

@@ -13,11 +13,14 @@ from panolog.renderer import ops
 from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches
+from panolog.renderer.cuda.motion import motion_sums
 from panolog.renderer.cuda.parts import Launch
-from panolog.renderer.motion import Motion
+from panolog.renderer.motion import MOTION, Motion
 from panolog.scene.gaussians import Gaussians
 from tests.renderer.agreement import IMAGES, NEAR, check_gradients, check_images, random_weights
 from tests.renderer.cuda.emulation import EmulatedLaunch
+
+AFFINE = torch.tensor([[0.7, 1.0, 1.3], [0.02, 0.0, -0.03]])  # an exposure
 
 
 @dataclass(frozen=True)
@@ -110,3 +113,58 @@ def check_tiles(machine: Machine, scene: Gaussians, at: Camera, exterior: Baked 
         assert torch.equal(starts, tiles) and torch.equal(entries[: len(expected)], expected)
         assert exterior is not None or torch.equal(met, slots.diff())
     assert abs(int(starts[-1]) - len(expected)) <= 0.01 * len(expected)
+
+
+def check_photometric(
+    machine: Machine, size: tuple[int, int], *, masked: bool, weight: float, rows: bool, exposed: bool
+) -> None:
+    """The loss of an image (H, W), its gradient, and the sums of its exposure."""
+    rng = torch.Generator().manual_seed(0)
+    color = torch.rand(*size, 3, generator=rng) * 1.2
+    target = torch.randint(0, 256, (*size, 3), generator=rng, dtype=torch.uint8)
+    mask, some = torch.rand(size, generator=rng) > 0.3, torch.rand(size[0], generator=rng)
+    given = {"color": color, "target": target, "mask": mask if masked else None, "lambda_ssim": weight}
+    given |= {"rows": some if rows else None, "exposure": AFFINE if exposed else None}
+    values, gradient, sums = ops.photometric(**given)
+    ours, our_gradient, our_sums = machine.run(launches.photometric, **given)
+    assert torch.allclose(ours, values, atol=1e-6, rtol=0)
+    assert (our_gradient - gradient).norm() <= 1e-4 * gradient.norm()
+    assert our_sums.shape == sums.shape == ((3, 5) if exposed else (0, 5))
+    assert torch.allclose(our_sums, sums, rtol=1e-4, atol=1e-5)
+
+
+def check_absolute_difference(machine: Machine, share: float) -> None:
+    """Where a share of the pixels is valid."""
+    rendered, target, chance = torch.rand(3, 20, 40, generator=torch.Generator().manual_seed(0))
+    given = {"rendered": rendered, "target": target, "valid": chance < share}
+    value, gradient = ops.absolute_difference(**given)
+    ours, our_gradient = machine.run(launches.absolute_difference, **given)
+    assert torch.allclose(ours, value, atol=1e-6, rtol=0)
+    assert torch.allclose(our_gradient, gradient)
+
+
+def check_adam(machine: Machine, moving: int) -> None:
+    """Steps of the first of 600 values; the others stay."""
+    rng = torch.Generator().manual_seed(0)
+    ours = [tensor.to(machine.device) for tensor in torch.rand(3, 600, generator=rng)]
+    theirs = [tensor.cpu().clone() for tensor in ours]
+    for step in range(1, 6):
+        gradient = torch.randn(600, generator=rng)
+        settings = (moving, 0.01, 0.9, 0.999, 1e-15, step)
+        moved = gradient.to(machine.device)
+        launches.adam(machine.launch, ours[0], moved, ours[1], ours[2], *settings)
+        ops.adam(theirs[0], gradient, theirs[1], theirs[2], *settings)
+    for one, two in zip(ours, theirs, strict=True):
+        assert torch.allclose(one.cpu(), two, atol=1e-6)
+        assert torch.equal(one.cpu()[moving:], two[moving:])
+
+
+def check_motion_sums(machine: Machine, count: int) -> None:
+    """Of so many motions: of several blocks, the last of them in part."""
+    motion = torch.randn(count, MOTION, generator=torch.Generator().manual_seed(0))
+    with machine.watching():
+        sums = motion_sums(machine.launch, motion.to(machine.device)).cpu()
+    gradient, moments = Motion.of(sums.numpy())
+    wide = motion.double().numpy()
+    assert np.allclose(gradient, wide.sum(0), rtol=1e-12, atol=1e-11)
+    assert np.allclose(moments, wide.T @ wide, rtol=1e-12, atol=1e-11)

@@ -13,7 +13,7 @@ from panolog.renderer.cuda import nvrtc
 
 pytestmark = pytest.mark.system
 
-pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core")
+pytest.importorskip("cuda.core", reason="CUDA: no cuda-core")
 
 HERE = Path(__file__).parent
 ARCH = "sm_89"

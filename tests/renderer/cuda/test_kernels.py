@@ -1,6 +1,8 @@
 """The CUDA kernels against those of the CPU: in the host's emulation, and on a card where there is one."""
 
+import functools
 import inspect
+import itertools
 import math
 import zlib
 from dataclasses import replace
@@ -11,15 +13,19 @@ import torch
 from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
-from panolog.renderer.cuda.motion import motion_sums
-from panolog.renderer.motion import MOTION, MOTION_SUMS, Motion
+from panolog.renderer.motion import MOTION_SUMS
 from panolog.scene.gaussians import Gaussians, concatenate
+from tests.on_device import ON_A_CARD
 from tests.renderer.agreement import NEAR, PARAMETERS, certain, check_images
 from tests.renderer.cuda.emulation import EmulatedLaunch, has_fused_multiply_add
 from tests.renderer.cuda.machine import (
     Machine,
     arguments,
+    check_absolute_difference,
+    check_adam,
     check_against_cpu,
+    check_motion_sums,
+    check_photometric,
     check_tiles,
     emulated,
     results,
@@ -32,10 +38,6 @@ pytestmark = pytest.mark.system
 SCENES = [(name, exact) for exact in (False, True) for name in scenes(camera(), exact)]
 NAMES = [f"{name}, exact" if exact else name for name, exact in SCENES]
 both = pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
-ON_A_CARD = [
-    pytest.mark.cuda,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA card"),
-]
 
 
 @pytest.fixture(params=["emulation", pytest.param("card", marks=ON_A_CARD)])
@@ -139,8 +141,8 @@ def test_an_exterior_of_another_camera_is_refused(exact: bool, machine: Machine)
 def test_any_width(width: int, exact: bool, machine: Machine) -> None:
     at, scene = camera(width), replace(cloud(60), exact=exact)
     keep = certain(scene, at)
-    if keep.any():
-        check_against_cpu(machine, scene, at, 2, keep)
+    assert keep.float().mean() > 0.9
+    check_against_cpu(machine, scene, at, 2, keep)
 
 
 @both
@@ -234,40 +236,17 @@ def test_a_broken_gaussian_harms_no_other(
 
 @pytest.mark.parametrize("count", [1, 127, 128, 4096, 4097, 9000])
 def test_sums_of_motion(count: int, machine: Machine) -> None:
-    """Over several blocks, the last of them in part."""
-    motion = torch.randn(count, MOTION, generator=torch.Generator().manual_seed(0))
-    with machine.watching():
-        sums = motion_sums(machine.launch, motion.to(machine.device)).cpu()
-    gradient, moments = Motion.of(sums.numpy())
-    wide = motion.double().numpy()
-    assert gradient == pytest.approx(wide.sum(0), rel=1e-12, abs=1e-11)
-    assert moments == pytest.approx(wide.T @ wide, rel=1e-12, abs=1e-11)
+    check_motion_sums(machine, count)
 
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("size", [(24, 48), (32, 64), (5, 10), (3, 6)])
 def test_photometric_loss(size: tuple[int, int], masked: bool, machine: Machine) -> None:
-    rng = torch.Generator().manual_seed(0)
-    color = torch.rand(*size, 3, generator=rng) * 1.2
-    target = torch.randint(0, 256, (*size, 3), generator=rng, dtype=torch.uint8)
-    mask = torch.rand(size, generator=rng) > 0.3 if masked else None
-    some = torch.rand(size[0], generator=rng)
-    affine = torch.tensor([[0.7, 1.0, 1.3], [0.02, 0.0, -0.03]])
-    for weight, rows, exposure in (
-        (0.0, None, None),
-        (0.2, None, None),
-        (1.0, None, None),
-        (0.2, some, None),
-        (0.2, some, affine),
-        (0.2, None, affine),
-    ):
-        given = {"color": color, "target": target, "mask": mask, "lambda_ssim": weight, "rows": rows}
-        values, gradient, sums = ops.photometric(**given, exposure=exposure)
-        ours, our_gradient, our_sums = machine.run(launches.photometric, **given, exposure=exposure)
-        assert torch.allclose(ours, values, atol=1e-6, rtol=0)
-        assert (our_gradient - gradient).norm() <= 1e-4 * gradient.norm()
-        assert our_sums.shape == sums.shape == ((0, 5) if exposure is None else (3, 5))
-        assert torch.allclose(our_sums, sums, rtol=1e-4, atol=1e-5)
+    check = functools.partial(check_photometric, machine, size, masked=masked)
+    for weight in (0.0, 1.0):
+        check(weight=weight, rows=False, exposed=False)
+    for rows, exposed in itertools.product((False, True), repeat=2):
+        check(weight=0.2, rows=rows, exposed=exposed)
 
 
 def test_nothing_under_a_mask_that_covers_all(machine: Machine) -> None:
@@ -281,25 +260,8 @@ def test_nothing_under_a_mask_that_covers_all(machine: Machine) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_absolute_difference(share: float, machine: Machine) -> None:
-    rng = torch.Generator().manual_seed(0)
-    rendered, target, chance = torch.rand(3, 20, 40, generator=rng)
-    given = {"rendered": rendered, "target": target, "valid": chance < share}
-    value, gradient = ops.absolute_difference(**given)
-    ours, our_gradient = machine.run(launches.absolute_difference, **given)
-    assert torch.allclose(ours, value, atol=1e-6, rtol=0)
-    assert torch.allclose(our_gradient, gradient)
+    check_absolute_difference(machine, share)
 
 
 def test_adam_on_the_first_values(machine: Machine) -> None:
-    rng = torch.Generator().manual_seed(0)
-    ours = [tensor.to(machine.device) for tensor in torch.rand(3, 500, generator=rng)]
-    theirs = [tensor.cpu().clone() for tensor in ours]
-    for step in range(1, 6):
-        gradient = torch.randn(500, generator=rng)
-        settings = (400, 0.01, 0.9, 0.999, 1e-15, step)
-        moved = gradient.to(machine.device)
-        launches.adam(machine.launch, ours[0], moved, ours[1], ours[2], *settings)
-        ops.adam(theirs[0], gradient, theirs[1], theirs[2], *settings)
-    for one, two in zip(ours, theirs, strict=True):
-        assert torch.allclose(one.cpu(), two, atol=1e-6)
-        assert torch.equal(one.cpu()[400:], two[400:])
+    check_adam(machine, 500)

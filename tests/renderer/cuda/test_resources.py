@@ -10,7 +10,7 @@ from panolog.renderer.cuda import nvrtc
 
 pytestmark = pytest.mark.system
 
-pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core")
+pytest.importorskip("cuda.core", reason="CUDA: no cuda-core")
 
 # Of a thread. An SM has 65,536, given out in groups of eight for each thread: with 48 it holds five blocks of
 # 256 threads, with 64 four (all that sm_75 can hold); with 96 five blocks of 128, with 104 to 128 four.
@@ -40,9 +40,13 @@ REGISTERS = {
 SHARED = 48 << 10  # bytes of a block that need no opt-in
 LAST_SUM = 12  # instructions in double precision: loads, additions and the store of the sum over a block
 STACK = 128  # bytes of a thread: arrays of projection with indices that are not constants; no spills
+ARCH = "sm_89"
+EVERY_ARCH = [
+    arch if arch == ARCH else pytest.param(arch, marks=pytest.mark.nightly) for arch in ARCHITECTURES
+]
 
 
-@pytest.fixture(scope="module", params=ARCHITECTURES)
+@pytest.fixture(scope="module", params=EVERY_ARCH)
 def kernels(request: pytest.FixtureRequest) -> list[Kernel]:
     return [kernel for module in nvrtc.MODULES for kernel in measure(module, request.param)]
 
@@ -101,7 +105,7 @@ def comparisons(ptx: str) -> set[str]:
 
 
 @pytest.mark.parametrize(("kernels", "least"), [("composite", 3), ("composite_ray", 2)])
-@pytest.mark.parametrize("arch", ARCHITECTURES)
+@pytest.mark.parametrize("arch", EVERY_ARCH)
 def test_forward_and_backward_count_the_same_pairs(arch: str, kernels: str, least: int) -> None:
     """To the bit: each comparison of the forward pass is also one of the backward pass."""
     ptx = compiled("composite", arch).ptx
@@ -118,9 +122,9 @@ def test_forward_and_backward_count_the_same_pairs(arch: str, kernels: str, leas
 
 
 def test_the_command_prints_each_kernel(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--arch", "sm_89"]) == 0
+    assert main(["--arch", ARCH]) == 0
     rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
     assert {row.split()[1] for row in rows[1:]} == REGISTERS.keys()
-    assert main(["--arch", "sm_89", "--json"]) == 0
+    assert main(["--arch", ARCH, "--json"]) == 0
     assert {kernel["name"] for kernel in json.loads(capsys.readouterr().out)["kernels"]} == REGISTERS.keys()
     assert main(["--arch", "sm_999"]) == 2
