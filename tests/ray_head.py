@@ -88,10 +88,10 @@ def all_end() -> Iterator[None]:
         prctl(_SUBREAPER, 0)
 
 
-def living(word: str) -> list[psutil.Process]:
-    """Our children with a word in their command line, but no zombie: another test may have left one."""
+def living(word: str, parent: int | None = None) -> list[psutil.Process]:
+    """Children of a process, by default of this one, with a word in their command line, but no zombies."""
     found = []
-    for child in psutil.Process().children():
+    for child in psutil.Process(parent).children():
         with suppress(psutil.Error):  # it ends meanwhile
             if word in child.cmdline() and child.status() != psutil.STATUS_ZOMBIE:
                 found.append(child)

@@ -1,13 +1,14 @@
 """What the follower knows of the run, for the threads that pass it on."""
 
 import threading
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from panolog.orchestrator.follower.notifications import Notification
+from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.orchestrator.run.records import Outcome
 
+_LAST_S = 5.0  # the longest pause between tries once the run has ended
 ALL = 2**62  # an iteration beyond every one: all curves of the task are settled
 
 
@@ -27,16 +28,17 @@ class News:
 class Board:
     """Holds the news; any thread waits for newer ones."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock = CLOCK) -> None:
         self._changed = threading.Condition()
+        self._clock = clock
         self._news = News()
-        self._end = 0.0  # time.monotonic() at which every thread has to end
+        self._end = 0.0  # clock.monotonic() at which every thread has to end
 
     def publish(self, news: News, seconds: float = 0.0) -> None:
         """Replaces the news. Args: seconds, if the run has ended: for which threads may still work."""
         with self._changed:
             self._news = news
-            self._end = time.monotonic() + seconds
+            self._end = self._clock.monotonic() + seconds
             self._changed.notify_all()
 
     @property
@@ -50,12 +52,19 @@ class Board:
             self._changed.wait_for(lambda: self._news is not known, seconds)
             return self._news
 
-    def wait_for_end(self, seconds: float) -> None:
-        """Waits until the run has ended, or for so many seconds."""
+    def pause(self, seconds: float) -> bool:
+        """Waits between two tries: until the run has ended, or for so many seconds; then for a short time.
+
+        Returns whether there is time for another try.
+        """
+        if self._news.ended:
+            self._clock.sleep(max(0.0, min(seconds, _LAST_S, self.left)))
+            return self.left > 0
         with self._changed:
             self._changed.wait_for(lambda: self._news.ended, seconds)
+        return True
 
     @property
     def left(self) -> float:
         """Seconds that are left to work, once the run has ended."""
-        return self._end - time.monotonic()
+        return self._end - self._clock.monotonic()

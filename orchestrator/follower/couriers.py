@@ -17,7 +17,6 @@ from panolog.orchestrator.follower.targets import Target
 
 _TRIES = 60  # of one notification by one follower: hours, if the run lasts
 _FIRST_S, _LONGEST_S = 2.0, 300.0  # pauses between tries, each twice as long as the one before
-_LAST_S = 5.0  # the longest pause once the run has ended
 _MOST = 100  # notifications of one run to one target, besides its end
 _ENDS = (Kind.DONE, Kind.FAILED)
 Send = Callable[[Target, Notification], Refusal | None]
@@ -72,7 +71,7 @@ class Courier(threading.Thread):
             problem = f"{refusal.reason}; not delivered: {notification.kind}"
             if refusal.final:
                 break
-            if not self._pause(max(refusal.after, min(_FIRST_S * 2**tried, _LONGEST_S))):
+            if not self._board.pause(max(refusal.after, min(_FIRST_S * 2**tried, _LONGEST_S))):
                 self.problem = problem
                 return False
         self.problem = problem
@@ -80,15 +79,6 @@ class Courier(threading.Thread):
         assert self._ledger is not None  # `_due` comes first
         self._note(abandoned=self._ledger.get("abandoned", {}) | {notification.id: self.problem})
         return True
-
-    def _pause(self, seconds: float) -> bool:
-        """Waits so long; less once the run has ended. Returns whether there is time for another try."""
-        if not self._board.news.ended:
-            self._board.wait_for_end(seconds)
-            return True
-        left = self._board.left
-        threading.Event().wait(max(0.0, min(seconds, _LAST_S, left)))
-        return self._board.left > 0
 
     def _kept(self, name: str) -> list[str]:
         assert self._ledger is not None  # `_due` comes first

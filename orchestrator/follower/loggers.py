@@ -18,7 +18,6 @@ from panolog.orchestrator.run.folder import RunFolder, read_json
 from panolog.scene.errors import RunFolderError
 
 _FIRST_S, _LONGEST_S = 2.0, 300.0  # pauses after errors, each twice as long as the one before
-_LAST_S = 5.0  # the longest once the run has ended
 _IDLE_S = 60.0  # between two looks without news
 
 
@@ -53,15 +52,8 @@ class Logger(threading.Thread):
                 news = self._board.wait(_IDLE_S, news)
             except errors as error:
                 self.problem = f"not all was passed on: {type(error).__name__}"
-                self._pause(min(_FIRST_S * 2**failures, _LONGEST_S))
+                self._board.pause(min(_FIRST_S * 2**failures, _LONGEST_S))
                 news, failures = self._board.news, failures + 1
-
-    def _pause(self, seconds: float) -> None:
-        """Waits so long; less once the run has ended."""
-        waited, step, timer = 0.0, 0.5, threading.Event()
-        while waited < seconds and not (self._board.news.ended and waited >= min(_LAST_S, self._board.left)):
-            timer.wait(step)
-            waited += step
 
     def _begin(self, sink: Sink, news: News) -> None:
         """Takes up the run there."""

@@ -61,8 +61,8 @@ def test_a_run_gives_its_secrets_to_no_process_that_it_starts(
 
     monkeypatch.setattr("panolog.orchestrator.commands.session.start", start)
     monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
-    secrets = ("HOOK", "PANOLOG_NOTIFY", "PANOLOG_NOTIFY_SECRET", "PANOLOG_NTFY_TOKEN")
-    secrets += ("PANOLOG_SMTP_USER", "PANOLOG_SMTP_PASSWORD")
+    secrets = ["HOOK", "PANOLOG_NOTIFY", "PANOLOG_NOTIFY_SECRET", "PANOLOG_NTFY_TOKEN"]
+    secrets += ["PANOLOG_SMTP_USER", "PANOLOG_SMTP_PASSWORD"]
     with receiver() as server:
         for name in secrets:
             monkeypatch.setenv(name, "T0PSECRET")

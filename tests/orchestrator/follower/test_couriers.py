@@ -1,7 +1,6 @@
 """Delivery to one target: tries again, gives up, goes on after a kill, and holds nothing up."""
 
 import threading
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +14,12 @@ from panolog.orchestrator.follower.notifications import Kind, Notification
 from panolog.orchestrator.follower.sending import Refusal
 from panolog.orchestrator.follower.targets import Target
 from panolog.scene.files import write_bytes
+from tests.orchestrator.fakes import SetClock
+from tests.ray_head import wait_until
 
 TARGET = Target("webhook", "label", "http://127.0.0.1:1/")
 LATER, NEVER = Refusal("HTTP 503", final=False), Refusal("HTTP 404", final=True)
+WHOLE_RUN = 1e6  # seconds: more than all tries take
 
 
 def notice(record: int, kind: Kind = Kind.PREEMPTED) -> Notification:
@@ -30,28 +32,25 @@ class Post:
     def __init__(self, answers: Sequence[Refusal | None] = ()) -> None:
         self.answers, self.tried = list(answers), list[str]()
         self.taken: list[str] = []
+        self.begun = threading.Event()  # once something was tried
 
     def __call__(self, _: Target, notification: Notification) -> Refusal | None:
         self.tried.append(notification.id)
         answer = self.answers.pop(0) if self.answers else None
         if answer is None:
             self.taken.append(notification.id)
+        self.begun.set()
         return answer
 
 
-@pytest.fixture(autouse=True)
-def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("panolog.orchestrator.follower.couriers._FIRST_S", 0.01)
-
-
-def deliver(path: Path, post: Post, *notices: Notification, began: int = 0, seconds: float = 30.0) -> Courier:
-    """One courier of a run that has ended."""
-    board = Board()
-    board.publish(News("run", began, notices, ended=True), seconds)
+def deliver(
+    path: Path, post: Post, *notices: Notification, run: str = "run", began: int = 0, left: float = WHOLE_RUN
+) -> Courier:
+    """One courier of a run that has ended, in this thread. Args: left, seconds on a clock of its own."""
+    board = Board(SetClock())
+    board.publish(News(run, began, notices, ended=True), left)
     courier = Courier(TARGET, board, path / "ledger.json", post)
-    courier.start()
-    courier.join(60)
-    assert not courier.is_alive()
+    courier.run()
     return courier
 
 
@@ -72,50 +71,37 @@ def test_what_is_refused_for_good_is_given_up_and_said(tmp_path: Path) -> None:
     assert again.tried == []
 
 
-def test_the_end_of_the_run_ends_a_pause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A target that was refused for five minutes is tried again at once: little time is left."""
-    monkeypatch.setattr("panolog.orchestrator.follower.couriers._FIRST_S", 300.0)
-    refused, board = threading.Event(), Board()
-
-    def post(_: Target, notification: Notification) -> Refusal | None:
-        if refused.is_set():
-            return None
-        refused.set()
-        return LATER
-
+def test_the_end_of_the_run_ends_a_pause(tmp_path: Path) -> None:
+    """A target that wants an hour's rest is tried again at once: little time is left."""
+    board, post = Board(), Post([replace(LATER, after=3600.0)])
     board.publish(News("run", 0, (notice(1),)))
     courier = Courier(TARGET, board, tmp_path / "ledger.json", post)
     courier.start()
-    assert refused.wait(60)
-    board.publish(News("run", 0, (notice(1),), ended=True), 30.0)
-    courier.join(60)
+    assert post.begun.wait(120)
+    board.publish(News("run", 0, (notice(1),), ended=True), WHOLE_RUN)
+    courier.join(120)
     assert not courier.is_alive()
     assert courier.problem == ""
     assert Ledger(tmp_path / "ledger.json", "run").get("delivered", []) == ["r-preempted-1"]
 
 
-def test_tries_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("panolog.orchestrator.follower.couriers._TRIES", 3)
-    post = Post([LATER] * 5)
+def test_tries_are_bounded(tmp_path: Path) -> None:
+    post = Post([LATER] * 1_000)
     deliver(tmp_path, post, notice(1))
-    assert len(post.tried) == 3
+    assert len(post.tried) == 60
 
 
 def test_the_time_after_the_end_is_bounded_and_the_next_follower_goes_on(tmp_path: Path) -> None:
-    post = Post([LATER] * 10_000)
-    courier = deliver(tmp_path, post, notice(1), seconds=0.2)
-    assert post.taken == []
+    post = Post([LATER] * 1_000)
+    courier = deliver(tmp_path, post, notice(1), left=30.0)
+    assert len(post.tried) == 7  # after 0, 2, 6, 11, 16, 21 and 26 seconds
     assert "HTTP 503" in courier.problem
     post = Post()
     deliver(tmp_path, post, notice(1), notice(2))
     assert post.taken == ["r-preempted-1", "r-preempted-2"]
-
-
-def test_a_delivered_id_is_not_sent_again_by_the_next_follower(tmp_path: Path) -> None:
-    deliver(tmp_path, Post(), notice(1))
     post = Post()
-    deliver(tmp_path, post, notice(1), notice(2))
-    assert post.tried == ["r-preempted-2"]
+    deliver(tmp_path, post, notice(1), notice(2), notice(3))
+    assert post.tried == ["r-preempted-3"]  # what was delivered is not sent again
 
 
 def test_a_kill_between_sending_and_noting_sends_the_same_id_again(tmp_path: Path) -> None:
@@ -139,10 +125,7 @@ def test_what_was_before_is_no_news_to_a_new_target(tmp_path: Path) -> None:
 
 def test_another_run_in_the_same_folder_begins_anew(tmp_path: Path) -> None:
     deliver(tmp_path, Post(), notice(1))
-    board, post = Board(), Post()
-    board.publish(News("other", 0, (notice(1),), ended=True), 30.0)
-    courier = Courier(TARGET, board, tmp_path / "ledger.json", post)
-    courier.run()
+    deliver(tmp_path, post := Post(), notice(1), run="other")
     assert post.taken == ["r-preempted-1"]
 
 
@@ -158,22 +141,11 @@ def test_of_many_notifications_the_end_still_arrives(tmp_path: Path) -> None:
 )
 def test_a_damaged_ledger_counts_as_none(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "ledger.json").write_bytes(content)
-    post = Post()
-    deliver(tmp_path, post, notice(1))
+    deliver(tmp_path, post := Post(), notice(1))
     assert post.taken == ["r-preempted-1"]
 
 
-def test_a_full_disk_stops_no_delivery(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("panolog.orchestrator.follower.ledger.write_bytes", full)
-    post = Post()
-    deliver(tmp_path, post, notice(1), notice(2))
-    assert post.taken == ["r-preempted-1", "r-preempted-2"]
-
-
-def test_what_could_not_be_noted_is_noted_with_the_next(
+def test_what_could_not_be_noted_on_a_full_disk_is_noted_with_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     left = [None, OSError(28, "No space left on device")]
@@ -184,23 +156,23 @@ def test_what_could_not_be_noted_is_noted_with_the_next(
         write_bytes(path, data)
 
     monkeypatch.setattr("panolog.orchestrator.follower.ledger.write_bytes", once)
-    deliver(tmp_path, Post(), notice(1), notice(2))
-    post = Post()
-    deliver(tmp_path, post, notice(1), notice(2))
+    deliver(tmp_path, post := Post(), notice(1), notice(2))
+    assert post.taken == ["r-preempted-1", "r-preempted-2"]
+    deliver(tmp_path, post := Post(), notice(1), notice(2))
     assert post.tried == []
 
 
 def test_news_of_a_live_run_are_delivered_as_they_come(tmp_path: Path) -> None:
-    board, post = Board(), Post([LATER])
+    board, post = Board(), Post()
     courier = Courier(TARGET, board, tmp_path / "ledger.json", post)
     courier.start()
-    news = News("run", 0, (notice(1),))
-    for number in (2, 3):
-        board.publish(news)
-        last = time.monotonic() + 30
-        while f"r-preempted-{number - 1}" not in post.taken and time.monotonic() < last:
-            time.sleep(0.01)
-        news = replace(news, notifications=(*news.notifications, notice(number)))
-    board.publish(replace(news, ended=True), 30.0)
-    courier.join(60)
-    assert post.taken == ["r-preempted-1", "r-preempted-2", "r-preempted-3"]
+    first, second, third = (notice(number) for number in (1, 2, 3))
+    try:
+        board.publish(News("run", 0, (first,)))
+        wait_until(lambda: post.taken == [first.id], "the first")
+        board.publish(News("run", 0, (first, second)))
+        wait_until(lambda: post.taken == [first.id, second.id], "the second")
+    finally:
+        board.publish(News("run", 0, (first, second, third), ended=True), WHOLE_RUN)
+        courier.join(120)
+    assert post.taken == [first.id, second.id, third.id]

@@ -5,9 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import psutil
@@ -17,10 +15,13 @@ from panolog.orchestrator.commands.companion import companion_follower
 from panolog.orchestrator.follower.follower import Follower
 from panolog.orchestrator.follower.plan import Plan, SinkChoice
 from panolog.orchestrator.follower.targets import Target
+from panolog.orchestrator.follower.watcher import Watcher
 from panolog.orchestrator.run import lock
 from tests.orchestrator.follower import histories
 from tests.orchestrator.follower.receivers import Receiver, receiver
+from tests.ray_head import living, wait_until
 
+FOLLOWER = "panolog.orchestrator.follower"
 # A command of a run that is killed: it starts the follower and waits.
 KILLED = """
 import sys, time
@@ -39,17 +40,16 @@ def plan_of(server: Receiver, *more: Target) -> Plan:
     return Plan((Target("webhook", "hook", f"{server.url}/x", secret="s"), *more))
 
 
-def wait_for(condition: Callable[[], object]) -> None:
-    last = time.monotonic() + 60
-    while not condition() and time.monotonic() < last:
-        time.sleep(0.05)
-    assert condition()
+def follower_of(parent: int) -> psutil.Process:
+    """Its follower, which has the command line of its parent until it executes its own program."""
+    wait_until(lambda: living(FOLLOWER, parent), "a follower")
+    (process,) = living(FOLLOWER, parent)
+    return process
 
 
-def followers(parent: int) -> list[psutil.Process]:
-    """Its living followers: a zombie, which another test may have left, has no command line."""
-    living = [it for it in psutil.Process(parent).children() if it.status() != psutil.STATUS_ZOMBIE]
-    return [it for it in living if "panolog.orchestrator.follower" in it.cmdline()]
+def gone(process: psutil.Process) -> bool:
+    """Whether it has ended, also where nobody has taken note of it yet."""
+    return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
 
 
 def test_the_end_of_a_run_is_delivered_once_over_several_commands(tmp_path: Path) -> None:
@@ -65,11 +65,30 @@ def test_the_end_of_a_run_is_delivered_once_over_several_commands(tmp_path: Path
     assert said == []
 
 
-def test_drivers_that_a_supervisor_replaces_are_no_failures(tmp_path: Path) -> None:
-    with receiver() as server, companion_follower(tmp_path / "run", plan_of(server), print):
-        for number in range(3):
-            histories.write(tmp_path / "run", number, number + 1)
-            time.sleep(2.5)  # for two looks at the database
+def test_drivers_that_a_supervisor_replaces_are_no_failures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks, look, ended = list[None](), Watcher.look, threading.Event()
+
+    def counted(watcher: Watcher) -> bool:
+        found = look(watcher)
+        looks.append(None)
+        return found
+
+    monkeypatch.setattr(Watcher, "look", counted)
+    monkeypatch.setattr("panolog.orchestrator.follower.follower.POLL_S", 0.05)
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)
+    with receiver() as server, ThreadPoolExecutor(1) as threads:
+        follower = Follower(tmp_path / "run", os.getppid(), plan_of(server))
+        problems = threads.submit(follower.follow, ended)
+        try:
+            for number in range(3):
+                histories.write(tmp_path / "run", number, number + 1)
+                looks.clear()
+                wait_until(lambda: len(looks) >= 2, "a look that begins after all was written")
+        finally:
+            ended.set()
+        assert problems.result(120) == []
     assert server.texts == ["run.done"]
 
 
@@ -87,10 +106,10 @@ def test_nothing_is_delivered_while_another_driver_is_at_work(tmp_path: Path) ->
 def test_a_follower_that_was_killed_is_replaced_at_the_end(tmp_path: Path) -> None:
     with receiver() as server:
         with companion_follower(tmp_path / "run", plan_of(server), print):
-            (process,) = followers(os.getpid())
+            process = follower_of(os.getpid())
             histories.write(tmp_path / "run")
             process.kill()
-            process.wait(60)
+            wait_until(lambda: gone(process), "its end")
         assert server.texts == ["run.done"]
 
 
@@ -100,12 +119,11 @@ def test_a_command_that_is_killed_leaves_a_follower_that_says_so_and_ends(tmp_pa
         run = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert run.stdout is not None
         assert run.stdout.readline() == "ready\n"
-        (process,) = followers(run.pid)
+        process = follower_of(run.pid)
         histories.write(tmp_path / "run", 0, 1)
         run.kill()
-        run.wait()
-        process.wait(60)
-        wait_for(lambda: server.received)
+        run.communicate()
+        wait_until(lambda: gone(process), "the end of its follower")
     assert server.texts == ["run.failed"]
     assert "killed" in server.received[0].json["text"]
 
@@ -113,11 +131,9 @@ def test_a_command_that_is_killed_leaves_a_follower_that_says_so_and_ends(tmp_pa
 def test_signals_that_end_a_run_do_not_end_its_follower(tmp_path: Path) -> None:
     with receiver() as server:
         with companion_follower(tmp_path / "run", plan_of(server), print):
-            (process,) = followers(os.getpid())
+            process = follower_of(os.getpid())
             histories.write(tmp_path / "run")
-            wait_for(lambda: process.status() == psutil.STATUS_SLEEPING)
-            wait_for(lambda: "SigIgn" in Path(f"/proc/{process.pid}/status").read_text())
-            wait_for(lambda: _ignores(process.pid, signal.SIGTERM))
+            wait_until(lambda: _ignores(process.pid, signal.SIGHUP), "it ignores signals")
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 process.send_signal(number)
         assert server.texts == ["run.done"]
@@ -132,14 +148,38 @@ def _ignores(pid: int, number: int) -> bool:
 def test_a_target_that_hangs_neither_holds_up_the_others_nor_the_run_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("panolog.orchestrator.commands.companion._FOLLOWER_S", 8.0)
-    with ExitStack() as stack:
-        server, hung = stack.enter_context(receiver()), stack.enter_context(receiver(hangs=True))
-        with companion_follower(tmp_path / "run", plan_of(server, Target("webhook", "b", hung.url)), print):
-            histories.write(tmp_path / "run")
-        assert followers(os.getpid()) == []
-        assert server.texts == ["run.done"]
-        assert len(hung.received) == 1
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)
+    monkeypatch.setattr("panolog.orchestrator.follower.follower.LAST_S", 1.0)
+    folder, ended = histories.write(tmp_path / "run"), threading.Event()
+    ended.set()
+    with receiver(hangs=True) as hung:
+        plan = Plan((Target("webhook", "hung", hung.url),))
+        Follower(folder.root, os.getppid(), plan).follow(ended)
+        assert not hung.hang.is_set()  # its end was not waited for
+        hung.hang.set()
+        for courier in [it for it in threading.enumerate() if it.name == "hung"]:
+            courier.join(120)
+    monkeypatch.setattr("panolog.orchestrator.follower.follower.LAST_S", 120.0)
+    with receiver() as server, receiver(hangs=True) as hung, ThreadPoolExecutor(1) as threads:
+        plan = plan_of(server, Target("webhook", "hung", hung.url))
+        problems = threads.submit(Follower(folder.root, os.getppid(), plan).follow, ended)
+        try:
+            wait_until(lambda: server.texts == ["run.done"], "the news at the other target")
+            assert not hung.hang.is_set()
+        finally:
+            hung.hang.set()
+        assert problems.result(240) == []
+
+
+def test_a_follower_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program, said = tmp_path / "python", list[str]()
+    program.write_text("#!/bin/sh\nexec sleep 1000\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr("panolog.orchestrator.commands.companion._FOLLOWER_S", 0.1)
+    with receiver() as server, companion_follower(tmp_path / "run", plan_of(server), said.append):
+        pass
+    assert said == ["the follower has ended early (code -9): not all may be delivered"]
 
 
 def test_what_was_not_delivered_is_said_without_a_secret(tmp_path: Path) -> None:
@@ -151,7 +191,7 @@ def test_what_was_not_delivered_is_said_without_a_secret(tmp_path: Path) -> None
 
 def test_a_plan_without_anything_starts_no_process(tmp_path: Path) -> None:
     with companion_follower(tmp_path, Plan(), print):
-        assert followers(os.getpid()) == []
+        assert living(FOLLOWER) == []
 
 
 def test_a_follower_that_cannot_work_is_said_and_ends_no_run(

@@ -25,6 +25,7 @@ from panolog.orchestrator.follower.sinks.interface import Facts, Sink
 from panolog.orchestrator.follower.watcher import Watcher
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Outcome
+from tests.orchestrator.fakes import SetClock
 from tests.orchestrator.follower import histories
 from tests.orchestrator.follower.histories import Curves, expected
 
@@ -75,19 +76,14 @@ class Memory(Sink):
         return found
 
 
-def follow(folder: RunFolder, make: Make, *, left: bool = True) -> Logger:
-    """One follower that looks once, at the end of a driver."""
-    watcher, board = Watcher(folder, 1e9), Board()
+def follow(folder: RunFolder, make: Make, *, seconds: float = 1e6) -> Logger:
+    """One follower that looks once, at the end of a driver. Args: seconds, on a clock that only it moves."""
+    watcher, board = Watcher(folder, 1e9), Board(SetClock())
     watcher.look()
-    board.publish(watcher.news(ended=True, left=left), 30.0)
+    board.publish(watcher.news(ended=True, left=True), seconds)
     logger = Logger("memory", make, board, folder.root, folder.root / "follower" / "sink.json")
     logger.run()
     return logger
-
-
-@pytest.fixture(autouse=True)
-def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("panolog.orchestrator.follower.loggers._FIRST_S", 0.01)
 
 
 def each_driver(root: Path, make: Make) -> RunFolder:
@@ -148,11 +144,7 @@ def test_a_sink_that_never_answers_leaves_the_time_limit(tmp_path: Path) -> None
     sink = Memory()
     sink.fails = dict.fromkeys(range(1, 10_000), OSError)
     folder = histories.write(tmp_path / "run")
-    watcher, board = Watcher(folder, 1e9), Board()
-    watcher.look()
-    board.publish(watcher.news(ended=True, left=True), 0.5)
-    logger = Logger("memory", lambda: sink, board, folder.root, tmp_path / "sink.json")
-    logger.run()
+    logger = follow(folder, lambda: sink, seconds=60.0)
     assert logger.problem == "not all was passed on: OSError"
 
 
@@ -173,6 +165,7 @@ def test_tensorboard_reads_the_curves_of_the_database(tmp_path: Path) -> None:
             if not killed and task == "coarse" and points[0].iteration > 20:
                 killed.append(task)
                 super().log(task, points[: len(points) // 2])
+                self.finish(None, {}, None)  # only so that no thread of a writer is left
                 raise Killed
             super().log(task, points)
 
