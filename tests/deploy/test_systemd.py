@@ -36,7 +36,7 @@ def test_systemd_accepts_it(tmp_path: Path, unit: Path, name: str) -> None:
     # what this machine has: no user panolog, and no program below /opt
     text = unit.read_text().replace("User=panolog", "User=root")
     copy.write_text(text.replace("/opt/panolog/.venv/bin/panolog", "/bin/true"))
-    command = ["systemd-analyze", "verify", "--man=no", copy]
+    command = ["systemd-analyze", "verify", "--man=no", str(copy)]
     ended = subprocess.run(command, check=False, capture_output=True, text=True)
     about_it = [line for line in ended.stderr.splitlines() if "panolog" in line]
     assert (ended.returncode, about_it) == (0, []), ended.stderr

@@ -57,7 +57,8 @@ def test_a_group_has_no_more_machines_than_the_cluster_and_without_configuration
     kind = {"resources": {"CPU": 4}, "max_workers": 10}
     config = {"max_workers": 3, "available_node_types": {"a": kind}, "head_node_type": "head"}
     assert groups_of(config)[0].most == 3
-    for nothing in ({}, {"available_node_types": None}, {"available_node_types": {"a": {}}}):
+    empty: list[dict[str, object]] = [{}, {"available_node_types": None}, {"available_node_types": {"a": {}}}]
+    for nothing in empty:
         assert groups_of(nothing) == ()
     assert read_config("127.0.0.1:1") == {}
 

@@ -34,7 +34,16 @@ from tests.ray_head import BIN, Head, free_ports, ray_head, read, wait_until
 
 pytestmark = pytest.mark.system
 
-SMALL = ("--device", "cpu", "--set", "sky.count=50", "--set", "checkpoint.every=500", "--blocks", "2x1x1")
+SMALL: tuple[str, ...] = (
+    "--device",
+    "cpu",
+    "--set",
+    "sky.count=50",
+    "--set",
+    "checkpoint.every=500",
+    "--blocks",
+    "2x1x1",
+)
 SMALL += ("--set", "checkpoint.share=1")
 
 
@@ -312,7 +321,7 @@ def test_a_job_logs_as_the_command_that_starts_it(monkeypatch: pytest.MonkeyPatc
     class Recorder:
         """The client of a job server."""
 
-        list_jobs = staticmethod(list)
+        list_jobs = staticmethod(list[object])
         submit_job = staticmethod(lambda **job: submitted.update(job) or "job")
         get_job_info = staticmethod(lambda _: info)
 

@@ -33,7 +33,13 @@ pytestmark = pytest.mark.system
 
 HEAD, ADDRESS = "10.77.0.1", "10.77.0.1:6379"
 WORKERS = {"one": "10.77.0.2", "two": "10.77.0.3"}
-SETS = ("sky.count=100", "checkpoint.every=5", "checkpoint.share=1", "densify.start=10", "iterations=20")
+SETS: tuple[str, ...] = (
+    "sky.count=100",
+    "checkpoint.every=5",
+    "checkpoint.share=1",
+    "densify.start=10",
+    "iterations=20",
+)
 SETS += ("device=cpu", "densify.every_floor=5")
 SETTINGS = tuple(word for setting in SETS for word in ("--set", setting))
 

@@ -289,6 +289,5 @@ def test_tasks_that_have_broken_their_context_harm_no_other(pool: RayPool) -> No
     assert again.card == faulty.card
     assert again.pid != faulty.pid
     assert all(works(pool, attempt) for attempt in [again, *others])
-    for broken in (faulty, crashed):
-        wait_until(lambda pid=broken.pid: not psutil.pid_exists(pid), "the end of its process")
+    wait_until(lambda: not any(map(psutil.pid_exists, (faulty.pid, crashed.pid))), "the end of both")
     assert end(pool, again, *others) == [Ended()] * 3

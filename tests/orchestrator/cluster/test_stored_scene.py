@@ -25,7 +25,7 @@ PROVIDER = {
     "AWS_DEFAULT_REGION": "us-east-1",
     "AWS_EC2_METADATA_DISABLED": "true",
 }
-SETTINGS = ("--iterations", "20", "--width", "64", "--device", "cpu", "--blocks", "2x1x1")
+SETTINGS: tuple[str, ...] = ("--iterations", "20", "--width", "64", "--device", "cpu", "--blocks", "2x1x1")
 SETTINGS += ("--set", "sky.count=100", "--set", "deliver=false")
 # Waits for the server, makes the bucket and stores a folder.
 STORE = """

@@ -39,7 +39,7 @@ from tests.examples.test_examples import example
 
 pytestmark = pytest.mark.system
 
-SETS = ("iterations=60", "sky.count=100", "checkpoint.every=20", "checkpoint.share=1")
+SETS: tuple[str, ...] = ("iterations=60", "sky.count=100", "checkpoint.every=20", "checkpoint.share=1")
 SETS += ("device=cpu", "densify.start=10", "densify.every_floor=5")
 SETTINGS = tuple(word for setting in SETS for word in ("--set", setting))
 
