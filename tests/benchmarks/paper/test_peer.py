@@ -60,31 +60,24 @@ def test_faces_see_what_the_panorama_sees(tmp_path: Path, gallery: Gallery) -> N
 
 
 def test_its_models_make_a_curve(tmp_path: Path, gallery: Gallery) -> None:
-    found = peer.train(program(tmp_path, gallery), gallery, tmp_path / "out", 20, 60)
+    found = peer.train(program(tmp_path, gallery), gallery, tmp_path / "out", 20, 600)
     assert (found.variant, len(found.curve), found.gaussians) == ("opensplat", 2, 50)
     assert found.metric("ws_psnr") == found.curve[-1].ws_psnr
     assert 0 <= found.curve[0].seconds <= found.total == found.curve[-1].seconds
 
 
-def test_its_schedules_are_as_long_as_its_run() -> None:
-    full, short = (
-        dict(zip(words[::2], words[1::2], strict=True)) for words in map(peer.schedules, (30_000, 1800))
-    )
-    assert (full["--resolution-schedule"], full["--refine-every"]) == ("3000", "100")  # its defaults
-    assert (short["--resolution-schedule"], short["--refine-every"]) == ("180", "6")
-
-
+@pytest.mark.nightly
 def test_it_is_ended_when_the_time_is_over(tmp_path: Path, gallery: Gallery) -> None:
-    copied = 'shutil.copy("{model}", output.with_name("splat_20.ply")); time.sleep(60)'
+    copied = 'shutil.copy("{model}", output.with_name("splat_20.ply")); time.sleep(6000)'
     binary = program(tmp_path, gallery, copied.format(model=tmp_path / "model.ply"))
-    found = peer.train(binary, gallery, tmp_path / "out", 20, 5)
+    found = peer.train(binary, gallery, tmp_path / "out", 20, 60)
     assert len(found.curve) == 1  # the last one may not be whole
-    assert "ended after 5 s" in found.notes[0]
+    assert "ended after 60 s" in found.notes[0]
 
 
 def test_its_failure_is_one_line(tmp_path: Path, gallery: Gallery) -> None:
     with pytest.raises(RunError, match="ended with 3"):
-        peer.train(program(tmp_path, gallery, "sys.exit(3)"), gallery, tmp_path / "out", 20, 60)
+        peer.train(program(tmp_path, gallery, "sys.exit(3)"), gallery, tmp_path / "out", 20, 600)
     false = shutil.which("true")
     assert false is not None
     with pytest.raises(RunError, match="has saved no model"):

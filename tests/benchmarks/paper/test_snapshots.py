@@ -47,12 +47,6 @@ def test_each_checkpoint_is_kept_once_and_not_copied(tmp_path: Path) -> None:
     assert inode in [file.stat().st_ino for file in folder.iterdir()]
 
 
-def test_nothing_is_kept_unless_wanted(tmp_path: Path) -> None:
-    with kept(tmp_path, tmp_path / "states", wanted=False):
-        pass
-    assert not (tmp_path / "states").exists()
-
-
 def test_a_state_is_what_a_merge_would_give(tmp_path: Path) -> None:
     coarse, better = gaussians(200, 20), gaussians(200, 20, opacity=0.9)
     grid = Grid((2, 1, 1))

@@ -7,9 +7,8 @@ import pytest
 
 from benchmarks.paper import goals, pages
 from benchmarks.paper.crops import Comparison, Crop
-from benchmarks.paper.curves import overlap_curve, quality_curve
 from benchmarks.paper.reference import published
-from benchmarks.paper.results import Point, Result, Results, load, save, spread
+from benchmarks.paper.results import Point, Result, Results, load, save
 from benchmarks.paper.study import Study
 from benchmarks.paper.study import load as load_study
 from benchmarks.paper.tables import HEAD, TAUS, Overlap, Table, csv_rows, main_tables, overlap_table
@@ -108,12 +107,6 @@ def test_the_time_at_a_level_is_between_two_states() -> None:
     assert goals.reached(curve, 24.0) is None
 
 
-def test_spread_needs_two_values() -> None:
-    assert str(spread([25.0])) == "25.00"
-    assert str(spread([0.8, 0.9])) == "0.8500 ± 0.0707"
-    assert spread([None]) is None
-
-
 def test_results_survive_the_disk(tmp_path: Path) -> None:
     save(tmp_path / "a.json", RUNS[0])
     assert load(tmp_path / "a.json") == RUNS[0]
@@ -140,24 +133,6 @@ def test_a_study_is_written_as_text_sheet_and_page(tmp_path: Path) -> None:
     assert "pano &lt;1&gt;.jpg" in page
     assert "<svg" in page
     assert (tmp_path / "quality-street.svg").read_text().startswith("<svg")
-
-
-def test_the_documentation_joins_several_studies(tmp_path: Path) -> None:
-    pages.write_docs(tmp_path / "quality.md", [study(), study(scene="flat")])
-    text = (tmp_path / "quality.md").read_text()
-    assert "(quality/0-quality-street.svg)" in text
-    assert (tmp_path / "quality" / "0-quality-street.svg").exists()
-    assert text.count("## 512×256, 600 iterations, blocks 2x1x1") == 2
-
-
-def test_pictures_are_drawn_in_the_ink_of_the_page() -> None:
-    svg = quality_curve(Results(RUNS), "street")
-    assert svg is not None
-    assert "currentColor" in svg
-    assert "panolog" in svg
-    assert quality_curve(Results([]), "street") is None
-    assert overlap_curve(()) is None
-    assert "blocks per camera" in (overlap_curve(OVERLAPS) or "")
 
 
 def test_overlap_has_a_column_for_each_tau() -> None:

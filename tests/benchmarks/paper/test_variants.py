@@ -79,13 +79,6 @@ def test_switches_of_stage_two_share_stage_one_and_its_scores(monkeypatch: pytes
             assert not same_training(config(name), config(base))
 
 
-def test_other_blocks_share_stage_one_and_no_scores() -> None:
-    two, four = config("blocks-2"), config("blocks-4")
-    assert same_stage_one(two, four)
-    assert not same_scores(two, four)
-    assert not differs_in_plan_alone(two, four)
-
-
 def test_equal_settings_are_one_training() -> None:
     assert same_training(config("paper"), config("tau-0.8"))
     assert same_training(config("panolog"), config("blocks-2"))
