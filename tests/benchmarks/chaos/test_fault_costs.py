@@ -22,11 +22,11 @@ def saved(task: TaskId) -> CheckpointSaved:
 
 
 BEGAN, AGAIN = RunBegan("host", 1, resumed=False), RunBegan("host", 2, resumed=True)
-DIED = "the worker process died"
+ZERO, ONE = TaskId.block(0), TaskId.block(1)
 
 
 def lost(task: TaskId, attempt: int = 1) -> TaskFailed:
-    return TaskFailed(task, attempt, DIED, final=False, kind=Failure.LOST)
+    return TaskFailed(task, attempt, "died", final=False, kind=Failure.LOST)
 
 
 def fault(time: float, kind: Kind, until: float = 0.0) -> Fault:
@@ -36,27 +36,27 @@ def fault(time: float, kind: Kind, until: float = 0.0) -> Fault:
 def test_a_worker_takes_back_its_work_since_the_checkpoint_and_the_time_to_start_again() -> None:
     records = history(
         (0.0, BEGAN),
-        (1.0, started(TaskId.block(0))),
-        (1.5, started(TaskId.block(1))),
-        (4.0, saved(TaskId.block(0))),
-        (9.0, lost(TaskId.block(0))),
-        (11.0, started(TaskId.block(0), 2)),
-        (20.0, model(TaskId.block(1))),
-        (21.0, model(TaskId.block(0))),
+        (1.0, started(ZERO)),
+        (1.5, started(ONE)),
+        (4.0, saved(ZERO)),
+        (9.0, lost(ZERO)),
+        (11.0, started(ZERO, 2)),
+        (20.0, model(ONE)),
+        (21.0, model(ZERO)),
     )
     (cost,) = fault_costs(records, [fault(6.0, Kind.WORKER)])
-    assert cost.tasks == (TaskId.block(0),)
+    assert cost.tasks == (ZERO,)
     assert (cost.redone, cost.recovery, cost.seconds) == (2.0, 5.0, 7.0)
 
 
 def test_a_task_that_takes_the_place_of_the_dead_one_counts_as_recovery() -> None:
     records = history(
         (0.0, BEGAN),
-        (1.0, started(TaskId.block(0))),
-        (5.0, lost(TaskId.block(0))),
-        (7.0, started(TaskId.block(1))),
-        (30.0, model(TaskId.block(1))),
-        (31.0, started(TaskId.block(0), 2)),
+        (1.0, started(ZERO)),
+        (5.0, lost(ZERO)),
+        (7.0, started(ONE)),
+        (30.0, model(ONE)),
+        (31.0, started(ZERO, 2)),
     )
     assert fault_costs(records, [fault(4.0, Kind.WORKER)])[0].recovery == 3.0
 
@@ -64,16 +64,16 @@ def test_a_task_that_takes_the_place_of_the_dead_one_counts_as_recovery() -> Non
 def test_a_driver_takes_all_running_tasks_with_it() -> None:
     records = history(
         (0.0, BEGAN),
-        (1.0, started(TaskId.block(0))),
-        (2.0, started(TaskId.block(1))),
-        (3.0, saved(TaskId.block(1))),
+        (1.0, started(ZERO)),
+        (2.0, started(ONE)),
+        (3.0, saved(ONE)),
         (15.0, AGAIN),
-        (16.0, started(TaskId.block(0))),
-        (18.0, started(TaskId.block(1))),
+        (16.0, started(ZERO)),
+        (18.0, started(ONE)),
         (30.0, RunEnded(Outcome.DONE)),
     )
     (cost,) = fault_costs(records, [fault(5.0, Kind.DRIVER)])
-    assert cost.tasks == (TaskId.block(0), TaskId.block(1))
+    assert cost.tasks == (ZERO, ONE)
     assert (cost.redone, cost.recovery) == (4.0, 13.0)
 
 
@@ -90,13 +90,13 @@ def test_a_driver_that_dies_between_tasks_loses_its_own_work() -> None:
 def test_kills_before_the_recovery_count_together() -> None:
     records = history(
         (0.0, BEGAN),
-        (1.0, started(TaskId.block(0))),
-        (4.0, lost(TaskId.block(0))),
+        (1.0, started(ZERO)),
+        (4.0, lost(ZERO)),
         (9.0, AGAIN),
-        (12.0, started(TaskId.block(0), 2)),
-        (20.0, saved(TaskId.block(0))),
-        (24.0, lost(TaskId.block(0), 2)),
-        (25.0, started(TaskId.block(0), 3)),
+        (12.0, started(ZERO, 2)),
+        (20.0, saved(ZERO)),
+        (24.0, lost(ZERO, 2)),
+        (25.0, started(ZERO, 3)),
     )
     kills = [fault(3.0, Kind.WORKER), fault(5.0, Kind.DRIVER), fault(23.0, Kind.WORKER)]
     first, second = fault_costs(records, kills)
@@ -105,30 +105,22 @@ def test_kills_before_the_recovery_count_together() -> None:
     assert (second.redone, second.recovery) == (3.0, 2.0)
 
 
-def test_a_hung_worker_is_noticed_after_the_next_fault_and_both_count_together() -> None:
+@pytest.mark.parametrize(("begun", "others"), [(1.0, (fault(5.0, Kind.RAYLET),)), (4.0, ())])
+def test_a_worker_that_hangs_has_recovered_when_its_next_attempt_begins(
+    begun: float, others: tuple[Fault, ...]
+) -> None:
+    """Neither with the next fault, which counts together with it, nor with its hello."""
     records = history(
         (0.0, BEGAN),
-        (1.0, started(COARSE)),
+        (begun, started(COARSE)),
         (13.0, lost(COARSE)),
         (16.0, started(COARSE, 2)),
         (30.0, model(COARSE)),
     )
-    (cost,) = fault_costs(records, [fault(3.0, Kind.HANG), fault(5.0, Kind.RAYLET)])
-    assert [one.kind for one in cost.faults] == [Kind.HANG, Kind.RAYLET]
+    (cost,) = fault_costs(records, [fault(3.0, Kind.HANG), *others])
+    assert [one.kind for one in cost.faults] == [Kind.HANG, *(one.kind for one in others)]
     assert (cost.tasks, cost.recovery) == ((COARSE,), 13.0)
-    assert cost.allowed == pytest.approx(sum(LIMITS[kind].costs for kind in (Kind.HANG, Kind.RAYLET)))
-
-
-def test_a_worker_that_hangs_after_its_hello_has_not_recovered_with_that() -> None:
-    records = history(
-        (0.0, BEGAN),
-        (4.0, started(COARSE)),
-        (13.0, lost(COARSE)),
-        (16.0, started(COARSE, 2)),
-        (30.0, model(COARSE)),
-    )
-    (cost,) = fault_costs(records, [fault(3.0, Kind.HANG)])
-    assert cost.recovery == 13.0
+    assert cost.allowed == pytest.approx(sum(LIMITS[one.kind].costs for one in cost.faults))
 
 
 def test_a_bad_node_costs_each_attempt_that_fails_there() -> None:
@@ -140,27 +132,23 @@ def test_a_bad_node_costs_each_attempt_that_fails_there() -> None:
         (6.0, failed),
         (8.0, started(COARSE, 2)),
         (20.0, model(COARSE)),
-        (22.0, started(TaskId.block(0))),
-        (23.0, TaskFailed(TaskId.block(0), 1, "Input/output error", final=False)),
-        (24.0, started(TaskId.block(1))),
-        (50.0, model(TaskId.block(1))),
+        (22.0, started(ZERO)),
+        (23.0, TaskFailed(ZERO, 1, "Input/output error", final=False)),
+        (24.0, started(ONE)),
+        (50.0, model(ONE)),
     )
     (cost,) = fault_costs(records, [fault(2.0, Kind.BADNODE)])
-    assert cost.tasks == (COARSE, TaskId.block(0))
+    assert cost.tasks == (COARSE, ZERO)
     assert (cost.redone, cost.recovery) == (2.0 + 1.0, 2.0 + 1.0)
 
 
-def test_a_full_disk_costs_the_silence_of_the_run() -> None:
+def test_a_full_disk_and_a_clock_that_jumps_cost_the_silence_around_them() -> None:
     records = history((0.0, BEGAN), (1.0, started(COARSE)), (3.0, saved(COARSE)), (9.5, saved(COARSE)))
-    (cost,) = fault_costs(records, [fault(4.0, Kind.ENOSPC, until=8.0)])
-    assert (cost.tasks, cost.seconds) == ((), 5.5)
-    assert cost.allowed == LIMITS[Kind.ENOSPC].costs + 4.0
-
-
-def test_a_clock_that_jumps_costs_the_silence_around_it() -> None:
-    records = history((0.0, BEGAN), (1.0, started(COARSE)), (2.0, saved(COARSE)), (9.5, saved(COARSE)))
-    (cost,) = fault_costs(records, [fault(3.0, Kind.CLOCK)])
-    assert cost.seconds == 6.5
+    (full,) = fault_costs(records, [fault(4.0, Kind.ENOSPC, until=8.0)])
+    assert (full.tasks, full.seconds) == ((), 5.5)
+    assert full.allowed == LIMITS[Kind.ENOSPC].costs + 4.0
+    (jump,) = fault_costs(records, [fault(4.0, Kind.CLOCK)])
+    assert jump.seconds == 5.5
 
 
 def test_jumps_of_the_clock_are_taken_back() -> None:
@@ -171,15 +159,11 @@ def test_jumps_of_the_clock_are_taken_back() -> None:
     assert [stored.time for stored in true_times(records, began)] == [1001.0, 1002.0, 1003.0, 1004.0]
 
 
-def test_a_worker_without_a_task_costs_nothing() -> None:
+def test_what_had_not_begun_or_had_ended_loses_no_work() -> None:
     records = history((0.0, BEGAN), (1.0, started(COARSE)), (9.0, model(COARSE)))
     (cost,) = fault_costs(records, [fault(3.0, Kind.WORKER)])
     assert (cost.tasks, cost.seconds) == ((), 0.0)
-
-
-def test_a_task_that_had_not_begun_loses_no_work() -> None:
-    failed = lost(COARSE)
-    records = history((3.0, BEGAN), (4.0, failed), (6.0, started(COARSE, 2)), (9.0, model(COARSE)))
+    records = history((3.0, BEGAN), (4.0, lost(COARSE)), (6.0, started(COARSE, 2)), (9.0, model(COARSE)))
     (cost,) = fault_costs(records, [fault(2.0, Kind.RAYLET)])
     assert (cost.tasks, cost.redone, cost.recovery) == ((COARSE,), 0.0, 4.0)
 
