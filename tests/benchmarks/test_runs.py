@@ -17,19 +17,6 @@ from panolog.workers.tasks import COARSE, TaskId
 from tests.benchmarks.histories import history, model, started
 
 
-def test_the_preflight_is_no_stage_of_it() -> None:
-    records = history(
-        (100.0, RunBegan("host", 1, resumed=False)),
-        (101.0, Preparing("calibrating")),
-        (109.0, Noticed(Part.PREFLIGHT, "it fits")),
-        (109.0, PreflightSaved("preflight.json", {})),
-        (110.0, Preparing("starting workers")),
-        (112.0, started(COARSE)),
-        (120.0, model(COARSE)),
-    )
-    assert stage_seconds(records) == {"coarse": 10}
-
-
 def test_the_start_of_workers_may_count_or_not() -> None:
     records = history(
         (100.0, RunBegan("host", 1, resumed=False)),
@@ -46,7 +33,11 @@ def test_the_start_of_workers_may_count_or_not() -> None:
 
 def test_the_stages_add_up_to_the_run() -> None:
     records = history(
-        (100.0, RunBegan("host", 1, resumed=False)),
+        (80.0, RunBegan("host", 1, resumed=False)),
+        (81.0, Preparing("calibrating")),
+        (89.0, Noticed(Part.PREFLIGHT, "it fits")),
+        (89.0, PreflightSaved("preflight.json", {})),
+        (100.0, Preparing("starting workers")),
         (103.0, started(COARSE)),
         (110.0, model(COARSE)),
         (112.0, ScoresSaved(TaskId.shard(0), "000.npz", 4)),

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from benchmarks.rasterizer.cases import CaseSpec, street_case
-from benchmarks.rasterizer.iteration import Times, TrainingStep, measure, stages
+from benchmarks.rasterizer.iteration import TrainingStep, measure, stages
 from panolog.renderer import ops
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.cuda.stubbed import stubbed
@@ -38,18 +38,7 @@ def test_an_iteration_on_a_card_leaves_the_model_too(block: str | None) -> None:
 
 
 def test_parts_are_those_of_the_iteration() -> None:
-    times = measure(street_case(200, 64), threads=1, repeats=1)
-    assert all(milliseconds > 0 for milliseconds in vars(times).values())
-    assert ops.threads() == 1
-
-
-def test_the_share_of_rasterization_is_one_of_the_parts() -> None:
-    times = Times(forward=30, loss=10, backward=50, adam=10, iteration=120)
-    assert times.rasterization == 80
-    assert times.share == pytest.approx(0.8)
-
-
-def test_stages_are_within_forward_and_backward() -> None:
     case = street_case(200, 64)
-    spent = stages(case, threads=1, repeats=1)
-    assert all(milliseconds > 0 for milliseconds in vars(spent).values())
+    times, spent = (work(case, threads=1, repeats=1) for work in (measure, stages))
+    assert all(milliseconds > 0 for each in (times, spent) for milliseconds in vars(each).values())
+    assert ops.threads() == 1

@@ -7,33 +7,21 @@ import pytest
 from benchmarks.rasterizer import rows as module
 from benchmarks.rasterizer.__main__ import parse, specs
 from benchmarks.rasterizer.cases import CaseSpec
-from benchmarks.rasterizer.rows import TIMES, Row, benchmark, tables
+from benchmarks.rasterizer.rows import TIMES, benchmark, tables
 
 
-@pytest.fixture
-def rows(monkeypatch: pytest.MonkeyPatch) -> list[Row]:
+def test_one_row_for_each_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "probe", lambda *_: 2000)  # a process takes seconds
-    return list(benchmark([CaseSpec(64, 200)], "cpu", [1, 2], repeats=1))
-
-
-def test_one_row_for_each_number_of_threads(rows: list[Row]) -> None:
+    rows = list(benchmark([CaseSpec(64, 200)], "cpu", [1, 2], repeats=1))
     assert [row.on for row in rows] == ["1 thread", "2 threads"]
     assert rows[0].memory == 2000 + 3 * 236 * 200 + 3 * 64 * 32
-    assert rows[1].speed_up == pytest.approx(rows[0].times.iteration / rows[1].times.iteration)
-
-
-def test_the_speed_up_is_in_the_rows_on_more_threads(rows: list[Row]) -> None:
-    one, two = tables(rows).splitlines()[2:4]
     gain = rows[0].times.iteration / rows[1].times.iteration
+    assert rows[1].speed_up == pytest.approx(gain)
+    one, two = tables(rows).splitlines()[2:4]
     column = [name for name, _ in TIMES].index("speed-up") + 1
     assert one.split("|")[column].strip() == "–"
     assert float(two.split("|")[column]) == pytest.approx(gain, rel=1e-2)
-
-
-def test_rows_are_json(rows: list[Row]) -> None:
-    content = json.loads(json.dumps(rows[0].content()))
-    assert content["times"]["forward"] > 0
-    assert content["shares"] == {"rasterization": rows[0].times.share}
+    assert json.loads(json.dumps(rows[0].content()))["shares"] == {"rasterization": rows[0].times.share}
 
 
 def test_the_command_line_requests_streets_a_model_or_both(capsys: pytest.CaptureFixture[str]) -> None:

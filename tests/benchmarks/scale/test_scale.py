@@ -2,21 +2,18 @@
 
 import re
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.scale import page as text
-from benchmarks.scale.__main__ import measure
 from benchmarks.scale.laws import laws, pictures, shown
 from benchmarks.scale.machines import MACHINES, law, seconds, spread
 from benchmarks.scale.models import exponent
 from benchmarks.scale.page import page
 from benchmarks.scale.places import city
 from panolog.orchestrator.estimates.calibration import Basis
-from panolog.scene.errors import ConfigError
 from tests.deploy.files import ROOT
 from tests.orchestrator.calibrated import calibrated
 
@@ -73,11 +70,6 @@ def test_an_iteration_on_a_card_follows_its_bandwidth() -> None:
     titan = replace(MACHINES[0].card, bandwidth=672.0)
     assert seconds(2e6, 1e6, titan) == pytest.approx((2 * each + pixel) / 1e3)
     assert seconds(2e6, 1e6, replace(titan, bandwidth=1344.0)) == pytest.approx((2 * each + pixel) / 2e3)
-
-
-def test_an_unknown_part_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="the parts are cities, laws, driver, dashboard, merge"):
-        measure(tmp_path, ["speed"], None, quick=True)
 
 
 def test_the_kept_page_has_the_present_text() -> None:
