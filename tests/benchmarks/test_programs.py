@@ -34,6 +34,11 @@ def contention(found: Found) -> None:
     assert all(rate > 0 for phase in found["phases"] for rate in phase["rates"])
 
 
+def cuda_resources(found: Found) -> None:
+    names = {kernel["name"] for kernel in found["kernels"]}
+    assert {"project_forward", "composite_backward", "loss_gradient", "adam_step"} <= names
+
+
 def dashboard(found: Found) -> None:
     measured = found["report"]
     assert min(measured["warm"], *measured["alone"], *measured["among"]) > 0
@@ -92,6 +97,7 @@ PROGRAMS: list[tuple[Callable[[Found], None], str, tuple[str, ...]]] = [
     (chaos, "chaos", ("--runs", "1", "--seed", "4", "--faults", "driver,eio")),
     (notices, "chaos.notices", ("--runs", "1", "--seconds", "120", "--nodes", "3")),
     (contention, "contention", ("--quick",)),
+    (cuda_resources, "cuda_resources", ("--arch", "sm_89")),
     (dashboard, "dashboard", ("--quick",)),
     (driver_scale, "driver_scale", ("--quick", "--folder", "{folder}")),
     (merge_scale, "merge_scale", ("--quick", "--folder", "{folder}")),

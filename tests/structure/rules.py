@@ -127,6 +127,21 @@ def import_circles() -> Iterator[str]:
             yield " <-> ".join(sorted(circle | {name}))
 
 
+def tests_of_benchmarks() -> Iterator[str]:
+    """Tests outside of tests/benchmarks that import benchmarks: what both need belongs to tests/."""
+    for file in tracked():
+        if file.suffix == ".py" and file.parts[0] == "tests" and file.parts[1] != "benchmarks":
+            for node in ast.walk(ast.parse(text(file))):
+                if isinstance(node, ast.Import):
+                    names = [alias.name for alias in node.names]
+                elif isinstance(node, ast.ImportFrom):
+                    names = [node.module or ""]
+                else:
+                    continue
+                if any(name.partition(".")[0] == "benchmarks" for name in names):
+                    yield f"{file}:{node.lineno}: imports benchmarks"
+
+
 def dialect() -> Iterator[str]:
     """Words of private style where plain technical English has its own, outside of `ALLOWED_WORDS`."""
     for file in tracked():
@@ -150,5 +165,6 @@ RULES: tuple[Callable[[], Iterator[str]], ...] = (
     long_functions,
     small_modules,
     import_circles,
+    tests_of_benchmarks,
     dialect,
 )

@@ -1,12 +1,11 @@
 """What the CUDA kernels take of a card, on every supported architecture: compiled by NVRTC."""
 
-import json
 import re
 
 import pytest
 
-from benchmarks.cuda_resources import ARCHITECTURES, Kernel, compiled, main, measure
 from panolog.renderer.cuda import nvrtc
+from tests.renderer.cuda.resources import ARCHITECTURES, Kernel, compiled, measure
 
 pytestmark = pytest.mark.system
 
@@ -119,12 +118,3 @@ def test_forward_and_backward_count_the_same_pairs(arch: str, kernels: str, leas
     # the image of a splat; what it is compared with is exact
     image = [left for left, _, _ in (each.partition(" against ") for each in forward) if "cvt.rni" in left]
     assert not any("loose" in each for each in (*counting, *image))
-
-
-def test_the_command_prints_each_kernel(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--arch", ARCH]) == 0
-    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
-    assert {row.split()[1] for row in rows[1:]} == REGISTERS.keys()
-    assert main(["--arch", ARCH, "--json"]) == 0
-    assert {kernel["name"] for kernel in json.loads(capsys.readouterr().out)["kernels"]} == REGISTERS.keys()
-    assert main(["--arch", "sm_999"]) == 2
