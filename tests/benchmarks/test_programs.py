@@ -12,7 +12,7 @@ import pytest
 from benchmarks.three_days.faults import Fault
 from tests.deploy.files import ROOT
 
-pytestmark = pytest.mark.nightly
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]  # the longest takes four minutes alone
 Found = dict[str, Any]
 
 

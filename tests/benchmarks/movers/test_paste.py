@@ -59,7 +59,7 @@ def test_some_panoramas_with_figures_follow_each_other() -> None:
     assert all(group == list(train[train.index(group[0]) :][: len(group)]) for group in groups)
 
 
-@pytest.mark.system
+@pytest.mark.nightly
 def test_the_program_measures_what_they_cost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_scene(tmp_path / "scene", names=[f"{i:02d}.jpg" for i in range(12)], points=500)
     options = ["--train", "--width", "64", "--iterations", "20", "--seeds", "0,1"]
