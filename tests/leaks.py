@@ -28,6 +28,7 @@ _MINE = "PANOLOG_TESTS"  # in the environment of all processes that this one has
 # Helpers of Python itself; they end with this process.
 _SERVERS = ("multiprocessing.forkserver", "multiprocessing.resource_tracker")
 _POOLS = ("fsspecIO", "asyncio_", "AnyIO worker thread", "ray_", "tqdm")  # threads of libraries
+_OF_A_FILE = ("dashboard_",)  # threads that a server of a whole file starts when it is used
 _CACHES = ("pymp-", "torchinductor_", ".ses")  # files of Python, torch and ONNX Runtime
 
 Found = dict[str, int]  # description -> the process, or 0
@@ -127,9 +128,7 @@ def _left(before: _Held) -> Found:
     for pid in _children(before.processes):
         if pid not in before.processes and not (_parent(pid) == os.getpid() and _is_server(pid)):
             found[f"process {pid}: {_command(pid)}"] = pid
-    for thread in threading.enumerate():
-        if thread.ident not in before.threads and not thread.name.startswith(_POOLS):
-            found[f"thread {thread.name}"] = 0
+    found |= _threads(before, but=_POOLS + _OF_A_FILE)
     if new := _sockets() - before.sockets:
         found |= {f"listening socket {where}": 0 for inode, where in _listening() if inode in new}
     return found | {f"temporary file {name}": 0 for name in _entries() - before.entries}
@@ -137,7 +136,7 @@ def _left(before: _Held) -> Found:
 
 def _left_of_a_file(before: _Held) -> Found:
     """Orphans that this process has started, with their test, and shared memory that no other process has."""
-    found: Found = {}
+    found = _threads(before, but=_POOLS)
     known = before.processes | set(_children()) | {os.getpid()}
     mark = f"{_MINE}={os.getpid()}".encode()
     for pid in _numbers(_PROC):
@@ -152,6 +151,12 @@ def _left_of_a_file(before: _Held) -> Found:
             if not any(name.encode() in content for content in maps):
                 found[f"shared memory {name}"] = 0
     return found
+
+
+def _threads(before: _Held, but: tuple[str, ...]) -> Found:
+    """Threads that did not exist before. Args: but, the beginnings of names that do not count."""
+    new = (it for it in threading.enumerate() if it.ident not in before.threads)
+    return {f"thread {it.name}": 0 for it in new if not it.name.startswith(but)}
 
 
 def _end(found: Found) -> None:
@@ -228,7 +233,8 @@ def _memory() -> set[str]:
     found = set()
     for name in _names(_MEMORY):
         with suppress(OSError):
-            if (_MEMORY / name).lstat().st_uid == os.getuid():
+            temporary = name.startswith("sem.mp-")  # of multiprocessing, which removes it at once
+            if not temporary and (_MEMORY / name).lstat().st_uid == os.getuid():
                 found.add(name)
     return found
 

@@ -115,6 +115,10 @@ class RunRegistry:
         """Does work that reads files, in a thread."""
         return await asyncio.get_running_loop().run_in_executor(self._pool, work, *arguments)
 
+    def end(self) -> None:
+        """Ends the threads when they have done what they are at; `call` is not possible any more."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
     def close(self) -> None:
         """Wakes all clients for the last time."""
         for topic in (self.list, *(topic for _, topic in self._topics.values())):

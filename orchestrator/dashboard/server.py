@@ -49,6 +49,7 @@ def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
         await compression
         registry.close()
         pages.close()
+        registry.end()
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
     app.state.registry, app.state.pages = registry, pages

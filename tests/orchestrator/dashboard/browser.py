@@ -5,15 +5,18 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
 PHONE, DESK = 390, 1440  # pixels
-expect.set_options(timeout=30_000)  # ms: Playwright's 5 s are too few on a loaded machine
+PATIENCE_MS = 120_000  # for what a machine under load does at last
+expect.set_options(timeout=PATIENCE_MS)
 # What a browser reports of itself, whatever the page does: a screenshot has to wait for a software GPU.
 _NOISE = re.compile("GPU stall due to ReadPixels")
+# What a page without its server reports.
+AWAY = re.compile("ERR_(CONNECTION_REFUSED|CONNECTION_RESET|INCOMPLETE_CHUNKED|EMPTY_RESPONSE)")
 
 # What a finger would miss: under 24 pixels in a direction (WCAG 2.5.8).
 SMALL = """() => [...document.querySelectorAll("a, button, input, select, summary")].filter((node) => {
@@ -27,13 +30,16 @@ KEYBOARD = Path(__file__).with_name("keyboard.js").read_text()
 def chromium(
     flags: Sequence[str] = (), environment: dict[str, str | float | bool] | None = None
 ) -> Iterator[Browser]:
-    """The browser of the machine while the context lasts; skips the test where there is none."""
+    """The browser of the machine while the context lasts; skips the test where there is none.
+
+    Until it ends, asyncio.run is not possible in this thread.
+    """
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("no chromium here")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
-            executable_path=path, args=["--no-sandbox", *flags], env=environment
+            executable_path=path, args=["--no-sandbox", *flags], env=environment, timeout=PATIENCE_MS
         )
         try:
             yield browser
@@ -47,12 +53,13 @@ def opened(
     url: str,
     *,
     width: int = DESK,
-    theme: Literal["light", "dark"] = "light",
-    tolerate: Callable[[str], bool] = lambda _: False,
+    height: int = 900,
+    tolerate: Callable[[str], object] = lambda _: False,
 ) -> Iterator[Page]:
     """A page in a window of its own. At the end nothing may have gone wrong but what is tolerated."""
-    size: Any = {"width": width, "height": 844 if width == PHONE else 900}
-    context = browser.new_context(viewport=size, color_scheme=theme, has_touch=width == PHONE)
+    size: Any = {"width": width, "height": 844 if width == PHONE else height}
+    context = browser.new_context(viewport=size, color_scheme="light", has_touch=width == PHONE)
+    context.set_default_timeout(PATIENCE_MS)
     page, wrong = context.new_page(), []
 
     def record(message: ConsoleMessage) -> None:
@@ -67,3 +74,13 @@ def opened(
         assert [text for text in wrong if not tolerate(text)] == []
     finally:
         context.close()
+
+
+def unreachable(page: Page) -> list[str]:
+    """What the Tab key does not reach, or reaches without showing it."""
+    wanted, seen = set(page.evaluate(KEYBOARD)["reachable"]), {}
+    for _ in range(2 * len(wanted)):
+        page.keyboard.press("Tab")
+        now = page.evaluate(KEYBOARD)
+        seen[now["focused"]] = now["seen"]
+    return [name for name in wanted if not seen.get(name)]

@@ -35,6 +35,7 @@ from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 
+PATIENCE_S = 120.0  # for what a machine under load does at last
 POST = {"X-PanoLOG": "1", "Content-Type": "application/json"}
 EVIL = '<script>alert("x")</script>&\'"'
 
@@ -142,18 +143,18 @@ def serving(
     thread.start()
     url = f"http://127.0.0.1:{listener.getsockname()[1]}"
     try:
-        with httpx.Client(base_url=url, timeout=20) as client:
+        with httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
             yield Served(url, client)
     finally:
         running.should_exit = True
-        thread.join(10)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
 
 @contextmanager
 def streaming(served: Served, query: str = "") -> Iterator[Iterator[tuple[str, Any]]]:
     """The messages of a stream as (event, content); pings are left out."""
-    with served.client.stream("GET", f"/api/stream{query}", timeout=15) as answer:
+    with served.client.stream("GET", f"/api/stream{query}") as answer:
         assert answer.status_code == 200
 
         def messages() -> Iterator[tuple[str, Any]]:
@@ -170,7 +171,7 @@ def streaming(served: Served, query: str = "") -> Iterator[Iterator[tuple[str, A
 def raw(url: str, request: bytes) -> bytes:
     """What comes back for bytes that no client library would send."""
     host, _, port = url.removeprefix("http://").partition(":")
-    with socket.create_connection((host, int(port)), timeout=10) as connection:
+    with socket.create_connection((host, int(port)), timeout=PATIENCE_S) as connection:
         connection.sendall(request)
         answer = b""
         while part := connection.recv(65_536):
