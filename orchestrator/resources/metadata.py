@@ -12,7 +12,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from email.utils import parsedate_to_datetime
@@ -60,25 +60,20 @@ class Service:
 
     def request(self, path: str, headers: Mapping[str, str], method: str = "GET") -> Answer:
         """What it answers. Raises NoAnswerError if that takes too long or is too large."""
-        connection = HTTPConnection(self._host, self._port, timeout=TIMEOUT_S)
-        late = Event()
-        timer = Timer(TIMEOUT_S, _cut, (connection, late))  # a socket's timeout is of each read
         try:
-            connection.connect()
-            timer.start()
-            connection.request(method, path, headers=dict(headers))
-            response = connection.getresponse()
-            body = response.read(_LIMIT + 1)
-            if len(body) > _LIMIT:
-                raise NoAnswerError(f"{path}: more than {_LIMIT} bytes")
-            if response.length or late.is_set():
-                raise NoAnswerError(f"{path}: it ends after {len(body)} bytes")
-            return Answer(response.status, body.decode(), dict(response.getheaders()))
+            with closing(HTTPConnection(self._host, self._port, timeout=TIMEOUT_S)) as connection:
+                connection.connect()
+                with _cut_when_late(connection.sock) as late:
+                    connection.request(method, path, headers=dict(headers))
+                    response = connection.getresponse()
+                    body = response.read(_LIMIT + 1)
+                if len(body) > _LIMIT:
+                    raise NoAnswerError(f"{path}: more than {_LIMIT} bytes")
+                if response.length or late.is_set():
+                    raise NoAnswerError(f"{path}: it ends after {len(body)} bytes")
+                return Answer(response.status, body.decode(), dict(response.getheaders()))
         except (OSError, HTTPException, UnicodeDecodeError) as error:
             raise NoAnswerError(f"{path}: {error}") from error
-        finally:
-            timer.cancel()
-            connection.close()
 
     def text(self, path: str, headers: Mapping[str, str]) -> str | None:
         """The body of an answer; None if there is no such value. Raises NoAnswerError for all others."""
@@ -88,10 +83,25 @@ class Service:
         return answer.body.strip() if answer.status == 200 else None
 
 
-def _cut(connection: HTTPConnection, late: Event) -> None:
-    late.set()
-    with suppress(OSError, AttributeError):  # it has just been closed
-        connection.sock.shutdown(socket.SHUT_RDWR)
+@contextmanager
+def _cut_when_late(connected: socket.socket) -> Iterator[Event]:
+    """Shuts a socket down after TIMEOUT_S, which is said by the event: its own timeout is of each read.
+
+    A connection forgets its socket once an answer of HTTP/1.0 has begun, so it cannot be cut through that.
+    """
+    late = Event()
+
+    def cut() -> None:
+        late.set()
+        with suppress(OSError):  # it has just been closed
+            connected.shutdown(socket.SHUT_RDWR)
+
+    timer = Timer(TIMEOUT_S, cut)
+    timer.start()
+    try:
+        yield late
+    finally:
+        timer.cancel()
 
 
 class Provider(Protocol):
