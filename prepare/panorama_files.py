@@ -1,6 +1,6 @@
 """The panoramas of an unfinished scene: files of images and layers, before it can be read as a scene."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,10 +120,11 @@ def _filled(pixels: NDArray[np.uint8], used: NDArray[np.bool_]) -> NDArray[np.ui
     return filled
 
 
-def prefetch(function: Callable[[In], Out], items: Iterable[In]) -> Iterator[tuple[In, Out]]:
+def prefetch(function: Callable[[In], Out], items: Iterable[In]) -> Generator[tuple[In, Out], None, None]:
     """Each item with `function` of it; meanwhile `function` of the next item runs in a thread.
 
-    Raises the exceptions of `function`, when the item is yielded.
+    Its thread ends with the last item, or when the generator is closed. Raises the exceptions of `function`,
+    when the item is yielded.
     """
     with ThreadPoolExecutor(1, "prefetch") as pool:
         waiting = None

@@ -8,6 +8,7 @@ user is lost.
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -97,10 +98,10 @@ def _some(
 ) -> Iterator[NDArray[np.uint8]]:
     """MOST panoramas or fewer, evenly chosen and decoded by `load`."""
     chosen = [pictures[i] for i in np.linspace(0, len(pictures) - 1, min(MOST, len(pictures))).astype(int)]
-    loaded = prefetch(load, chosen)
-    for done, (_, image) in enumerate(loaded, 1):
-        yield image
-        progress(done, len(chosen))
+    with closing(prefetch(load, chosen)) as loaded:
+        for done, (_, image) in enumerate(loaded, 1):
+            yield image
+            progress(done, len(chosen))
 
 
 def make_masks(
