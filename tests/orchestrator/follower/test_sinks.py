@@ -1,15 +1,12 @@
 """What sinks have in the end is what run.db has, however often the follower and the run were killed.
 
-MLflow's part needs its server, from the package `mlflow`: PANOLOG_TEST_MLFLOW names that program, which may
-be in another environment. Its client is in `mlflow-skinny`.
+The packages `wandb` and `mlflow`, which has the server, are installed by `make nightly`.
 """
 
 import json
 import os
 import socket
 import subprocess
-import time
-import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +25,7 @@ from panolog.orchestrator.run.records import Outcome
 from tests.orchestrator.fakes import SetClock
 from tests.orchestrator.follower import histories
 from tests.orchestrator.follower.histories import Curves, expected
+from tests.ray_head import BIN, read, wait_until
 
 Make = Callable[[], Sink]
 
@@ -206,10 +204,11 @@ def wandb_records(path: Path) -> Iterator[bytes]:
             yield whole
 
 
+@pytest.mark.nightly
 @pytest.mark.system
 def test_wandb_keeps_the_curves_of_the_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its client, which writes to the disk without a server."""
-    module, reason = "wandb.proto.wandb_internal_pb2", "the package wandb is not installed"
+    module, reason = "wandb.proto.wandb_internal_pb2", "the package wandb is not installed: make nightly"
     messages = pytest.importorskip(module, reason=reason)
     from panolog.orchestrator.follower.sinks.wandb_sink import WandbSink  # noqa: PLC0415
 
@@ -233,10 +232,9 @@ def test_wandb_keeps_the_curves_of_the_database(tmp_path: Path, monkeypatch: pyt
 @pytest.fixture(scope="module")
 def mlflow_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A server of MLflow on this machine, with its own store."""
-    pytest.importorskip("mlflow", reason="the package mlflow-skinny is not installed")
-    program = os.environ.get("PANOLOG_TEST_MLFLOW")
-    if program is None:
-        pytest.skip("PANOLOG_TEST_MLFLOW does not name the program `mlflow`")
+    program = BIN / "mlflow"
+    if not program.exists():
+        pytest.skip("the package mlflow is not installed: make nightly")
     folder = tmp_path_factory.mktemp("mlflow")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -245,20 +243,14 @@ def mlflow_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     command = [program, "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1", *store]
     with (folder / "log").open("wb") as log:
         server = subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, start_new_session=True)
-    url, last = f"http://127.0.0.1:{port}", time.monotonic() + 120
-    while time.monotonic() < last:
-        try:
-            urllib.request.urlopen(f"{url}/health", timeout=5).close()
-            break
-        except OSError:
-            if server.poll() is not None:
-                pytest.skip("the program `mlflow` has no server: the package mlflow is needed")
-            time.sleep(0.5)
+    url = f"http://127.0.0.1:{port}"
+    wait_until(lambda: read(f"{url}/health"), "the server of MLflow", 300)
     yield url
     os.killpg(server.pid, 15)
     server.wait(30)
 
 
+@pytest.mark.nightly
 @pytest.mark.system
 def test_mlflow_has_the_curves_of_the_database(mlflow_server: str, tmp_path: Path) -> None:
     from mlflow.tracking import MlflowClient  # noqa: PLC0415
