@@ -54,7 +54,7 @@ nightly: $(READY) $(PEERS)  ## run the heavy tests that `make test` leaves out (
 	@$(PIP) --group nightly
 	$(PYTEST) -m nightly $(OPTIONS) $(FILES)
 
-stress: $(READY)  ## run the tests beside load, in random order and on one core (FILES=... some of them)
+stress: $(READY)  ## run the tests under load, in random order and on one core (FILES=... some of them)
 	$(BIN)/python -m tests.stress $(OPTIONS) $(FILES)
 
 lint: $(READY) $(TSC)  ## check style, types of Python and of the scripts, and the direction of imports

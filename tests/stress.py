@@ -1,4 +1,4 @@
-"""`make stress`: the suite beside load, in random order and on one core, and what has failed at least once.
+"""`make stress`: the suite under load, in random order and on one core, and what has failed at least once.
 
     python -m tests.stress [--variants load,random,core] [--rounds N] [--log FILE] [FILE ...]
 

@@ -152,8 +152,8 @@ def test_where_a_side_has_no_cameras_or_was_not_trained_there_is_no_seam(walk: C
     trained, untrained = (walk(Grid((2, 1, 1)), seen=seen, cameras=4) for seen in (1, 0))
     assert trained.trained.all() and len(seams_of(trained)) == 1
     assert not untrained.trained.any() and seams_of(untrained) == ()
-    beside = walk(Grid((1, 2, 1)))  # all cameras are on one side
-    assert planes_between(beside.grid) and seams_of(beside) == ()
+    one_sided = walk(Grid((1, 2, 1)))  # all cameras are on one side
+    assert planes_between(one_sided.grid) and seams_of(one_sided) == ()
 
 
 def places(seed: int = 0) -> NDArray[np.float64]:

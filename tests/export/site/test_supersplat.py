@@ -56,7 +56,7 @@ def center(image: NDArray[np.float64], channel: int) -> tuple[float, float]:
 
 def test_it_shows_a_site_upright_at_its_start(tmp_path: Path) -> None:
     shutil.copytree(peer("@playcanvas/supersplat-viewer") / "public", tmp_path / "viewer")
-    (tmp_path / "viewer" / "favicon.ico").touch()  # which a browser asks for
+    (tmp_path / "viewer" / "favicon.ico").touch()  # which a browser requests
     site(tmp_path / "viewer" / "site")
     address = "index.html?content=site/model.sog&settings=site/settings.json&noanim&noui"
     shown = "window.firstFrame = () => { window.shown = true; }"

@@ -1,4 +1,4 @@
-"""`panolog notify test`; what `run` refuses before it begins, and which secrets nobody inherits from it."""
+"""`panolog notify test`; what `run` refuses before it begins, and that no process inherits its secrets."""
 
 import os
 from pathlib import Path

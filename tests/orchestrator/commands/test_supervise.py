@@ -151,7 +151,10 @@ def test_the_head_of_the_cluster_gets_time_to_come_back(
 ) -> None:
     monkeypatch.setattr(supervise, "_HEAD_POLL_S", 0.01)
     with closing(socket.socket()) as head, closing(socket.socket()) as gone:
-        for bound in (head, gone):  # nobody else has their ports, and who does not listen does not answer
+        for bound in (
+            head,
+            gone,
+        ):  # no other program has their ports, and they do not answer before they listen
             bound.bind(("127.0.0.1", 0))
         address, other = (f"127.0.0.1:{bound.getsockname()[1]}" for bound in (head, gone))
         script.when_said = lambda line: head.listen() if address in line else None

@@ -48,7 +48,7 @@ def follower_of(parent: int) -> psutil.Process:
 
 
 def gone(process: psutil.Process) -> bool:
-    """Whether it has ended, also where nobody has taken note of it yet."""
+    """Whether it has ended, also where its parent has not reaped it yet."""
     return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
 
 
