@@ -90,6 +90,6 @@ def test_the_launcher_itself_reads_its_task(program: str, file: str, found: str,
     python = ROOT / "build" / "peers" / "bin" / "python"
     if not python.exists():
         pytest.skip("skypilot and dstack are not installed: make nightly")
-    command, home = [python, "-c", program, DEPLOY / file], os.environ | {"HOME": str(tmp_path)}
+    command, home = [str(python), "-c", program, str(DEPLOY / file)], os.environ | {"HOME": str(tmp_path)}
     ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300, env=home)
     assert ended.stdout.split() == found.split(), ended.stderr

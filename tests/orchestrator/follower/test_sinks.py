@@ -240,7 +240,7 @@ def mlflow_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     store = ["--backend-store-uri", f"sqlite:///{folder}/store.db", "--artifacts-destination", str(folder)]
-    command = [program, "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1", *store]
+    command = [str(program), "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1", *store]
     with (folder / "log").open("wb") as log:
         server = subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, start_new_session=True)
     url = f"http://127.0.0.1:{port}"
