@@ -6,6 +6,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from starlette.testclient import TestClient
 
 from panolog.orchestrator.commands.companion import companion_dashboard
 from panolog.orchestrator.dashboard import discovery, server
@@ -52,9 +53,12 @@ def test_nothing_is_read_before_a_client_comes(tmp_path: Path) -> None:
     """A dashboard of many runs shows their names first."""
     for number in range(3):
         write_run(tmp_path / str(number))
-    registry = server.make_app(tmp_path, Access(None, 1)).state.registry
+    app = server.make_app(tmp_path, Access(None, 1))
+    registry = app.state.registry
     registry._search()
     assert {watch.snapshot.row.status for watch in registry._watches.values()} == {"unread"}
+    with TestClient(app):
+        pass  # its end removes its folder
 
 
 def test_a_port_that_is_taken(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import psutil
 import pytest
 from playwright.sync_api import expect
 
@@ -138,7 +139,10 @@ def test_a_run_without_its_scene_can_be_resumed_only_if_it_makes_it(
     assert served.client.post(path, json={"action": "resume"}, headers=POST).status_code == 409
     (folder.root / "away.json").rename(settings_path(folder))
     append(folder, RunBegan(os.uname().nodename, 1, resumed=True), RunEnded(Outcome.INTERRUPTED))
+    before = psutil.Process().children()
     assert served.client.post(path, json={"action": "resume"}, headers=POST).status_code == 202
+    started = [it for it in psutil.Process().children() if it not in before]
+    assert psutil.wait_procs(started, timeout=120)[1] == []
 
 
 @pytest.mark.system
