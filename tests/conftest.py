@@ -67,12 +67,23 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
         for file, duration in sorted(seconds.items(), key=lambda item: -item[1])[:_SHOWN]:
             terminalreporter.write_line(f"{duration:7.1f} s  {file}")
     if config.getoption("--write-durations"):
-        recorded = json.loads(_DURATIONS.read_text()) | {file: round(s, 1) for file, s in seconds.items()}
-        kept = {
-            file: s for file, s in recorded.items() if s >= _LONG_S and Path(config.rootpath, file).exists()
-        }
-        ordered = dict(sorted(kept.items(), key=lambda item: -item[1]))
-        _DURATIONS.write_text(json.dumps(ordered, indent=2) + "\n")
+        _record(terminalreporter, seconds)
+
+
+def _record(terminalreporter: pytest.TerminalReporter, seconds: dict[str, float]) -> None:
+    """Writes how long files took that take long or have tests of a system, in place of what was recorded."""
+    reports = [report for reports in terminalreporter.stats.values() for report in reports]
+    system = {
+        _file(report.nodeid)
+        for report in reports
+        if isinstance(report, pytest.TestReport) and "system" in report.keywords
+    }
+    recorded = {}
+    for file, took in sorted(seconds.items(), key=lambda item: -item[1]):
+        if took >= _LONG_S or file in system:
+            tenths = round(10 * took)
+            recorded[file] = (tenths + (tenths % 10 == 0)) / 10  # a whole number would be an estimate
+    _DURATIONS.write_text(json.dumps(recorded, indent=2) + "\n")
 
 
 def _file(nodeid: str) -> str:

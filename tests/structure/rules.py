@@ -1,6 +1,7 @@
 """Each rule as a function that returns its violations, one line each."""
 
 import ast
+import json
 import re
 import subprocess
 from collections import Counter
@@ -142,6 +143,35 @@ def tests_of_benchmarks() -> Iterator[str]:
                     yield f"{file}:{node.lineno}: imports benchmarks"
 
 
+def durations() -> Iterator[str]:
+    """Entries of tests/durations.json that are not recorded, and files with tests of a system without one."""
+    recorded = json.loads(text(Path("tests/durations.json")))
+    for file, seconds in recorded.items():
+        if not (ROOT / file).exists():
+            yield f"{file}: is in tests/durations.json, and there is no such file"
+        elif seconds == int(seconds):
+            yield f"{file}: {seconds} s is not recorded: make test OPTIONS=--write-durations"
+    tests = [file for file in tracked() if file.parts[0] == "tests" and file.match("test_*.py")]
+    for path in (file for file in tests if str(file) not in recorded):
+        if any("system" in marks and "nightly" not in marks for marks in _marks(path)):
+            yield f"{path}: has tests of a system, and no entry in tests/durations.json"
+
+
+def _marks(file: Path) -> Iterator[set[str]]:
+    """The markers of each test of a file; those of a parameter alone do not count."""
+    tree = ast.parse(text(file))
+    common = [
+        node.value
+        for node in tree.body
+        if isinstance(node, ast.Assign) and any(ast.unparse(it) == "pytestmark" for it in node.targets)
+    ]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+            marked = "\n".join(map(ast.unparse, [*common, *node.decorator_list]))
+            marked = re.sub(r"marks=[^,)]*", "", marked)
+            yield set(re.findall(r"pytest\.mark\.(\w+)", marked))
+
+
 def dialect() -> Iterator[str]:
     """Words of private style where plain technical English has its own, outside of `ALLOWED_WORDS`."""
     for file in tracked():
@@ -166,5 +196,6 @@ RULES: tuple[Callable[[], Iterator[str]], ...] = (
     small_modules,
     import_circles,
     tests_of_benchmarks,
+    durations,
     dialect,
 )
