@@ -66,17 +66,27 @@ def companion_follower(run: Path, plan: Plan, say: Callable[[str], None]) -> Ite
     try:
         yield
     finally:
-        if process.poll() is not None:
+        said, killed = _end(process)
+        if killed:
             process = _follower(run, plan)
-        try:
-            said, _ = process.communicate(timeout=_FOLLOWER_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            said, _ = process.communicate()
+            said, _ = _end(process)
         for line in said.splitlines()[:_LINES]:
             say(line)
         if process.returncode:
             say(f"the follower has ended early (code {process.returncode}): not all may be delivered")
+
+
+def _end(process: "subprocess.Popen[str]") -> tuple[str, bool]:
+    """Lets a follower deliver the last news. Returns its lines, and whether something else ended it before.
+
+    Its exit code is the only proof: before a killed process can be reaped, it still counts as running.
+    """
+    try:
+        said, _ = process.communicate(timeout=_FOLLOWER_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.communicate()[0], False
+    return said, process.returncode != 0
 
 
 def _follower(run: Path, plan: Plan) -> "subprocess.Popen[str]":
