@@ -8,7 +8,7 @@ from pathlib import Path
 from subprocess import DEVNULL, PIPE
 from threading import Thread
 
-from panolog.orchestrator.follower.follower import LAST_S
+from panolog.orchestrator.follower.follower import END, LAST_S
 from panolog.orchestrator.follower.plan import Plan, to_json
 
 _TIMEOUT_S = 8.0  # for the process to send its pages the last state of the run, and to end
@@ -82,6 +82,7 @@ def _end(process: "subprocess.Popen[str]") -> tuple[str, bool]:
     Its exit code is the only proof: before a killed process can be reaped, it still counts as running.
     """
     try:
+        _write(process, END)
         said, _ = process.communicate(timeout=_FOLLOWER_S)
     except subprocess.TimeoutExpired:
         process.kill()
@@ -98,8 +99,12 @@ def _follower(run: Path, plan: Plan) -> "subprocess.Popen[str]":
     process = subprocess.Popen(
         command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, text=True, start_new_session=True
     )
-    assert process.stdin is not None
-    with suppress(BrokenPipeError):  # it was killed at once
-        process.stdin.write(to_json(plan, run) + "\n")
-        process.stdin.flush()
+    _write(process, to_json(plan, run) + "\n")
     return process
+
+
+def _write(process: "subprocess.Popen[str]", line: str) -> None:
+    assert process.stdin is not None
+    with suppress(BrokenPipeError):  # it was killed
+        process.stdin.write(line)
+        process.stdin.flush()

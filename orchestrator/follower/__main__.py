@@ -1,6 +1,8 @@
-"""The process of a follower: gets its plan in the first line of stdin, and ends after stdin does.
+"""The process of a follower: gets its plan in the first line of stdin, and ends after the line END there.
 
-So that it delivers the last news, it ignores the signals that end a run. Separate: it is a program.
+The end of stdin is no sign: a process that is killed closes its pipes before its lock of the run, one by one,
+and gives its children another parent when all are closed. So that it delivers the last news, a follower
+ignores the signals that end a run. Separate: it is a program.
 """
 
 import os
@@ -9,7 +11,7 @@ import sys
 import threading
 from contextlib import suppress
 
-from panolog.orchestrator.follower.follower import Follower
+from panolog.orchestrator.follower.follower import END, Follower
 from panolog.orchestrator.follower.plan import from_json
 
 
@@ -24,8 +26,8 @@ def main() -> None:
     ended = threading.Event()
 
     def wait() -> None:
-        sys.stdin.read()
-        ended.set()
+        if sys.stdin.readline() == END:
+            ended.set()
 
     threading.Thread(target=wait, daemon=True).start()
     problems = Follower(root, parent, plan).follow(ended)

@@ -1,6 +1,6 @@
 """Workers that follow a script of a test, and a job whose drivers come and go."""
 
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from contextlib import closing
 from copy import copy
 from dataclasses import replace
@@ -26,6 +26,7 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Failure, RunBegan
 from panolog.orchestrator.run.state import OnChange, RunState, ignore, replay
 from panolog.orchestrator.run.store import Database, read_milestones, read_records
+from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import (
@@ -167,6 +168,18 @@ class FakePool(InProcess):
         yield Ended()
 
 
+class Noting(InProcess):
+    """Takes the place of a pool, and notes which files a task is given."""
+
+    def __init__(self) -> None:
+        self.scene: set[Path] = set()
+        self.run: set[Path] = set()
+
+    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
+        self.scene, self.run = set(scene), set(run)
+        return here
+
+
 def well(spec: TaskSpec) -> Iterator[Event]:
     """The events of a worker when all goes well."""
     task = spec.task
@@ -260,6 +273,17 @@ class Harness:
 
     def records(self, kind: type) -> list[Any]:
         return [s.record for s in read_records(self.folder.database) if isinstance(s.record, kind)]
+
+
+def doing(task: TaskId, action: Callable[[], object]) -> Script:
+    """All goes well, and something is done at the begin of each attempt at one task."""
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == task:
+            action()
+        yield from well(spec)
+
+    return script
 
 
 def fails(task: TaskId, failed: Failed, times: int, before: Sequence[Event] = ()) -> Script:

@@ -163,7 +163,9 @@ def test_districts_that_were_not_begun_are_missing_from_an_early_model(tmp_path:
     assert 2 < state.merged.gaussians < 202
 
 
-def test_a_limit_before_the_first_checkpoint_leaves_no_model(tmp_path: Path) -> None:
+def test_a_limit_before_the_first_checkpoint_leaves_no_model_and_one_after_the_training_ends_nothing(
+    tmp_path: Path,
+) -> None:
     harness = Limited(tmp_path, BudgetSet(max_cost=30.0, prices=PRICES))
 
     def script(spec: TaskSpec) -> Iterator[Event]:
@@ -173,12 +175,9 @@ def test_a_limit_before_the_first_checkpoint_leaves_no_model(tmp_path: Path) -> 
 
     state = harness.drive(script)
     assert (state.outcome, state.merged) == (Outcome.LIMITED, None)
-
-
-def test_what_follows_the_training_is_not_ended(tmp_path: Path) -> None:
-    harness = Limited(tmp_path, BudgetSet(max_cost=30.0, prices=PRICES))
-    state = harness.drive(slow(harness, {EVAL: 100}))
-    assert (state.outcome, harness.records(BudgetReached)) == (Outcome.DONE, [])
+    harness.begin(BudgetSet(max_cost=60.0, prices=PRICES))
+    state = harness.drive(slow(harness, {EVAL: 100}), resumed=True)
+    assert (state.outcome, len(harness.records(BudgetReached))) == (Outcome.DONE, 1)
 
 
 def test_a_driver_that_dies_after_a_limit_leaves_the_rest_to_the_next(tmp_path: Path) -> None:
@@ -198,39 +197,25 @@ def test_a_driver_that_dies_after_a_limit_leaves_the_rest_to_the_next(tmp_path: 
     assert (state.outcome, harness.tasks) == (Outcome.LIMITED, [EVAL])
 
 
-def test_what_attempts_lose_is_recorded(tmp_path: Path) -> None:
+def test_what_attempts_and_killed_drivers_lose_is_recorded(tmp_path: Path) -> None:
     harness = Limited(tmp_path, BudgetSet(prices=PRICES))
-    lost = [True]
+    ends: list[BaseException] = [SystemExit(), CrashError(DIED)]
 
     def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == COARSE and lost.pop() if lost else False:
+        if spec.task == COARSE and ends:
             harness.passes(10)
             yield Checkpoint(COARSE, 1, {"x": torch.arange(3)})
             harness.passes(4)
-            raise CrashError(DIED)
+            yield Progress(COARSE, 2, 2, 3.0)
+            raise ends.pop()
         yield from slow(harness, {EVAL: 6})(spec)
-
-    state = harness.drive(script)
-    assert [(record.task, record.seconds) for record in harness.records(WorkLost)] == [(COARSE, 4.0)]
-    assert (state.money.lost.cost, state.money.used.cost) == pytest.approx((4.0, 20.0))
-
-
-def test_what_a_killed_driver_loses_is_recorded_by_the_next(tmp_path: Path) -> None:
-    harness = Limited(tmp_path, BudgetSet(prices=PRICES))
-
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        yield Progress(spec.task, 1, 2, 3.0)
-        harness.passes(7)
-        yield Progress(spec.task, 2, 2, 3.0)
-        raise SystemExit
 
     with pytest.raises(SystemExit):
         harness.drive(script)
     harness.begin()
-    state = harness.drive(resumed=True)
-    assert [record.seconds for record in harness.records(WorkLost)] == [7.0]
-    assert state.money.lost.cost == pytest.approx(7.0)
-    assert state.money.used.cost == pytest.approx(7.0)
+    state = harness.drive(script, resumed=True)
+    assert [(record.task, record.seconds) for record in harness.records(WorkLost)] == [(COARSE, 4.0)] * 2
+    assert (state.money.lost.cost, state.money.used.cost) == pytest.approx((8.0, 34.0))
 
 
 @pytest.mark.parametrize(

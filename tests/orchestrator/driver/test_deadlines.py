@@ -144,54 +144,36 @@ def test_a_task_that_waits_for_its_place_does_not_hang(harness: Harness) -> None
     assert pool.others < 100
 
 
-def test_a_task_may_be_silent_for_ten_times_its_usual_interval(harness: Harness) -> None:
-    def slow(*last: Silence) -> Timed:
-        steps = [step for i in range(20) for step in (Silence(200), Progress(BLOCK, i, 99, 0.005))]
-        return once(BLOCK, *steps, *last, Progress(BLOCK, 20, 99, 0.005))
-
-    pool = TimedPool(slow(Silence(1990)))
-    drive(harness, pool)
-    assert not pool.cancelled
-
-
-def test_a_task_may_be_silent_for_ten_times_what_the_calibration_needed(harness: Harness) -> None:
-    """Also at the start of an attempt that follows others: it reads its model again."""
-    basis = Basis(calibrated(begin=300.0), startup=3.0)
+@pytest.mark.parametrize(("begin", "interval", "most"), [(0.5, 200.0, 2000.0), (300.0, 0.0, 3000.0)])
+def test_a_task_may_be_silent_for_ten_times_its_usual_interval_or_what_the_calibration_needed(
+    harness: Harness, begin: float, interval: float, most: float
+) -> None:
+    """The latter also at the start of an attempt that follows others: it reads its model again."""
+    basis = Basis(calibrated(begin=begin), startup=3.0)
     write_json(harness.folder.preflight, {"basis": asdict(basis)})
-    steps = [Progress(BLOCK, i, 99, 1.0) for i in range(20)]
-    pool = TimedPool(once(BLOCK, *steps, Silence(2990), Progress(BLOCK, 20, 99, 1.0), HANG))
+    steps = [step for i in range(20) for step in (Silence(interval), Progress(BLOCK, i, 99, 1.0))]
+    pool = TimedPool(once(BLOCK, *steps, Silence(most - 10), Progress(BLOCK, 20, 99, 1.0), HANG))
     drive(harness, pool)
-    assert pool.cancelled == [(BLOCK, 3005)]
+    assert pool.cancelled == [(BLOCK, most + STEP)]
 
 
-def test_a_slow_task_that_hangs_is_noticed_too(harness: Harness) -> None:
-    steps = [step for i in range(20) for step in (Silence(200), Progress(BLOCK, i, 99, 0.005))]
-    pool = TimedPool(once(BLOCK, *steps, HANG))
-    drive(harness, pool)
-    assert pool.cancelled == [(BLOCK, 2005)]
+@pytest.mark.parametrize(
+    ("events", "slow", "kind", "seconds"),
+    [
+        # the driver saves a checkpoint for an hour, or its machine is asleep, while the other block is silent
+        ([Progress(BLOCK, 1, 9, 1.0), Silence(4000)], TaskId.block(1), Checkpoint, 3600.0),
+        # a message of the other block is there, however many turns those of this one take, all short
+        ([Progress(BLOCK, i, 999, 1.0) for i in range(200)], BLOCK, object, STEP),
+    ],
+    ids=["one long turn", "many short ones"],
+)
+def test_the_time_in_which_the_driver_is_busy_does_not_count(
+    harness: Harness, events: list[Event | Silence], slow: TaskId, kind: type, seconds: float
+) -> None:
+    pool = TimedPool(once(BLOCK, *events))
 
-
-def test_the_time_in_which_the_driver_is_busy_does_not_count(harness: Harness) -> None:
-    """It saves a checkpoint for an hour, or its machine is asleep, while the other block is silent."""
-    other = TaskId.block(1)
-    pool = TimedPool(once(BLOCK, Progress(BLOCK, 1, 9, 1.0), Silence(4000)))
-
-    def sleep(task: TaskId, message: Message) -> None:
-        if task == other and isinstance(message, Checkpoint):
-            pool.now += 3600
-
-    pool.on_take = sleep
-    drive(harness, pool)
-    assert not pool.cancelled
-
-
-def test_a_task_whose_message_is_there_is_not_silent(harness: Harness) -> None:
-    """However long the driver needs for those of others, in turns that are short enough to count."""
-    other = TaskId.block(1)
-    pool = TimedPool(once(BLOCK, *(Progress(BLOCK, i, 999, 1.0) for i in range(200))))
-
-    def save(task: TaskId, _: Message) -> None:
-        pool.now += STEP if task != other else 0
+    def save(task: TaskId, message: Message) -> None:
+        pool.now += seconds if task == slow and isinstance(message, kind) else 0.0
 
     pool.on_take = save
     drive(harness, pool)

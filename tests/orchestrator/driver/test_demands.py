@@ -21,35 +21,32 @@ from tests.workers.small import WIDTH, small_scene
 GIB = 2**30
 NODE = Node("a", "host", cpus=16, memory=64 * GIB, gpus=(Gpu(memory=24 * GIB), Gpu(memory=24 * GIB)))
 HALF = Placement("a", cpus=8.0, memory=24 * GIB, gpus=1.0, gpu=0, kind="GPU")  # one of its two GPUs
-NEED = 6 * GIB
+SET = CacheConfig(memory=5.0, device=1.0)
+LEAST = CacheConfig().memory
 
 
-def test_on_the_cpu_the_settings_hold() -> None:
-    for cache in (CacheConfig(), CacheConfig(memory=7.0, device=3.0)):
-        assert image_cache(cache, Placement("a", cpus=4.0, memory=64 * GIB), NODE, NEED, 0) == cache
-
-
-def test_on_a_gpu_the_defaults_follow_free_memory() -> None:
-    found = image_cache(CacheConfig(), HALF, NODE, NEED, 0)
-    assert found.memory == 64 / 2 / 2
-    assert found.device == pytest.approx(0.9 * 24 - 6)
-    full = image_cache(CacheConfig(), HALF, NODE, 40 * GIB, 0)
-    assert full.device == 0
-
-
-def test_on_a_gpu_a_small_machine_keeps_the_least() -> None:
-    found = image_cache(CacheConfig(), HALF, replace(NODE, memory=0), NEED, 0)
-    assert found.memory == CacheConfig().memory
-
-
-def test_on_a_gpu_what_is_set_holds() -> None:
-    cache = CacheConfig(memory=5.0, device=1.0)
-    assert image_cache(cache, HALF, NODE, NEED, 0) == cache
-
-
-def test_a_shortage_leaves_nothing_on_the_gpu() -> None:
-    found = image_cache(CacheConfig(memory=8.0, device=1.0), HALF, NODE, NEED, 1)
-    assert (found.memory, found.device) == (2.0, 0.0)
+@pytest.mark.parametrize(
+    ("cache", "where", "memory", "need", "shortages", "expected"),
+    [
+        (CacheConfig(), replace(HALF, gpu=None), 64, 6, 0, (LEAST, None)),  # on the CPU the settings hold
+        (SET, replace(HALF, gpu=None), 64, 6, 0, (5.0, 1.0)),
+        (CacheConfig(), HALF, 64, 6, 0, (64 / 2 / 2, 0.9 * 24 - 6)),  # on a GPU, what is free
+        (CacheConfig(), HALF, 64, 40, 0, (64 / 2 / 2, 0.0)),
+        (CacheConfig(), HALF, 0, 6, 0, (LEAST, 0.9 * 24 - 6)),  # a small machine
+        (SET, HALF, 64, 6, 0, (5.0, 1.0)),
+        (SET, HALF, 64, 6, 1, (1.25, 0.0)),  # after a shortage nothing on the GPU
+    ],
+)
+def test_the_image_cache_is_as_set_or_what_its_place_leaves(
+    cache: CacheConfig,
+    where: Placement,
+    memory: int,
+    need: int,
+    shortages: int,
+    expected: tuple[float, float | None],
+) -> None:
+    found = image_cache(cache, where, replace(NODE, memory=memory * GIB), need * GIB, shortages)
+    assert (found.memory, found.device) == pytest.approx(expected)
 
 
 def test_shards_demand_what_their_cameras_distinguish(tmp_path: Path) -> None:

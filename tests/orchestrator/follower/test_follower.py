@@ -34,6 +34,21 @@ with companion_follower(Path(sys.argv[1]), plan, print):
     print("ready", flush=True)
     time.sleep(600)
 """
+# Its parent has closed the pipe, and has the lock of the run until it is killed.
+DYING = """
+import os, signal, subprocess, sys
+from pathlib import Path
+from panolog.orchestrator.follower.plan import read_plan, to_json
+from panolog.orchestrator.run import lock
+
+root = Path(sys.argv[1])
+plan, _ = read_plan(["webhook:env:HOOK"], (), {"HOOK": sys.argv[2], "HOME": "/nowhere"})
+with lock.hold(root / "lock"):
+    process = subprocess.Popen([sys.executable, "-m", "panolog.orchestrator.follower"], stdin=subprocess.PIPE)
+    process.stdin.write((to_json(plan, root) + "\\n").encode())
+    process.stdin.close()
+    signal.pause()
+"""
 
 
 def plan_of(server: Receiver, *more: Target) -> Plan:
@@ -109,6 +124,18 @@ def test_a_follower_that_was_killed_is_replaced_at_the_end(tmp_path: Path) -> No
             histories.write(tmp_path / "run")
             follower_of(os.getpid()).kill()  # and the context ends, perhaps before it is gone
         assert server.texts == ["run.done"]
+
+
+def test_a_killed_command_that_closes_its_pipe_before_its_lock_has_failed(tmp_path: Path) -> None:
+    folder = histories.write(tmp_path / "run", 0, 1)
+    with receiver() as server:
+        run = subprocess.Popen([sys.executable, "-c", DYING, str(folder.root), f"{server.url}/x"])
+        process = follower_of(run.pid)
+        wait_until(lambda: list(folder.follower.glob("webhook-*")), "a look after the end of its stdin")
+        run.kill()
+        run.wait()
+        wait_until(lambda: gone(process), "the end of its follower")
+    assert server.texts == ["run.failed"]
 
 
 def test_a_command_that_is_killed_leaves_a_follower_that_says_so_and_ends(tmp_path: Path) -> None:
