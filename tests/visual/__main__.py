@@ -7,26 +7,29 @@ from tempfile import TemporaryDirectory
 
 import cv2
 
-from tests.visual.browser import fixed_browser, fixed_page, screenshot
+from tests.visual.browser import fixed_browser, fixed_page, screenshot, wait_until_quiet
 from tests.visual.compare import Picture
-from tests.visual.pages import SHOTS, THEMES, WIDTHS, site
+from tests.visual.pages import SHOTS, show, site
 from tests.visual.references import path_of, write
 
 
 def pictures(names: list[str]) -> Iterator[tuple[str, Picture]]:
     """All pictures by name, or those whose name begins with one of `names`."""
     starts = tuple(names) or ("",)
-    with TemporaryDirectory() as folder, site(Path(folder)) as here, fixed_browser() as browser:
-        for size, width in WIDTHS.items():
-            with fixed_page(browser, width, here.root) as page:
-                for shot in SHOTS:
-                    wanted = [theme for theme in THEMES if f"{shot.name}-{size}-{theme}".startswith(starts)]
-                    if wanted:
-                        shot.open(here, page)
-                    for theme in wanted:
-                        shot.show(page, theme)
-                        shot.settle(page, patience=2)
-                        yield f"{shot.name}-{size}-{theme}", screenshot(page, whole=shot.whole)
+    with (
+        TemporaryDirectory() as folder,
+        site(Path(folder)) as here,
+        fixed_browser() as browser,
+        fixed_page(browser, here.root) as page,
+    ):
+        for shot in SHOTS:
+            if any(f"{shot.name}-{view}".startswith(starts) for view in shot.views):
+                shot.open(here, page)
+            for view in shot.views:
+                if f"{shot.name}-{view}".startswith(starts):
+                    show(page, view)
+                    wait_until_quiet(page, 2_000)
+                    yield f"{shot.name}-{view}", screenshot(page, whole=shot.whole)
 
 
 def main() -> None:

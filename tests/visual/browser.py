@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from playwright.sync_api import Browser, Page
 
-from tests.orchestrator.dashboard.browser import PHONE, chromium
+from tests.orchestrator.dashboard.browser import chromium
 from tests.visual.compare import Picture
 from tests.visual.fixed import NOW, fixed_fonts
 
@@ -57,17 +57,9 @@ def fixed_browser() -> Iterator[Browser]:
 
 
 @contextmanager
-def fixed_page(browser: Browser, width: int, folder: Path) -> Iterator[Page]:
-    """A light page of that width where time stands still and nothing moves; it shows `folder` as /data."""
-    size: Any = {"width": width, "height": 844 if width == PHONE else 900}
-    context = browser.new_context(
-        viewport=size,
-        color_scheme="light",
-        reduced_motion="reduce",
-        locale="en-GB",
-        timezone_id="UTC",
-        has_touch=width == PHONE,
-    )
+def fixed_page(browser: Browser, folder: Path) -> Iterator[Page]:
+    """A page where time stands still and nothing moves; it shows `folder` as /data."""
+    context = browser.new_context(reduced_motion="reduce", locale="en-GB", timezone_id="UTC")
     page = context.new_page()
     page.clock.set_fixed_time(NOW)
     page.add_init_script(_RENAME % {"old": json.dumps(str(folder)), "new": json.dumps("/data")})

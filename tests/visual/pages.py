@@ -12,14 +12,11 @@ from panolog.orchestrator.views.comparison.page import write_page
 from panolog.orchestrator.views.report import write_report
 from tests.orchestrator.dashboard.browser import DESK, PHONE
 from tests.orchestrator.dashboard.served import Served, serving
-from tests.visual.browser import Theme, wait_until_quiet
 from tests.visual.fixed import fixed_machine
 from tests.visual.queue import queue_at_work
 from tests.visual.runs import all_runs
 
-WIDTHS: dict[str, int] = {"desk": DESK, "phone": PHONE}
-THEMES: tuple[Theme, ...] = ("light", "dark")
-_QUIET_MS = 400
+WIDTHS = {"desk": DESK, "phone": PHONE}
 _COMPARED = ("finished", "failed", "live")
 
 
@@ -46,31 +43,31 @@ class Site:
 
 @dataclass(frozen=True)
 class Shot:
-    """One page in one state."""
+    """One page in one state, and the widths and themes in which it is looked at.
+
+    Colours do not depend on the width, and the layout does not depend on the theme.
+    """
 
     name: str
     url: Callable[[Site], str]
     prepare: Callable[[Page], None] = lambda _: None  # after it has loaded
+    views: tuple[str, ...] = ("desk-light", "desk-dark", "phone-light")
     whole: bool = True  # False: only what the window shows
-    quiet: float = _QUIET_MS  # milliseconds without a change, after which it is complete
 
     def open(self, site: Site, page: Page) -> None:
-        """Shows the page as it is to be looked at."""
-        page.emulate_media(color_scheme="light")
+        """Shows the page as it is to be looked at, in its first view."""
+        show(page, self.views[0])
         page.goto(self.url(site))
         self.prepare(page)
         page.mouse.move(0, 0)
         page.evaluate("scrollTo(0, 0); document.activeElement?.blur()")
-        self.settle(page)
 
-    def show(self, page: Page, theme: Theme) -> None:
-        """Switches the page that is open to a theme, for which it requests nothing."""
-        page.emulate_media(color_scheme=theme)
-        wait_until_quiet(page, min(self.quiet, _QUIET_MS))
 
-    def settle(self, page: Page, *, patience: float = 1) -> None:
-        """Waits until the page is complete; with more patience, longer."""
-        wait_until_quiet(page, patience * self.quiet)
+def show(page: Page, view: str) -> None:
+    """Gives a page the width and the theme of a view; one that is open requests nothing for that."""
+    size, theme = view.split("-")
+    page.set_viewport_size({"width": WIDTHS[size], "height": 844 if size == "phone" else 900})
+    page.emulate_media(color_scheme="dark" if theme == "dark" else "light")
 
 
 @contextmanager
@@ -83,7 +80,9 @@ def site(root: Path) -> Iterator[Site]:
         queue_at_work(root, root / "runs", clock) as queue,
         serving(root / "runs", queue=queue) as served,
     ):
-        reports = {state: write_report(folder, root / f"{state}.html") for state, folder in runs.items()}
+        reports = {
+            state: write_report(runs[state], root / f"{state}.html") for state in ("finished", "live")
+        }
         comparison = root / "comparison.html"
         write_page([runs[state].root for state in _COMPARED], comparison)
         yield Site(root, served, runs, reports, comparison)
@@ -145,30 +144,34 @@ def _chosen(page: Page) -> None:
         page.get_by_label(f"Compare {name}").check()
 
 
+def _missing(page: Page) -> None:
+    expect(page.locator("#missing")).to_be_visible()
+
+
 def _compared(page: Page) -> None:
     """Waits for the curves of a comparison, and shows them by minutes."""
     expect(page.locator("#charts .scatterlayer .trace").first).to_be_attached(timeout=30_000)
     page.get_by_role("button", name="Minutes").click()
 
 
-def _run(state: str, prepare: Callable[[Page], None]) -> Shot:
-    return Shot(f"run-{state}", lambda site: site.run_url(state), prepare, quiet=1200)
+def _run(state: str, prepare: Callable[[Page], None], *views: str) -> Shot:
+    return Shot(f"run-{state}", lambda site: site.run_url(state), prepare, views or Shot.views)
 
 
-def _report(state: str) -> Shot:
-    return Shot(f"report-{state}", lambda site: site.reports[state].as_uri())
+def _report(state: str, *views: str) -> Shot:
+    return Shot(f"report-{state}", lambda site: site.reports[state].as_uri(), views=views or Shot.views)
 
 
 SHOTS = (
     Shot("runs", lambda site: site.served.url, _chosen),
-    Shot("compare", lambda site: site.compare_url, _compared, quiet=1200),
+    Shot("compare", lambda site: site.compare_url, _compared),
     _run("finished", _around),
     _run("live", _camera),
-    _run("failed", _block(1)),
-    _run("killed", _drawn),
-    _run("preparing", _prepared),
-    Shot("confirm", lambda site: site.run_url("live"), _confirm, whole=False, quiet=1200),
-    Shot("missing", lambda site: f"{site.served.url}/runs/0123456789abcdef", quiet=1700),
-    *map(_report, ("finished", "live", "failed", "killed")),
-    Shot("comparison-report", lambda site: site.comparison.as_uri(), _compared),
+    _run("failed", _block(1), "desk-light", "desk-dark"),
+    _run("preparing", _prepared, "desk-light", "phone-light"),
+    Shot("confirm", lambda site: site.run_url("live"), _confirm, ("desk-dark", "phone-light"), whole=False),
+    Shot("missing", lambda site: f"{site.served.url}/runs/0123456789abcdef", _missing, ("phone-light",)),
+    _report("finished"),
+    _report("live", "desk-light"),
+    Shot("comparison-report", lambda site: site.comparison.as_uri(), _compared, ("desk-light",)),
 )
