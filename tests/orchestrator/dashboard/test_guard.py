@@ -16,7 +16,6 @@ from tests.orchestrator.dashboard.served import (
     Served,
     raw,
     serving,
-    write_run,
     write_whole_run,
 )
 
@@ -64,7 +63,7 @@ def test_this_machine_may_be_called(served: Served, host: str) -> None:
 def test_other_sites_cannot_act(driven: tuple[Served, RunFolder], headers: dict[str, str]) -> None:
     served, folder = driven
     path = f"/api/runs/{served.id('run')}/actions"
-    for target in (path, path.replace("actions", "viewer")):
+    for target in (path, path.replace("actions", "viewer"), "/api/queue"):
         answer = served.client.post(target, content='{"action": "stop"}', headers=POST | headers)
         assert answer.status_code == 403
     assert control.take(folder) == []
@@ -109,18 +108,12 @@ def test_other_methods_do_nothing(served: Served) -> None:
         assert "access-control-allow-origin" not in answer.headers
 
 
-def test_without_the_token_nothing_is_answered(tmp_path: Path) -> None:
+def test_the_token_opens_the_door_and_without_it_nothing_is_answered(tmp_path: Path) -> None:
     write_whole_run(tmp_path / "run")
     id = RunEntry(tmp_path, "run").id
     with serving(tmp_path, token=TOKEN) as served:
-        targets = [
-            "/",
-            f"/runs/{id}",
-            "/static/runs/runs.js",
-            "/static/plotly.min.js",
-            "/api/runs",
-            "/api/stream",
-        ]
+        targets = ["/", f"/runs/{id}", "/static/runs/runs.js", "/static/plotly.min.js"]
+        targets += ["/api/runs", "/api/stream", "/compare", "/api/compare", "/api/compare/curves"]
         targets += [f"/api/runs/{id}{rest}" for rest in ("", "/map", "/point_cloud.ply", "/nothing")]
         wrong: list[dict[str, Any]] = [
             {},
@@ -138,16 +131,10 @@ def test_without_the_token_nothing_is_answered(tmp_path: Path) -> None:
                 answer = served.client.get(target, **given)
                 assert answer.status_code == 403, (target, given)
                 assert set(answer.json()) == {"error"}
-        assert (
-            served.client.get("/api/runs", params={"token": TOKEN}).status_code == 403
-        )  # only the first page
+        answer = served.client.get("/api/runs", params={"token": TOKEN})
+        assert answer.status_code == 403  # only the first page takes it
         answer = served.client.post(f"/api/runs/{id}/actions", content="{}", headers=POST)
         assert answer.status_code == 403
-
-
-def test_the_token_opens_the_door_once(tmp_path: Path) -> None:
-    write_run(tmp_path / "run")
-    with serving(tmp_path, token=TOKEN) as served:
         bearer = {"Authorization": f"Bearer {TOKEN}", "Host": "any.name"}
         assert served.client.get("/api/runs", headers=bearer).status_code == 200
         door = served.client.get("/", params={"token": TOKEN})
@@ -155,14 +142,9 @@ def test_the_token_opens_the_door_once(tmp_path: Path) -> None:
         assert {"HttpOnly", "SameSite=strict", "Path=/"} <= set(cookie.split("; "))
         assert 'http-equiv="refresh" content="0;url=./"' in door.text
         assert TOKEN not in door.text
-        id = served.id("run")  # the client has the cookie now
-        foreign = served.client.post(
-            f"/api/runs/{id}/actions",
-            content='{"action": "stop"}',
-            headers={"Origin": "http://evil.example"} | POST,
-        )
-        assert foreign.status_code == 403
-        assert served.act(id, "stop").status_code == 409
+        assert served.act(id, "stop").status_code == 409  # the client has the cookie now
+        served.client.headers["Origin"] = "http://evil.example"
+        assert served.act(id, "stop").status_code == 403
 
 
 def test_a_token_is_needed_beyond_this_machine_and_stays_the_same(tmp_path: Path) -> None:

@@ -1,39 +1,40 @@
 """The 3D view of a run in a real browser: it draws, and what it runs can do nothing to the dashboard."""
 
-import asyncio
-import json
 import os
 import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
 import httpx
 import numpy as np
 import pytest
+from playwright.sync_api import Browser
 
-from panolog.orchestrator.dashboard.discovery import RunEntry
-from panolog.orchestrator.dashboard.model_pages import ModelPages, page_policy
+from panolog.orchestrator.dashboard.model_pages import page_policy
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.stages.partitioning import write_plan
 from panolog.orchestrator.views.site.build import Wanted, site_of_run, write_folder
-from panolog.orchestrator.views.site.viewpoints import read_viewpoints
-from panolog.scene.errors import InputError
+from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
-from tests.orchestrator.dashboard.browser import chromium, opened
+from tests.orchestrator.dashboard.browser import opened
 from tests.orchestrator.dashboard.served import POST, Served, plan, raw, serving, write_run
 from tests.orchestrator.views.models import some
 from tests.orchestrator.views.pictures import layers, psnr, ready, rendered, shown, until
+from tests.orchestrator.views.sites import SIZE, viewpoints_of
 from tests.scenes import write_scene
 
 TOKEN = "t" * 43
 FETCH = "fetch('/api/runs').then(() => 'answered', () => 'refused')"
 
 
-def request_page(served: Served, task: str | None = None, camera: str | None = None) -> httpx.Response:
+def request_page(
+    served: Served, task: str | None = None, camera: str | None = None, run: str = "run"
+) -> httpx.Response:
     body = {"task": task, "camera": camera}
-    path = f"/api/runs/{served.id('run')}/viewer"
-    return served.client.post(path, json=body, headers=POST, timeout=120)
+    return served.client.post(f"/api/runs/{served.id(run)}/viewer", json=body, headers=POST)
 
 
 def url_of(served: Served, task: str | None = None, camera: str | None = None) -> str:
@@ -42,69 +43,83 @@ def url_of(served: Served, task: str | None = None, camera: str | None = None) -
     return str(answer.json()["url"])
 
 
-def save_model(folder: RunFolder) -> None:
+def refused(served: Served, task: str | None = None, camera: str | None = None, run: str = "run") -> str:
+    """The line of a request that gets no page."""
+    answer = request_page(served, task, camera, run)
+    assert answer.status_code == 409
+    assert "\n" not in answer.json()["error"]
+    return str(answer.json()["error"])
+
+
+def save_model(folder: RunFolder, model: Gaussians) -> None:
     folder.of(COARSE).mkdir(exist_ok=True)
-    write_ply(folder.model(COARSE), some(400, sky=100))
+    write_ply(folder.model(COARSE), model)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run whose model is of opaque balls in front of one of its cameras."""
+    folder = write_run(tmp_path_factory.mktemp("folder") / "run")
+    write_plan(folder, plan())
+    save_model(folder, layers(viewpoints_of(folder, "1.jpg")))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def served(folder: RunFolder) -> Iterator[Served]:
+    """A server that requires a token, and a client that has it."""
+    with serving(folder.root.parent, token=TOKEN) as served:
+        served.client.headers["Authorization"] = f"Bearer {TOKEN}"
+        yield served
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("token", [None, TOKEN])
-def test_a_model_is_drawn_by_a_page_that_can_reach_nothing(tmp_path: Path, token: str | None) -> None:
-    save_model(write_run(tmp_path / "run"))
-    with serving(tmp_path, token=token) as served, chromium() as browser:
-        if token:
-            served.client.headers["Authorization"] = f"Bearer {token}"
-        url = served.url + url_of(served, "coarse")
-        with opened(browser, url, tolerate=lambda text: "Content Security Policy" in text) as page:
-            ready(page)
-            assert page.title() == "coarse of run"
-            picture = shown(page)
-            assert (
-                len(np.unique(picture[200:].reshape(-1, 3), axis=0)) > 1_000
-            )  # a blurred model, no plain page
-            assert page.evaluate("self.origin") == "null"
-            assert page.evaluate(FETCH) == "refused"
+def test_the_picture_of_a_page_that_can_reach_nothing_is_that_of_our_renderer(
+    browser: Browser, served: Served, folder: RunFolder
+) -> None:
+    def policy(text: str) -> bool:
+        return "Content Security Policy" in text
+
+    viewpoints, url = viewpoints_of(folder, "1.jpg"), served.url + url_of(served, camera="1.jpg")
+    with opened(browser, url, width=SIZE[0], height=SIZE[1], tolerate=policy) as page:
+        picture = shown(page)
+        assert page.title() == "model of run"
+        assert page.evaluate("self.origin") == "null"
+        assert page.evaluate(FETCH) == "refused"
+    expected = rendered(layers(viewpoints), viewpoints, SIZE, background=picture[0, 0])
+    assert psnr(picture, expected) >= 25
 
 
 @pytest.mark.system
-def test_only_the_page_itself_is_granted_and_only_to_origins_of_their_own(tmp_path: Path) -> None:
-    save_model(write_run(tmp_path / "run"))
-    with serving(tmp_path, token=TOKEN) as served:
-        bearer = {"Authorization": f"Bearer {TOKEN}"}
-        served.client.headers.update(bearer)
-        url = url_of(served)
-        key = url.strip("/").split("/")[1]
-        with httpx.Client(base_url=served.url) as anyone:
-            for name in ("", "scene.json", "viewer.js", "engine.js", "model.sog", "sky.jpg"):
-                answer = anyone.get(url + name)
-                assert answer.status_code == 200
-                assert answer.headers["access-control-allow-origin"] == "null"
-                assert answer.headers["content-security-policy"] == page_policy(
-                    answer.request.url.netloc.decode(), key
-                )
-            for path in (
-                "/",
-                "/api/runs",
-                f"/models/{key[:-1]}0/" if key[-1] != "0" else f"/models/{key[:-1]}1/",
-                f"/models/{key.upper()}/" if key.upper() != key else "/models/x/",
-                f"/models/{key}",
-                "/models/",
-            ):
-                assert anyone.get(path).status_code == 403, path
-            assert anyone.post(url, headers=POST, content="{}").status_code in (403, 405)
-        host = served.url.removeprefix("http://").encode()
-        for path in (
-            "..",
-            "../..",
-            "%2e%2e/%2e%2e",
-            "../../api/runs",
-            "/etc/passwd",
-            "%00",
-            "x/../../x",
-            ".hidden",
-        ):
-            request = f"GET {url}{path} HTTP/1.1\r\nHost: ".encode() + host + b"\r\nConnection: close\r\n\r\n"
-            assert raw(served.url, request).split(b" ")[1] in (b"403", b"404"), path
+def test_only_the_page_itself_is_granted_and_only_to_origins_of_their_own(served: Served) -> None:
+    url = url_of(served)
+    key = url.strip("/").split("/")[1]
+    with httpx.Client(base_url=served.url) as anyone:
+        for name in ("", "scene.json", "viewer.js", "engine.js", "model.sog"):
+            answer = anyone.get(url + name)
+            assert answer.status_code == 200
+            assert answer.headers["access-control-allow-origin"] == "null"
+            policy = page_policy(answer.request.url.netloc.decode(), key)
+            assert answer.headers["content-security-policy"] == policy
+        other = f"{key[:-1]}{(int(key[-1], 16) + 1) % 16:x}"
+        for path in ("/", "/api/runs", f"/models/{other}/", f"/models/{key}A/", f"/models/{key}", "/models/"):
+            assert anyone.get(path).status_code == 403, path
+        assert anyone.post(url, headers=POST, content="{}").status_code in (403, 405)
+    host = served.url.removeprefix("http://").encode()
+    outside = ("..", "../..", "%2e%2e/%2e%2e", "../../api/runs", "/etc/passwd", "%00", "x/../../x", ".hidden")
+    for path in outside:
+        request = f"GET {url}{path} HTTP/1.1\r\nHost: ".encode() + host + b"\r\nConnection: close\r\n\r\n"
+        assert raw(served.url, request).split(b" ")[1] in (b"403", b"404"), path
+
+
+@pytest.mark.system
+def test_a_page_is_made_once_for_all_cameras_and_clients(served: Served) -> None:
+    with ThreadPoolExecutor(2) as clients:
+        first, second = clients.map(url_of, [served, served])
+    assert first == second
+    assert url_of(served, camera="0.jpg") == f"{first}#camera=0.jpg"
+    for name in ("none.jpg", "../0.jpg", ""):
+        assert refused(served, camera=name) == "the plan of this run has no such panorama"
 
 
 def test_the_policy_names_the_pages_own_address_alone() -> None:
@@ -118,51 +133,27 @@ def test_the_policy_names_the_pages_own_address_alone() -> None:
         assert "connect-src 'self' data: blob:;" in policy
 
 
-def test_a_model_that_is_not_there_or_no_task_is_a_line(tmp_path: Path) -> None:
-    write_run(tmp_path / "run")
-    with serving(tmp_path) as served:
+@pytest.mark.system
+def test_a_model_that_is_not_there_or_not_the_runs_own_is_a_line(tmp_path: Path) -> None:
+    write_run(tmp_path / "folder" / "run")
+    write_ply(tmp_path / "secret.ply", some(3))
+    write_run(tmp_path / "folder" / "linked").point_cloud.symlink_to(tmp_path / "secret.ply")
+    damaged = write_run(tmp_path / "folder" / "damaged")
+    damaged.of(COARSE).mkdir()
+    damaged.model(COARSE).write_bytes(b"nonsense")
+    with serving(tmp_path / "folder") as served:
         for task in (None, "block/001", "../../etc"):
-            answer = request_page(served, task)
-            assert answer.status_code == 409
-            assert "\n" not in answer.json()["error"]
+            assert refused(served, task)
+        assert refused(served, camera="0.jpg")  # without a plan
+        assert "not a plain file of the run" in refused(served, run="linked")
+        line = refused(served, run="damaged")
+        assert "model.ply: is not a model" in line and "/proc" not in line
         assert "was removed" in served.errors("/models/none/", 404)
 
 
 @pytest.mark.system
-def test_a_page_is_made_once_for_all_cameras(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run")
-    save_model(folder)
-    with serving(tmp_path) as served:
-        assert request_page(served, camera="0.jpg").status_code == 409  # without a plan
-        write_plan(folder, plan())
-        for name in ("none.jpg", "../0.jpg", ""):
-            answer = request_page(served, camera=name)
-            assert answer.status_code == 409
-            assert answer.json()["error"] == "the plan of this run has no such panorama"
-        assert url_of(served, camera="0.jpg") == f"{url_of(served)}#camera=0.jpg"
-
-
-@pytest.mark.system
-def test_the_picture_in_the_sandbox_is_that_of_our_renderer(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run")
-    write_plan(folder, plan())
-    viewpoints = read_viewpoints(folder, None, "1.jpg")
-    assert viewpoints is not None
-    model = layers(viewpoints)
-    folder.of(COARSE).mkdir()
-    write_ply(folder.model(COARSE), model)
-    with serving(tmp_path) as served, chromium() as browser:
-        page = browser.new_page(viewport={"width": 480, "height": 320})
-        page.goto(served.url + url_of(served, camera="1.jpg"))
-        picture = shown(page)
-        assert page.evaluate("self.origin") == "null"
-        quality = psnr(picture, rendered(model, viewpoints, (480, 320), background=picture[0, 0]))
-        assert quality >= 25, f"{quality:.1f} dB"
-
-
-@pytest.mark.system
 def test_what_a_run_has_written_is_shown_with_the_scenes_photographs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = [f"{number}.jpg" for number in range(4)]
     write_scene(tmp_path / "scene", names=names)
@@ -170,68 +161,21 @@ def test_what_a_run_has_written_is_shown_with_the_scenes_photographs(
     (tmp_path / "scene" / "images" / "2.jpg").write_bytes(blue)
     folder = write_run(tmp_path / "run", scene=str(tmp_path / "scene"))
     write_plan(folder, plan())
-    save_model(folder)
+    save_model(folder, some(400, sky=100))
     write_folder(site_of_run(folder, Wanted()), folder.web)
     (folder.web / "secret.txt").symlink_to(tmp_path / "scene" / "images" / "2.jpg")
-    with serving(tmp_path) as served, chromium() as browser:
-        with monkeypatch.context() as patch:
-            patch.setattr("sys.executable", "/nowhere/python")  # nothing is converted
-            url = url_of(served)
+    (program := tmp_path / "program").write_text("#!/bin/sh\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("sys.executable", str(program))  # nothing can be converted
+    with serving(tmp_path) as served:
+        url = url_of(served)
         served.errors(f"{url}secret.txt", 404)
         served.errors(f"{url}photos/000004.jpg", 404)
-        with opened(browser, served.url + url) as page:
+        with opened(browser, served.url + url, width=SIZE[0], height=SIZE[1]) as page:
             ready(page)
             page.evaluate("panolog.walk.go(panolog.walk.cameras[2])")
             until(page, "panolog.walk._picture.opacity === 1")
-            picture = shown(page)
-            assert np.allclose(picture[450, 720], (250, 20, 10), atol=8)
+            assert np.allclose(shown(page)[SIZE[1] // 2, SIZE[0] // 2], (250, 20, 10), atol=8)
         later = time.time() + 100
-        os.utime(folder.model(COARSE), (later, later))  # a newer model
-        assert url_of(served) != url
-
-
-@pytest.mark.system
-def test_pages_are_made_once_and_kept_for_a_while(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run")
-    save_model(folder)
-    place = RunEntry(tmp_path.resolve(), "run")
-
-    async def check() -> None:
-        pages = ModelPages()
-        try:
-            first, again = await asyncio.gather(pages.make(place, None, None), pages.make(place, None, None))
-            assert first == again
-            assert await pages.make(place, None, None) == first
-            assert pages.grants(f"/models/{first}/viewer.js")
-            for key in ("", "../x", first[:-1]):
-                assert not pages.grants(f"/models/{key}/viewer.js")
-            folder.model(COARSE).write_bytes(b"nonsense")
-            with pytest.raises(InputError, match=r"model\.ply: is not a model") as caught:
-                await pages.make(place, None, None)
-            assert "/proc" not in str(caught.value)
-            made = Path(pages._folder.name)
-            assert len(list(made.iterdir())) == 1
-        finally:
-            pages.close()
-        assert not made.exists()
-
-    asyncio.run(check())
-
-
-def test_a_page_shows_nothing_from_outside_the_run(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run")
-    secret = tmp_path / "secret.ply"
-    write_ply(secret, some(3))
-    folder.point_cloud.symlink_to(secret)
-    place = RunEntry(tmp_path.resolve(), "run")
-
-    async def check() -> None:
-        pages = ModelPages()
-        try:
-            with pytest.raises(InputError, match="not a plain file of the run"):
-                await pages.make(place, None, None)
-        finally:
-            pages.close()
-
-    asyncio.run(check())
-    assert json.loads(folder.info.read_text())
+        os.utime(folder.model(COARSE), (later, later))  # a newer model needs another page
+        assert refused(served) == "the 3D view could not be made"

@@ -71,49 +71,29 @@ def link_out(path: Path) -> None:
     path.symlink_to(secret)
 
 
-def no_scene(path: Path) -> None:
-    path.write_bytes(b"")
-    for file in (path.parents[1] / "sparse" / "0").iterdir():
-        file.unlink()
-
-
-@pytest.mark.parametrize(
-    ("spoil", "why"),
-    [
-        (bomb, "cannot be decoded"),
-        (link_out, "a link that leads out of the scene"),
-        (os.mkfifo, "is missing"),
-        (lambda path: None, "is missing"),
-        (lambda path: path.write_bytes(b"\xff\xd8\xff no picture"), "cannot be decoded"),
-        (no_scene, "no COLMAP model"),
-    ],
-)
-def test_what_is_no_panorama_of_the_scene_is_not_sent(
-    tmp_path: Path, spoil: Callable[[Path], None], why: str
-) -> None:
-    scene, _ = of_scene(tmp_path)
-    file = scene / "images" / "1.jpg"
-    file.unlink()
-    spoil(file)
-    with serving(tmp_path / "folder") as server:
-        assert why in server.errors(f"/api/runs/{server.id('run')}/camera/1/panorama", 404)
-
-
-def test_a_name_that_leads_out_of_the_scene_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_panorama_of_the_scene_is_not_sent(tmp_path: Path) -> None:
     scene, folder = of_scene(tmp_path)
-    link_out(scene / "images" / "link.jpg")
-    text = folder.plan.read_text()
+    file, plan = scene / "images" / "1.jpg", folder.plan.read_text()
+    spoils: dict[Callable[[Path], object], str] = {
+        bomb: "cannot be decoded",
+        link_out: "a link that leads out of the scene",
+        os.mkfifo: "is missing",
+        lambda path: None: "is missing",
+        lambda path: path.write_bytes(b"\xff\xd8\xff no picture"): "cannot be decoded",
+    }
     with serving(tmp_path / "folder") as server:
-        for name in (
-            "../../secret.jpg",
-            "../../../secret.jpg",
-            str(tmp_path / "secret.jpg"),
-            "link.jpg",
-            "\\u0000",
-        ):
-            folder.plan.write_text(text.replace("1.jpg", name))
-            answer = server.client.get(f"/api/runs/{server.id('run')}/camera/1/panorama")
-            assert answer.status_code == 404, name
+        path = f"/api/runs/{server.id('run')}/camera/1/panorama"
+        for spoil, why in spoils.items():
+            file.unlink(missing_ok=True)
+            spoil(file)
+            assert why in server.errors(path, 404)
+        for name in ("../../secret.jpg", "../../../secret.jpg", str(tmp_path / "secret.jpg"), "\\u0000"):
+            folder.plan.write_text(plan.replace("1.jpg", name))
+            assert server.errors(path, 404), name
+        folder.plan.write_text(plan)
+        for model in (scene / "sparse" / "0").iterdir():
+            model.unlink()
+        assert "no COLMAP model" in server.errors(path, 404)
 
 
 def stored_scene(root: Path, monkeypatch: pytest.MonkeyPatch) -> str:
