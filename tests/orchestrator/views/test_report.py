@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Iterator
 from contextlib import closing
 from html import unescape
 from pathlib import Path
@@ -27,7 +26,7 @@ from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.views.report import report_or_notice, write_report
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import write_ply
-from panolog.workers.seams.schema import Seam, SeamsFile
+from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.dashboard.served import write_whole_run
 from tests.orchestrator.fakes import Harness, fails
@@ -58,6 +57,13 @@ def data(page: str) -> dict[str, Any]:
     return found
 
 
+def self_contained(page: str) -> bool:
+    """Whether a page requests nothing, but for what Plotly's code says."""
+    beyond_plotly = page.replace(page[page.index("<script>/**") : page.index("</head>")], "")
+    outside = r"""(src|href)\s*=\s*["']?(https?:|//|\.)|^(import|export) """
+    return not re.search(outside, beyond_plotly, re.MULTILINE)
+
+
 def text_of(page: str) -> str:
     """What a reader of the page reads."""
     body = re.sub(r"<(script|style).*?</\1>", "", page, flags=re.DOTALL)
@@ -74,18 +80,7 @@ def test_a_finished_run_is_one_self_contained_page(done: RunFolder) -> None:
     for text in ("Stage II", "pano_4.png", "24.00 dB", "202", "/scenes/street", "width", "torch 2", "seed 7"):
         assert text in text_of(page), text
     assert 'src="data:image/jpeg;base64,' in page
-    beyond_plotly = page.replace(page[page.index("<script>/**") : page.index("</head>")], "")
-    assert not re.search(r"""(src|href)\s*=\s*["']?(https?:|//|\.)""", beyond_plotly)
-    assert not re.search(r"^(import|export) ", beyond_plotly, re.MULTILINE)
-
-
-def test_the_driver_writes_that_its_run_is_done(tmp_path: Path) -> None:
-    harness = Harness(tmp_path)
-    begin(harness.folder)
-    with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
-        harness.drive()
-        session._report(harness.folder, Journal(database))
-        assert not re.search(r"\brunning\b", text_of(harness.folder.report.read_text()))
+    assert self_contained(page)
 
 
 def test_a_failed_run_has_a_report_with_its_reason(tmp_path: Path) -> None:
@@ -133,6 +128,9 @@ def test_a_run_that_has_hardly_begun_has_a_report_too(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     begin(folder)
     assert "Timeline" in write_report(folder).read_text()
+    with closing(Database(folder.database)) as database:
+        database.append([RunBegan("host", 1, resumed=False)])
+    assert "run driver lost" in text_of(write_report(folder).read_text())
 
 
 def test_pictures_are_few_and_small_and_only_the_runs_own(tmp_path: Path) -> None:
@@ -168,14 +166,15 @@ def test_what_cannot_be_reported(tmp_path: Path) -> None:
     assert not folder.report.exists()
 
 
-def test_a_report_that_cannot_be_written_is_a_notice_and_the_run_is_done(tmp_path: Path) -> None:
+def test_the_driver_writes_the_report_and_one_that_cannot_be_written_is_a_notice(tmp_path: Path) -> None:
     harness = Harness(tmp_path)
     begin(harness.folder)
-    harness.drive()
     shown: list[Stored] = []
-    with closing(Database(harness.folder.database)) as database:
+    with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
+        harness.drive()
         session._report(harness.folder, Journal(database, lambda state, news: shown.extend(news)))
-        assert (shown, harness.folder.report.is_file()) == ([], True)
+        assert not shown
+        assert not re.search(r"\brunning\b", text_of(harness.folder.report.read_text()))
         harness.folder.report.unlink()
         harness.folder.report.mkdir()
         session._report(harness.folder, Journal(database, lambda state, news: shown.extend(news)))
@@ -191,41 +190,26 @@ def test_the_command_says_where_the_report_is(done: RunFolder, tmp_path: Path) -
     assert CliRunner().invoke(app.app, ["report", str(tmp_path)]).exit_code == 2
 
 
-@pytest.fixture
-def seams(done: RunFolder) -> Iterator[tuple[Seam, ...]]:
-    """Faces of the run in `done`, the first with pictures."""
-    faces = (seam(1, 1.75), seam(2, None))
-    write_json(done.seams, SeamsFile.of(faces).model_dump(mode="json"))
-    place = done.seam(0, 1)
+def test_the_report_shows_the_seams_and_the_worst_in_pictures(done: RunFolder) -> None:
+    assert "Seams between blocks" not in text_of(write_report(done).read_text())
+    write_json(done.seams, SeamsFile.of((seam(1, 1.75), seam(2, None))).model_dump(mode="json"))
+    place = done.seam(0, 1)  # the first has pictures
     place.mkdir(parents=True)
     for name in ("truth.jpg", "merged.jpg", "below.jpg", "above.jpg", "face.png"):
         cv2.imwrite(str(place / name), np.zeros((3, 4, 3), np.uint8))
-    yield faces
-    done.seams.unlink()
-    rmtree(place)
-
-
-@pytest.mark.usefixtures("seams")
-def test_the_report_shows_the_seams_and_the_worst_in_pictures(done: RunFolder) -> None:
-    page = write_report(done).read_text()
-    text = text_of(page)
-    for words in ("Seams between blocks", "Blocks 0 and 1: seam 1.75", "2 faces", "0 | 2", "seam 1.5 to 3"):
-        assert words in text, words
-    assert "Blocks 0 and 2" not in text
-    assert page.count('<img class="line"') == 4
-
-
-def test_a_run_without_seams_has_no_part_for_them(done: RunFolder) -> None:
-    assert "Seams between blocks" not in text_of(write_report(done).read_text())
-
-
-def test_a_damaged_seams_json_is_named(done: RunFolder) -> None:
-    done.seams.write_bytes(b"{}")
     try:
+        page = write_report(done).read_text()
+        text = text_of(page)
+        for words in ("Seams between blocks", "Blocks 0 and 1: seam 1.75", "2 faces", "0 | 2", "1.5 to 3"):
+            assert words in text, words
+        assert "Blocks 0 and 2" not in text
+        assert page.count('<img class="line"') == 4
+        done.seams.write_bytes(b"{}")
         with pytest.raises(InputError, match=r"seams\.json"):
             write_report(done)
     finally:
         done.seams.unlink()
+        rmtree(place)
 
 
 def test_the_report_shows_movers_and_only_the_runs_own_pictures(done: RunFolder, tmp_path: Path) -> None:

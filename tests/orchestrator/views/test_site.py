@@ -79,6 +79,8 @@ def test_the_current_model_is_the_latest_there_is(folder: RunFolder) -> None:
     assert model_of(folder) == folder.model(COARSE)
     with pytest.raises(InputError, match="block/001 has no model yet"):
         model_of(folder, TaskId.block(1))
+    with pytest.raises(InputError, match="score/000 is not a task that trains"):
+        model_of(folder, TaskId.shard(0))
     write_ply(folder.point_cloud, some(3))
     assert model_of(folder) == folder.point_cloud
 
@@ -87,11 +89,6 @@ def test_the_current_model_is_the_latest_there_is(folder: RunFolder) -> None:
 def test_a_task_is_no_path(task: str) -> None:
     with pytest.raises(InputError, match="is not a task"):
         TaskId.parse(task)
-
-
-def test_a_task_without_a_model(folder: RunFolder) -> None:
-    with pytest.raises(InputError, match="score/000 is not a task that trains"):
-        model_of(folder, TaskId.shard(0))
 
 
 def test_a_checkpoint_becomes_a_page_of_its_cameras(folder: RunFolder, tmp_path: Path) -> None:
@@ -183,19 +180,15 @@ def test_a_sog_is_shown_as_it_is(tmp_path: Path) -> None:
     assert "<title>my model</title>" in (tmp_path / "page.html").read_text()
 
 
-@pytest.mark.parametrize("content", [b"", b"ply\nformat ascii 1.0\n", b"\x10" + bytes(7) + b"{" + bytes(20)])
-def test_what_is_no_model(tmp_path: Path, content: bytes) -> None:
+def test_what_is_no_model_or_has_no_gaussians(tmp_path: Path) -> None:
     path = tmp_path / "model"
-    path.write_bytes(content)
-    with pytest.raises((InputError, RunError)):
-        site_of_file(path, Wanted())
-
-
-def test_a_model_without_gaussians(tmp_path: Path) -> None:
-    path = tmp_path / "model.ply"
-    write_ply_parts(path, [], count=0, sky=0)
+    for content in (b"", b"ply\nformat ascii 1.0\n", b"\x10" + bytes(7) + b"{" + bytes(20)):
+        path.write_bytes(content)
+        with pytest.raises((InputError, RunError)):
+            site_of_file(path, Wanted())
+    write_ply_parts(tmp_path / "model.ply", [], count=0, sky=0)
     with pytest.raises(InputError, match="has no Gaussians to show"):
-        site_of_file(path, Wanted())
+        site_of_file(tmp_path / "model.ply", Wanted())
 
 
 def test_a_model_of_sky_alone_is_shown(tmp_path: Path) -> None:

@@ -162,28 +162,6 @@ def test_differences_are_of_the_panoramas_that_both_have(tmp_path: Path) -> None
     assert (other.mean, other.difference, other.panoramas) == (25.0, None, None)
 
 
-def test_panoramas_have_the_metrics_and_pictures_of_each_run(tmp_path: Path) -> None:
-    first, second = write(tmp_path / "a", measured=metrics()), write(tmp_path / "b")
-    write_picture(first, "b.jpg", 10, 200)
-    views = {view.name: view for view in compared(first, second).views}
-    assert views.keys() == VALUES.keys()
-    assert views["b.jpg"].pictures == (str(first.picture("b.jpg")), None)
-    assert views["b.jpg"].truth == str(first.picture("b.jpg"))
-    assert views["a.jpg"].metrics[1] is None
-    assert views["a.jpg"].truth is None
-
-
-def test_the_first_run_that_can_be_read_is_what_others_are_compared_with(tmp_path: Path) -> None:
-    folders = [write(tmp_path / "a", measured=metrics()), write(tmp_path / "b", measured=metrics(HIGHER))]
-    read = read_runs([folder.root for folder in folders])
-    comparison = compare([UnreadRun("0", "gone", "it is gone"), *read])
-    assert comparison.first == 1
-    assert (comparison.runs[0].status, comparison.runs[0].error) == ("unreadable", "it is gone")
-    assert comparison.runs[2].metrics["ws_psnr"].better == 2
-    assert all(len(view.metrics) == len(view.pictures) == 3 for view in comparison.views)
-    assert curves_of([UnreadRun("0", "gone", "it is gone"), *read]).runs[0].error == "it is gone"
-
-
 def test_names_are_as_long_as_it_takes() -> None:
     places = [Path("/x/one/run"), Path("/x/two/run"), Path("/x/two/other")]
     assert names_of(places) == ["one/run", "two/run", "two/other"]
