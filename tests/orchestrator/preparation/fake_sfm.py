@@ -9,9 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import session
 from panolog.orchestrator.preparation.settings import Options
 from panolog.orchestrator.run.config import load_config
@@ -90,10 +88,6 @@ def start(source: Path, root: Path, *, action: Callable[[], object] = ignore, **
 
 def resume(root: Path) -> None:
     session.resume(root, None, ignore, CalibratingPool())
-
-
-def call(*words: object) -> Any:
-    return CliRunner().invoke(app.app, [str(word) for word in words])
 
 
 class Killed(BaseException):

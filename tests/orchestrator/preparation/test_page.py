@@ -1,14 +1,14 @@
 """A run that makes its scene: what its page shows meanwhile, and what it believes of files in RUN/prepare."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import psutil
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
 from panolog.orchestrator.preparation import notes
 from panolog.orchestrator.preparation.notes import Counts, StepProgress, StepResult
@@ -22,7 +22,7 @@ from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.views.preparation import prepared_share, view_preparation
 from panolog.orchestrator.views.timing import progress_of
 from panolog.workers.tasks import PREPARE
-from tests.orchestrator.dashboard.browser import PHONE, chromium, opened
+from tests.orchestrator.dashboard.browser import PHONE, opened
 from tests.orchestrator.dashboard.served import EVIL, POST, Served, append, serving, write_run
 from tests.visual import legible
 
@@ -115,16 +115,20 @@ def huge(path: Path) -> None:
         file.truncate(2**40)
 
 
-@pytest.mark.parametrize("spoil", [pipe, link, huge, lambda path: path.write_bytes(b"{")])
-def test_files_made_to_do_harm_show_nothing(spoil: Callable[[Path], None], folder: RunFolder) -> None:
-    spoil(settings_path(folder))
-    spoil(notes.progress_path(write_preparing(folder.root.parent / "other")))
-    with serving(folder.root.parent) as server:
-        page = server.get(f"/api/runs/{server.id('walk')}")
-        assert page["preparation"] is None
-        assert page["summary"]["status"] == "stopped"
-        view = server.get(f"/api/runs/{server.id('other')}")["preparation"]
-        assert [step["status"] for step in view["steps"]] == ["done", "waiting", "waiting"]
+def test_files_made_to_do_harm_show_nothing(tmp_path: Path) -> None:
+    spoils = {"pipe": pipe, "link": link, "huge": huge, "damaged": lambda path: path.write_bytes(b"{")}
+    for name, spoil in spoils.items():
+        spoil(settings_path(write_preparing(tmp_path / "runs" / name)))
+        spoil(notes.progress_path(write_preparing(tmp_path / "runs" / f"{name} progress")))
+    with serving(tmp_path / "runs") as server:
+        for run in server.get("/api/runs")["runs"]:
+            page = server.get(f"/api/runs/{run['id']}")
+            if run["name"].endswith("progress"):
+                steps = page["preparation"]["steps"]
+                assert [step["status"] for step in steps] == ["done", "waiting", "waiting"], run
+            else:
+                assert page["preparation"] is None, run
+                assert page["summary"]["status"] == "stopped"
 
 
 def test_a_run_without_its_scene_can_be_resumed_only_if_it_makes_it(
@@ -134,7 +138,7 @@ def test_a_run_without_its_scene_can_be_resumed_only_if_it_makes_it(
     notes.sfm_picture(folder).unlink()
     folder.scene.rmdir()
     settings_path(folder).rename(folder.root / "away.json")
-    monkeypatch.setattr("panolog.orchestrator.dashboard.actions._PROGRAM", "pass")
+    monkeypatch.setattr("sys.executable", "/bin/true")
     path = f"/api/runs/{served.id('walk')}/actions"
     assert served.client.post(path, json={"action": "resume"}, headers=POST).status_code == 409
     (folder.root / "away.json").rename(settings_path(folder))
@@ -146,10 +150,12 @@ def test_a_run_without_its_scene_can_be_resumed_only_if_it_makes_it(
 
 
 @pytest.mark.system
-def test_the_page_has_steps_numbers_pictures_and_then_exposures(folder: RunFolder, served: Served) -> None:
+def test_the_page_has_steps_numbers_pictures_and_then_exposures(
+    browser: Browser, folder: RunFolder, served: Served
+) -> None:
     url, path = (f"{served.url}/runs/{served.id('walk')}", f"/api/runs/{served.id('walk')}/exposure")
     assert served.client.get(path).status_code == 404
-    with lock.hold(folder.lock), chromium() as browser, opened(browser, url, width=PHONE) as page:
+    with lock.hold(folder.lock), opened(browser, url, width=PHONE) as page:
         card = page.locator("#preparation")
         running = card.locator(".step[data-status='running'] .step-note")
         expect(running).to_have_text("running · depth 3 of 10")

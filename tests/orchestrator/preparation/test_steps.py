@@ -1,6 +1,5 @@
 """A run of panoramas makes its scene first: step by step, whatever stops it."""
 
-import json
 import os
 import signal
 import threading
@@ -23,7 +22,8 @@ from panolog.orchestrator.run.store import read_records
 from panolog.prepare.sfm.pipeline import workspace_folder
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
-from tests.orchestrator.preparation.fake_sfm import FakeSfm, Killed, call, resume, start
+from tests.orchestrator.cli.program import call, shown
+from tests.orchestrator.preparation.fake_sfm import FakeSfm, Killed, resume, start
 from tests.prepare.networks.networks import given, red_depth
 
 
@@ -44,15 +44,12 @@ def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> N
     noticed = [it.message for it in records if isinstance(it, Noticed) and str(it.task) == "prepare"]
     assert noticed[0] == "9 of 10 panoramas have a pose"
     assert noticed[1].startswith("without a pose: 1, contradictions: 1; ")
-    done = json.loads(call("status", calm.root, "--json").stdout)
+    done = shown("status", calm.root)
     assert [step["status"] for step in done["preparation"]["steps"]] == ["done"] * 3
     assert done["preparation"]["registered"] == 9
 
 
-MOMENTS = ["features", "poses", "report", "masks", "check"]
-
-
-@pytest.mark.parametrize("moment", MOMENTS)
+@pytest.mark.parametrize("moment", ["features", "poses", "report", "masks", "check"])
 def test_a_run_killed_in_a_step_ends_with_the_same_bytes(
     moment: str, calm: RunFolder, raw: Path, sfm: FakeSfm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -75,8 +72,8 @@ def test_a_run_killed_in_a_step_ends_with_the_same_bytes(
     with pytest.raises(Killed):
         start(raw, root)
     assert RunFolder(killed).info.exists()
-    shown = json.loads(call("status", killed, "--json").stdout)
-    assert (shown["status"], shown["stage"]) == ("stopped", "prepare")
+    status = shown("status", killed)
+    assert (status["status"], status["stage"]) == ("stopped", "prepare")
     monkeypatch.setattr(notes, "write_note", write)
     sfm.at, sfm.done = ignore, []
     resume(killed)
@@ -100,8 +97,8 @@ def test_ctrl_c_in_the_preparation_is_resumed(
     sfm.at = interrupt
     with pytest.raises(KeyboardInterrupt):
         start(raw, tmp_path / "run")
-    shown = json.loads(call("status", tmp_path / "run", "--json").stdout)
-    assert (shown["status"], shown["stage"]) == ("interrupted", "prepare")
+    status = shown("status", tmp_path / "run")
+    assert (status["status"], status["stage"]) == ("interrupted", "prepare")
     sfm.at = ignore
     resume(tmp_path / "run")
     assert sfm.done == ["features", "poses"]
@@ -122,64 +119,50 @@ def test_a_request_to_stop_is_taken_in_the_preparation(raw: Path, sfm: FakeSfm, 
     assert list(RunFolder(root).control.iterdir()) == []
 
 
-def test_status_shows_how_far_the_preparation_is(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+def test_status_shows_how_far_the_preparation_is_and_no_other_process_joins(
+    raw: Path, sfm: FakeSfm, tmp_path: Path
+) -> None:
     root, seen = tmp_path / "run", list[Any]()
 
     def look(at: str) -> None:
         if at == "poses":
-            seen.append((call("status", root).stdout, json.loads(call("status", root, "--json").stdout)))
+            seen.append((call("status", root).stdout, shown("status", root)))
+            for again in (lambda: start(raw, root), lambda: resume(root)):
+                with pytest.raises(InputError, match="another driver is at work on it"):
+                    again()
 
     sfm.at = look
     start(raw, root)
-    ((text, shown),) = seen
+    ((text, status),) = seen
     assert text.startswith("preparing: poses 0 of 10 · 6%")
-    assert (shown["status"], shown["label"], shown["stage"]) == ("running", "preparing", "prepare")
-    (masks, step, check) = shown["preparation"]["steps"]
+    assert "masks: " in text
+    assert (status["status"], status["label"], status["stage"]) == ("running", "preparing", "prepare")
+    (masks, step, check) = status["preparation"]["steps"]
     assert (step["status"], step["what"], step["done"], step["total"]) == ("running", "poses", 0, 10)
     assert (masks["status"], check["status"]) == ("done", "waiting")
-    assert "masks: " in text
     assert call("pause", root, 0).exit_code == 2
 
 
-def test_two_processes_cannot_prepare_one_run(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
-    root, refused = tmp_path / "run", list[str]()
-
-    def again(at: str) -> None:
-        with pytest.raises(InputError) as started:
-            start(raw, root)
-        with pytest.raises(InputError) as resumed:
-            resume(root)
-        refused.extend([str(started.value), str(resumed.value)])
-        sfm.at = ignore
-
-    sfm.at = again
-    start(raw, root)
-    assert all("another driver is at work on it" in line for line in refused)
-    assert len(refused) == 2
+def with_masks(town: Path, source: Path, count: int) -> Path:
+    """Panoramas of the town, the first ones with masks of a strip on the left."""
+    copytree(town / "images", source / "images")
+    (source / "masks").mkdir()
+    mask = np.full((32, 64), 255, np.uint8)
+    mask[:, :8] = 0
+    for image in sorted((source / "images").iterdir())[:count]:
+        cv2.imwrite(str(source / "masks" / f"{image.stem}.png"), mask)
+    return source
 
 
 def test_masks_of_the_source_are_kept_as_they_are(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:
-    source = tmp_path / "source"
-    copytree(town / "images", source / "images")
-    for image in (source / "images").iterdir():
-        mask = np.full((32, 64), 255, np.uint8)
-        (source / "masks").mkdir(exist_ok=True)
-        cv2.imwrite(str(source / "masks" / f"{image.stem}.png"), mask)
-    start(source, tmp_path / "run")
+    start(with_masks(town, tmp_path / "source", 9), tmp_path / "run")
     settings = read_settings(RunFolder(tmp_path / "run"))
     assert settings is not None
     assert settings.steps() == (Step.SFM, Step.CHECK)
 
 
 def test_masks_of_the_source_are_joined_with_what_is_wanted(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:
-    source = tmp_path / "source"
-    copytree(town / "images", source / "images")
-    first = min((source / "images").iterdir())
-    mask = np.full((32, 64), 255, np.uint8)
-    mask[:, :8] = 0
-    (source / "masks").mkdir()
-    cv2.imwrite(str(source / "masks" / f"{first.stem}.png"), mask)
-    start(source, tmp_path / "run", nadir=45)
+    start(with_masks(town, tmp_path / "source", 1), tmp_path / "run", nadir=45)
     made = tmp_path / "run" / "scene" / "masks"
     assert len(list(made.iterdir())) == 9
     joined, other = (cv2.imread(str(it), cv2.IMREAD_GRAYSCALE) for it in sorted(made.iterdir())[:2])

@@ -18,19 +18,17 @@ from panolog.orchestrator.run.records import Outcome, Record, RunBegan, RunEnded
 from panolog.orchestrator.views.comparison.compare import compare
 from panolog.orchestrator.views.comparison.curves import curves_of
 from panolog.orchestrator.views.comparison.page import write_page
-from panolog.orchestrator.views.comparison.reading import UnreadRun, names_of, picture_of, read_runs
+from panolog.orchestrator.views.comparison.reading import names_of, picture_of, read_runs
 from panolog.orchestrator.views.comparison.schema import Comparison
 from panolog.orchestrator.views.comparison.terminal import table
 from panolog.scene.errors import InputError
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.views.comparison.runs import (
-    VALUES,
     finished,
     metrics,
     progressed,
     started,
     write,
-    write_picture,
 )
 
 HIGHER = {"a.jpg": 21.0, "b.jpg": 23.0, "c.jpg": 31.0}
