@@ -22,7 +22,7 @@ _COMPARED = ("finished", "failed", "live")
 
 @dataclass(frozen=True)
 class Site:
-    """The five runs, their reports, and the server of both."""
+    """The runs, reports of two, and the server of both."""
 
     root: Path
     served: Served
@@ -80,9 +80,7 @@ def site(root: Path) -> Iterator[Site]:
         queue_at_work(root, root / "runs", clock) as queue,
         serving(root / "runs", queue=queue) as served,
     ):
-        reports = {
-            state: write_report(runs[state], root / f"{state}.html") for state in ("finished", "live")
-        }
+        reports = {state: write_report(runs[state], root / f"{state}.html") for state in ("finished", "live")}
         comparison = root / "comparison.html"
         write_page([runs[state].root for state in _COMPARED], comparison)
         yield Site(root, served, runs, reports, comparison)

@@ -1,4 +1,4 @@
-"""Run folders as drivers leave them: finished, live, failed and killed, with all that pages show of a run."""
+"""Run folders as drivers leave them: finished, live, failed and preparing, with all that pages show."""
 
 import json
 import math
@@ -62,7 +62,6 @@ NAMES = {
     "finished": "harbour",
     "live": "old-town",
     "failed": "market-square",
-    "killed": "riverside",
     "preparing": "arcade",
 }
 LENGTH = 30_000  # iterations of a task
@@ -311,17 +310,6 @@ def failed(root: Path, clock: Clock) -> RunFolder:
     return run.folder
 
 
-def killed(root: Path, clock: Clock) -> RunFolder:
-    """The driver was killed six hours ago in Stage II: no record says so, and nothing holds the lock."""
-    with _written(root, clock, 7 * 3600, "5x1x1") as run:
-        _stage_one(run)
-        blocks = _partition(run)
-        run.add(*map(_started, blocks[:2]), after=4)
-        shares = {blocks[0]: (0.0, 0.55), blocks[1]: (0.0, 0.48)}
-        _train(run, shares, seconds=1250, gaussians=410_000)
-    return run.folder
-
-
 def preparing(root: Path, clock: Clock) -> RunFolder:
     """A run of a video that has masks and poses, and estimates depth."""
     with _written(root, clock, 1_540, "auto") as run:
@@ -366,13 +354,18 @@ def preparing(root: Path, clock: Clock) -> RunFolder:
 
 @contextmanager
 def all_runs(root: Path, clock: Clock) -> Iterator[dict[str, RunFolder]]:
-    """The five runs and, for the list, two smaller ones, while drivers hold the locks of the live ones."""
-    makers = {"finished": finished, "live": live, "failed": failed, "killed": killed, "preparing": preparing}
+    """The four runs and, for the list, three smaller ones, while drivers hold the locks of the live ones."""
+    makers = {"finished": finished, "live": live, "failed": failed, "preparing": preparing}
     folders = {state: maker(root / NAMES[state], clock) for state, maker in makers.items()}
-    with _written(root / "quarry-test", clock, 9 * 86_400, "2x1x1") as run:
-        run.add(_started(COARSE), after=12)
-        _train(run, {COARSE: (0.0, 0.42)}, seconds=400, gaussians=900_000)
-        run.add(StopRequested(1), RunEnded(Outcome.INTERRUPTED), after=9)
+    stopped: dict[str, tuple[Record, ...]] = {
+        "riverside": (),  # its driver was killed: no record says so, and nothing holds the lock
+        "quarry-test": (StopRequested(1), RunEnded(Outcome.INTERRUPTED)),
+    }
+    for days, (name, last) in enumerate(stopped.items(), 4):
+        with _written(root / name, clock, days * 86_400, "2x1x1") as run:
+            run.add(_started(COARSE), after=12)
+            _train(run, {COARSE: (0.0, 0.42)}, seconds=400, gaussians=900_000)
+            run.add(*last, after=9)
     (root / "damaged").mkdir()
     (root / "damaged" / "run.json").write_text("{")
     with lock.hold(folders["live"].lock), lock.hold(folders["preparing"].lock):

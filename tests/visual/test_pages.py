@@ -13,7 +13,11 @@ from tests.visual.pages import SHOTS, Shot, Site, show, site
 
 pytestmark = pytest.mark.system
 
-_QUIET_MS = (400, 1_200, 2_000)  # without a change, after which a page is looked at, and again on a busy machine
+_QUIET_MS = (
+    400,
+    1_200,
+    2_000,
+)  # without a change, after which a page is looked at, and again on a busy machine
 _STYLE = """(rules) => {
   const sheet = new CSSStyleSheet();
   sheet.replaceSync(rules);

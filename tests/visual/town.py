@@ -1,6 +1,5 @@
 """A small town as a run sees it: cameras along its streets, points on its houses, photographs and renders."""
 
-from functools import cache
 from pathlib import Path
 
 import cv2
@@ -14,36 +13,17 @@ from panolog.partition.contraction import contract
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import write_ply
-from panolog.synthetic.layout import camera_path, sun, town
-from panolog.synthetic.light import shade
-from panolog.synthetic.trace import PanoramaRays, Sun, cast
-
-_WIDTH, _PHOTOGRAPHS = 512, 6  # pixels of a panorama, and how many differ
-_STREETS = (
-    (-60.0, -14.0, 60.0, -14.0),
-    (-60.0, 16.0, 60.0, 16.0),
-    (-22.0, -40.0, -22.0, 40.0),
-    (24.0, -40.0, 24.0, 40.0),
-)
 
 
-@cache
-def _photographs() -> list[NDArray[np.uint8]]:
-    """(H, W, 3) BGR each: panoramas of the synthetic town."""
-    shapes = town(0)
-    light = Sun.over(shapes, sun(), texel=0.3)
-    pictures = []
-    for rotation, center in zip(*camera_path(_PHOTOGRAPHS, 0), strict=True):
-        rays = PanoramaRays(rotation, center, _WIDTH, 1)
-        color = shade(shapes, rays, cast(shapes, rays), light)
-        image = np.rint(255 * color.reshape(3, _WIDTH // 2, _WIDTH)).astype(np.uint8)
-        pictures.append(np.ascontiguousarray(image[::-1].transpose(1, 2, 0)))
-    return pictures
+def photograph(index: int) -> NDArray[np.uint8]:
+    """(256, 512, 3) BGR: patches of colour, other ones for each index."""
+    patches = np.random.default_rng(index).integers(0, 256, (16, 32, 3), np.uint8)
+    return np.asarray(cv2.resize(patches, (512, 256), interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
 def write_picture(path: Path, index: int, share: float) -> None:
     """Writes a JPEG of a render above its photograph: the more `share` of the training, the sharper."""
-    truth = _photographs()[index % _PHOTOGRAPHS]
+    truth = photograph(index)
     render = cv2.GaussianBlur(truth, (0, 0), 0.6 + 9 * (1 - share) ** 2)
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), np.concatenate([render, truth]), [cv2.IMWRITE_JPEG_QUALITY, 85])
@@ -63,48 +43,37 @@ def write_scene(root: Path, name: str) -> None:
     for folder in (root / "sparse" / "0", root / "images"):
         folder.mkdir(parents=True)
     (root / "sparse" / "0" / "cameras.txt").touch()
-    cv2.imwrite(str(root / "images" / name), _photographs()[2])
+    cv2.imwrite(str(root / "images" / name), photograph(2))
 
 
 def cameras(count: int) -> NDArray[np.float64]:
-    """(count, 3) centres along two streets and two lanes, in metres."""
+    """(count, 3) centres in turn along a street and a lane that cross, in metres."""
+    along = np.linspace(-60, 60, count)
+    street, lane = (
+        np.column_stack(way) for way in ((along, 0 * along - 14), (0 * along + 24, along * 2 / 3))
+    )
+    places = np.where(np.arange(count)[:, None] % 2 == 0, street, lane)
     random = np.random.default_rng(1)
-    streets = np.array(_STREETS)
-    street = np.arange(count) % len(streets)
-    along = (np.arange(count) // len(streets) + 0.5) / (count / len(streets))
-    ends = streets[street].reshape(count, 2, 2)
-    places = ends[:, 0] + along[:, None] * (ends[:, 1] - ends[:, 0])
     return np.column_stack([places + random.normal(0, 0.8, (count, 2)), random.normal(1.7, 0.1, count)])
 
 
 def points(count: int = 12_000) -> NDArray[np.float64]:
-    """(count, 3) on the walls and roofs of houses along the streets, in metres."""
+    """(count, 3) in houses, and some in the land around, in metres."""
     random = np.random.default_rng(2)
-    corners = random.uniform([-66, -46], [60, 40], (90, 2))
-    sizes = random.uniform(6, 15, (90, 2))
-    house = random.integers(0, 90, count)
-    inside = random.uniform(0, 1, (count, 2))
-    wall = random.random(count) < 0.7
-    side = random.integers(0, 2, count)
-    inside[wall, side[wall]] = np.round(inside[wall, side[wall]])
-    places = corners[house] + inside * sizes[house] + random.normal(0, 0.15, (count, 2))
-    far = random.random(count) < 0.15  # the land around
-    places[far] += random.normal(0, 70, (int(far.sum()), 2))
+    houses = random.uniform([-66, -46], [60, 40], (90, 2))
+    places = houses[random.integers(0, 90, count)] + random.uniform(-4, 4, (count, 2))
+    places[::7] += random.normal(0, 70, places[::7].shape)
     return np.column_stack([places, random.uniform(0, 8, count)])
 
 
-def write_model(path: Path, sky: int = 500) -> None:
-    """Writes a PLY with Gaussians at the points, and a sky."""
+def write_model(path: Path) -> None:
+    """Writes a PLY with Gaussians at the points."""
     means = torch.from_numpy(points()).float()
-    dome = torch.nn.functional.normalize(
-        torch.randn(sky, 3, generator=torch.Generator().manual_seed(0)), dim=1
-    )
-    means = torch.cat([means, 400 * dome])
     n = len(means)
-    quats = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1)
-    scales, shs = torch.full((n, 3), -2.0), (torch.zeros(n, 1, 3), torch.zeros(n, 15, 3))
+    quats, scales = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1), torch.full((n, 3), -2.0)
+    colours = torch.zeros(n, 1, 3), torch.zeros(n, 15, 3)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_ply(path, Gaussians(means, quats, scales, torch.zeros(n), *shs, sky=sky))
+    write_ply(path, Gaussians(means, quats, scales, torch.zeros(n), *colours, sky=0))
 
 
 def plan(grid: str, count: int) -> Plan:
