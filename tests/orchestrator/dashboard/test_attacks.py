@@ -170,8 +170,8 @@ def test_files_that_are_no_files(tmp_path: Path) -> None:
             if name in rows and name != "folder control":
                 assert rows[name]["status"] == "unreadable", name
             id = RunEntry(tmp_path / "folder", name).id
-            for path in ("", "/events", "/previews", "/series?task=coarse", "/map"):
-                assert "a secret outside" not in served.client.get(f"/api/runs/{id}{path}").text
+            for part in ("", "/events", "/previews", "/series?task=coarse", "/map"):
+                assert "a secret outside" not in served.client.get(f"/api/runs/{id}{part}").text
             served.act(id, "stop")
     assert not list(outside.control.iterdir())
 

@@ -1,7 +1,7 @@
 """A run that makes its scene: what its page shows meanwhile, and what it believes of files in RUN/prepare."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -116,7 +116,8 @@ def huge(path: Path) -> None:
 
 
 def test_files_made_to_do_harm_show_nothing(tmp_path: Path) -> None:
-    spoils = {"pipe": pipe, "link": link, "huge": huge, "damaged": lambda path: path.write_bytes(b"{")}
+    spoils: dict[str, Callable[[Path], object]] = {"pipe": pipe, "link": link, "huge": huge}
+    spoils["damaged"] = lambda path: path.write_bytes(b"{")
     for name, spoil in spoils.items():
         spoil(settings_path(write_preparing(tmp_path / "runs" / name)))
         spoil(notes.progress_path(write_preparing(tmp_path / "runs" / f"{name} progress")))

@@ -1,6 +1,5 @@
 """What the terminal shows of a run, at the usual widths."""
 
-import json
 import re
 import time
 from dataclasses import replace
@@ -25,7 +24,6 @@ from panolog.orchestrator.run.records import (
     TaskYielded,
 )
 from panolog.orchestrator.run.state import RunState
-from panolog.orchestrator.views.summary import summarize
 from panolog.orchestrator.views.terminal import WIDE, page, progress
 from tests.orchestrator.views.test_timing import (
     INFO,
@@ -132,22 +130,6 @@ def test_plain_lines_say_what_leaves_and_what_moves() -> None:
         "gpu-07 (3f2a81c4): has left",
         "gpu-08 (7f2a81c4): stays after all, and is used again",
     ]
-
-
-def test_status_says_which_machines_leave_and_how_often_a_task_moved() -> None:
-    summary = summarize(state([*LARGE, (20_001, LEAVES), (20_002, TaskYielded(ONE, "gpu-07"))]), running=True)
-    (leaving,) = json.loads(summary.model_dump_json())["leaving"]
-    assert leaving == {
-        "node": "3f2a81c4d5e6",
-        "host": "gpu-07",
-        "kind": "preemption",
-        "reason": "its provider takes it away; tasks there save a checkpoint and move",
-        "until": 20_121.0,
-    }
-    task = summary.task(str(ONE))
-    assert task is not None
-    assert task.moves == 1
-    assert [notice.message for notice in summary.notices if "gpu-07" in notice.message]
 
 
 def test_plain_lines_say_it_also_where_no_record_can_be_stored() -> None:
