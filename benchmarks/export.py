@@ -41,7 +41,6 @@ from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.model import Scene
 from panolog.scene.ply import (
-    COLUMNS,
     ply_exact,
     ply_header,
     read_ply,
@@ -62,7 +61,6 @@ FORMATS = {
     "web": (["--web"], "-web", False),
     "3dtiles": (["--3dtiles"], "-3dtiles", False),
 }
-_ROW = 4 * len(COLUMNS)  # bytes of a Gaussian in a PLY
 _MEASURED = """\
 import sys
 from benchmarks.processes import peak_memory

@@ -31,6 +31,11 @@ def peak_memory(pid: int | None = None) -> int:
     return int(status.partition("VmHWM:")[2].split()[0]) * 1024
 
 
+def resident_memory() -> int:
+    """Resident set of this process at present, in bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
 def drop_from_page_cache(path: Path) -> None:
     """Writes a file's changes to the disk and removes the file from the page cache."""
     with path.open("rb") as file:

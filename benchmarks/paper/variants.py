@@ -5,7 +5,7 @@ A variant whose iterations depend on what others have taken states these, so tha
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.paper.results import Result
@@ -86,7 +86,6 @@ class Group:
     variants: tuple[str, ...]
     note: str = ""
     source: str = ""  # the paper's table, if it has one
-    columns: tuple[str, ...] = field(default=())
 
 
 def flat(config: RunConfig) -> dict[str, Any]:

@@ -1,15 +1,10 @@
 """Ray-casts the places of `layouts`: photographs in the order of the walk, or a video of them.
 
-    python -m benchmarks.places.shoot PLACE FOLDER [--bare] [--width 1024] [--seed 0]
-
 The light is that of an overcast day: no shadow distinguishes one side of a square from the other.
 """
 
-import argparse
 import json
 import os
-import sys
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,21 +104,3 @@ def as_video(walk: Walk, video: Path, fps: float = 2.0) -> Path:
         writer.write(picture)
     writer.release()
     return video
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The program; returns its exit code."""
-    parser = argparse.ArgumentParser("python -m benchmarks.places.shoot", description=__doc__)
-    parser.add_argument("place", choices=LAYOUTS)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--bare", action="store_true", help="no texture on ground and sky")
-    parser.add_argument("--width", type=int, default=1024)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args(arguments)
-    walk = shoot(options.place, options.folder, bare=options.bare, width=options.width, seed=options.seed)
-    as_video(walk, options.folder / "walk.mp4")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

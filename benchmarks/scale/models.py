@@ -1,6 +1,5 @@
 """Models on disk: merge and levels of detail of more and more Gaussians, and the law that they follow."""
 
-import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.merge_scale import measure as measure_merge
-from benchmarks.processes import in_fresh_process, peak_memory
+from benchmarks.processes import in_fresh_process, peak_memory, resident_memory
 from benchmarks.scale.places import city
 from panolog.orchestrator.estimates.suggestions import balanced
 from panolog.orchestrator.run.config import RunConfig, change
@@ -79,7 +78,7 @@ def _hierarchy(folder: Path, panoramas: int, each: int) -> LevelsRow:
     whole = folder / "whole.ply"
     count = _write_model(whole, scene, each)
     reset_peaks("cpu")
-    before, began = _resident(), time.perf_counter()
+    before, began = resident_memory(), time.perf_counter()
     levels = Surroundings(scene, whole, config, _WIDTH)
     seconds, peak = time.perf_counter() - began, peak_memory()
     blocks = config.grid.count
@@ -94,11 +93,6 @@ def _hierarchy(folder: Path, panoramas: int, each: int) -> LevelsRow:
     cut = (time.perf_counter() - began) / len(chosen)
     memory = (peak - before) / count
     return LevelsRow(panoramas, blocks, count, seconds, memory, cut, round(sum(counts) / len(counts)))
-
-
-def _resident() -> int:
-    """Bytes of memory of this process."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _write_model(path: Path, scene: Scene, each: int) -> int:

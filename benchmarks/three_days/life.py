@@ -17,6 +17,7 @@ from enum import Enum
 from pathlib import Path
 from unittest.mock import patch
 
+from benchmarks.processes import resident_memory
 from benchmarks.three_days import faults
 from benchmarks.three_days.cluster import SimulatedCluster, VirtualClock
 from benchmarks.three_days.faults import Fault, Period
@@ -181,7 +182,7 @@ class _World:
         sample = Sample(
             hours=self._clock.now / HOUR,
             driver=self._number,
-            memory=_resident(),
+            memory=resident_memory(),
             descriptors=sum(1 for _ in Path("/proc/self/fd").iterdir()),
             database=self._paths.run.database.stat().st_size,
             cpu=time.process_time() - self.cluster.cpu - self._cpu,
@@ -221,11 +222,6 @@ class _World:
 
 def _within(periods: tuple[Period, ...], now: float) -> bool:
     return any(period.has(now) for period in periods)
-
-
-def _resident() -> int:
-    """Bytes of memory of this process."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _disk(folder: str | Path) -> int:
