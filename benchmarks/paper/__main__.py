@@ -1,7 +1,6 @@
 """The paper's tables and the recipes' worth on some scenes, in one resumable command.
 
     python -m benchmarks.paper SCENE ... -o FOLDER [--width 512] [--iterations 600] [--seeds 3]
-    python -m benchmarks.paper SCENE -o FOLDER --tables main,switches --opensplat BINARY
     python -m benchmarks.paper SCENE ... -o FOLDER --also OTHER --docs docs/quality.md
 
 FOLDER keeps every run and its result; what is there is not run again.
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import report
-from benchmarks.paper import pages, peer, results, study, tables
+from benchmarks.paper import pages, study, tables
 from benchmarks.paper.crops import Comparison, compare
 from benchmarks.paper.goals import KINDS
 from benchmarks.paper.measure import Gallery
@@ -31,13 +30,12 @@ from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.partition.plan import Plan, read_plan
 from panolog.renderer.process import prepare
-from panolog.scene.errors import InputError, RunError
+from panolog.scene.errors import InputError
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 
 _SHOWN = ("paper", "panolog", "panolog-time", "panolog-stage1")  # in crops
 _PLANS = ("paper", "panolog")  # whose overlap is shown
-_PATIENCE = 3.0  # times the seconds of `paper` that the peer may take
 
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
@@ -53,7 +51,6 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=1, help="of what is given with a spread")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
     parser.add_argument("--set", dest="sets", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--opensplat", type=Path, metavar="BINARY", help="train this peer too")
     parser.add_argument(
         "--kind",
         dest="kinds",
@@ -92,8 +89,6 @@ def checked(options: argparse.Namespace) -> Settings:
     for scene in options.scenes:
         if not read_scene(scene).test:
             raise InputError(f"{scene}: has no held-out panoramas, so nothing can be measured")
-    if options.opensplat:
-        peer.check(options.opensplat)
     settings = Settings(
         options.width, options.iterations, options.blocks, options.device, tuple(options.sets)
     )
@@ -149,7 +144,6 @@ def measure(options: argparse.Namespace, settings: Settings) -> Study:
     for result in run_all(benches, tables_of_variants, finished=options.finished):
         done.append(result)
         so_far().save(options.output)
-    done += [found for bench in benches if bench.seed == 0 and (found := _peer(bench, options))]
     made = so_far()
     made.save(options.output)
     pages.write(options.output, made, [c for b in benches if b.seed == 0 for c in _crops(b, chosen)])
@@ -173,30 +167,7 @@ def _words(options: argparse.Namespace) -> list[str]:
     words += ["--width", str(options.width), "--iterations", str(options.iterations)]
     words += ["--blocks", options.blocks, "--seeds", str(options.seeds)]
     words += [part for setting in options.sets for part in ("--set", setting)]
-    words += [part for scene, kind in options.kinds.items() for part in ("--kind", f"{scene}={kind}")]
-    return words + (["--opensplat", "BINARY"] if options.opensplat else [])
-
-
-def _peer(bench: Bench, options: argparse.Namespace) -> Result | None:
-    """OpenSplat on a scene, for as many iterations as `paper` has in all; None if it is not wanted."""
-    file = bench.folder / f"{tables.PEER}@0.json"
-    if known := results.load(file):
-        return known
-    if not options.opensplat or options.finished:
-        return None
-    paper = bench.done.get("paper")
-    try:
-        if paper is None:
-            raise RunError("it is compared with paper, which has no result: give --tables main")
-        print(f"paper: {bench.scene.name}: OpenSplat", file=sys.stderr)
-        gallery = Gallery.of(paper.root, bench.settings.device)
-        iterations = paper.result.iterations * (1 + paper.result.blocks)
-        limit = _PATIENCE * paper.result.total
-        found = peer.train(options.opensplat, gallery, bench.folder / tables.PEER, iterations, limit)
-    except RunError as error:
-        return Result(bench.scene.name, tables.PEER, 0, failed=str(error))
-    results.save(file, found)
-    return found
+    return words + [part for scene, kind in options.kinds.items() for part in ("--kind", f"{scene}={kind}")]
 
 
 def _crops(bench: Bench, chosen: Sequence[Variant]) -> list[Comparison]:
@@ -208,9 +179,6 @@ def _crops(bench: Bench, chosen: Sequence[Variant]) -> list[Comparison]:
         return []
     gallery = Gallery.of(bench.done[shown[0]].root, bench.settings.device)
     models = {name: read_ply(RunFolder(bench.done[name].root).point_cloud) for name in shown}
-    theirs = sorted((bench.folder / tables.PEER).glob("splat*.ply"), key=lambda path: path.stat().st_mtime)
-    if theirs:
-        models[tables.PEER] = read_ply(theirs[-1])
     return compare(bench.scene.name, gallery, models)
 
 

@@ -20,6 +20,7 @@ from benchmarks.paper import results, snapshots
 from benchmarks.paper.code import Code, present
 from benchmarks.paper.measure import Gallery, haze
 from benchmarks.paper.results import Point, Result
+from benchmarks.paper.tables import overlap_of
 from benchmarks.paper.variants import (
     Measured,
     Settings,
@@ -89,7 +90,7 @@ class Bench:
         except (RunError, ConfigError) as error:  # the latter: a switch that needs others
             return self._failed(variant, str(error))
         if known is None:
-            result = replace(result, notes=(*result.notes, *self._off(variant, result)))
+            result = replace(result, notes=(*result.notes, *self.off(variant, result)))
             results.save(self._file(variant), result)
         root = self.done[result.same_as].root if result.same_as else self._root(variant)
         self.done[variant.name] = Done(config, result, root)
@@ -120,7 +121,7 @@ class Bench:
         """What there is so far."""
         return {name: done.result for name, done in self.done.items()}
 
-    def _off(self, variant: Variant, result: Result) -> Iterable[str]:
+    def off(self, variant: Variant, result: Result) -> Iterable[str]:
         """How far a run that was given the time of another has missed it, where that is much."""
         if variant.aim is None:
             return
@@ -147,7 +148,7 @@ class Bench:
         donor = self._donor(config)
         root, kept = self._root(variant), self._file(variant, ".states")
         watched = variant.curve and self.seed == 0
-        self._begin(variant, config)
+        self.begin(variant, config)
         if donor is not None and not RunFolder(root).info.exists():
             changes = differing(donor.config, config)
             scored = config["refine"] and _scored(donor.root) and same_scores(donor.config, config)
@@ -171,7 +172,7 @@ class Bench:
         except InputError as error:
             raise RunError(str(error)) from error
 
-    def _begin(self, variant: Variant, config: dict[str, Any]) -> None:
+    def begin(self, variant: Variant, config: dict[str, Any]) -> None:
         """Removes what is there of a run of other settings or other code."""
         begun, wanted = self._file(variant, ".begun"), {"sources": self.code.sources, "settings": config}
         if not begun.exists() or json.loads(begun.read_bytes()) != wanted:
@@ -226,7 +227,7 @@ class Bench:
         if (drivers := sum(isinstance(item.record, RunBegan) for item in records)) > 1:
             notes.append(f"resumed ({drivers - 1}): work done twice counts twice")
         plan = read_plan(RunFolder(root).plan) if RunFolder(root).plan.exists() else None
-        overlap, added = overlap_of(plan) if plan else (None, None)
+        overlap, added = overlap_of(plan.assignment) if plan else (None, None)
         result = Result(
             self.scene.name,
             variant.name,
@@ -343,14 +344,6 @@ def equal_plans(a: Plan, b: Plan) -> bool:
     same = a.grid == b.grid and np.array_equal(a.aabb.lower, b.aabb.lower)
     same = same and np.array_equal(a.aabb.upper, b.aabb.upper)
     return bool(same and np.array_equal(a.assignment.assigned, b.assignment.assigned))
-
-
-def overlap_of(plan: Plan) -> tuple[float, float]:
-    """Blocks that a camera trains on average, and the share of all assignments that gradients add."""
-    assignment = plan.assignment
-    all_of_them = int(assignment.assigned.sum())
-    added = int((assignment.gradient & ~assignment.geometric).sum())
-    return all_of_them / max(len(plan.rows), 1), added / max(all_of_them, 1)
 
 
 def peak_of(records: Sequence[Stored]) -> int | None:

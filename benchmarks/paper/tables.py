@@ -8,11 +8,10 @@ from benchmarks import report
 from benchmarks.paper import reference
 from benchmarks.paper.results import METRICS, Result, Results, spread
 from benchmarks.paper.variants import Group, groups, variants
-from panolog.partition.assignment import assign
+from panolog.partition.assignment import Assignment, assign
 from panolog.partition.plan import Plan
 
 TAUS = (1.0, 0.9, 0.8, 0.7, 0.5, 0.3, 0.1, 0.02)
-PEER = "opensplat"
 _FIELDS = (
     *("scene", "variant", "seed", "iterations", "blocks", *METRICS, "gaussians", "bytes", "haze"),
     *(
@@ -69,8 +68,7 @@ def main_tables(results: Results, chosen: Sequence[str], scenes: Sequence[Path])
 
 def _of_group(results: Results, group: Group, scene: Path, *, first: bool) -> Table:
     base = group.variants[0]
-    names = group.variants + ((PEER,) if group.name == "main" else ())
-    rows = [row for name in names if (row := _row(results, scene.name, name, base))]
+    rows = [row for name in group.variants if (row := _row(results, scene.name, name, base))]
     notes = [group.note] if group.note and first else []
     found = [reference.TABLES[group.source]] if group.source else []
     if group.name == "main" and (known := reference.published(scene)):
@@ -106,7 +104,6 @@ HEAD = (
 def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ...] | None:
     """A variant's row; None if it was not run."""
     found = results.of(scene, name)
-    what = variants()[name].what if name in variants() else "OpenSplat on cube faces"
     if not found:
         why = results.failure(scene, name)
         return (name, *(None,) * 13, f"failed: {why}") if why else None
@@ -126,7 +123,7 @@ def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ..
         spread(r.on_workers / 60 for r in found),
         first.memory and first.memory / 1e9,
         steps,
-        "; ".join([what, *([same] if same else []), *first.notes, *_code(first, results)]),
+        "; ".join([variants()[name].what, *([same] if same else []), *first.notes, *_code(first, results)]),
     )
 
 
@@ -147,13 +144,15 @@ def _same(result: Result, equal: bool) -> str:
 
 def overlaps(scene: str, variant: str, plan: Plan) -> list[Overlap]:
     """What the scores of a plan assign at other τ."""
-    made = []
-    for tau in TAUS:
-        assignment = assign(plan.camera_blocks, plan.scores, tau)
-        count = int(assignment.assigned.sum())
-        added = int((assignment.gradient & ~assignment.geometric).sum())
-        made.append(Overlap(scene, variant, tau, count / max(len(plan.rows), 1), added / max(count, 1)))
-    return made
+    assigned = ((tau, assign(plan.camera_blocks, plan.scores, tau)) for tau in TAUS)
+    return [Overlap(scene, variant, tau, *overlap_of(found)) for tau, found in assigned]
+
+
+def overlap_of(assignment: Assignment) -> tuple[float, float]:
+    """Blocks that a camera trains on average, and the share of all assignments that gradients add."""
+    count = int(assignment.assigned.sum())
+    added = int((assignment.gradient & ~assignment.geometric).sum())
+    return count / max(len(assignment.assigned), 1), added / max(count, 1)
 
 
 def overlap_table(found: Sequence[Overlap]) -> Table:

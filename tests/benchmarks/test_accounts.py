@@ -7,9 +7,7 @@ import pytest
 from benchmarks.contention import Phase, rows
 from benchmarks.dashboard.simulated_run import RunSize, write_run
 from benchmarks.driver_scale.__main__ import lost
-from benchmarks.driver_scale.simulated_pool import grid
 from benchmarks.merge_scale import SKY, _check, fill, measure
-from benchmarks.overhead import Turn, Turns
 from benchmarks.processes import in_fresh_process, peak_memory
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Progressed, Stored
@@ -28,12 +26,6 @@ def test_rates_among_other_processes_have_medians_spread_and_ratios() -> None:
     assert rows(phases) == [(0, 2, 10.0, 9.0, 12.0, 1.0), (1, 2, 5.0, 4.0, 7.0, 0.5)]
 
 
-def test_the_cost_is_that_of_both_runs_and_the_noise_is_between_them() -> None:
-    first, plain, second = (Turn(name, s, s, 0, {}) for name, s in (("run", 11), ("plain", 10), ("run", 10)))
-    turns = Turns((first, plain, second))
-    assert (turns.cost, turns.noise) == pytest.approx((0.05, 0.1))
-
-
 def test_lost_repeated_and_late_events_are_counted() -> None:
     received = [(ZERO, 1), (ZERO, 2), (ONE, 1), (ONE, 3)]
     records = [Stored(i, 0.0, Progressed(task, n, 9, 1.0)) for i, (task, n) in enumerate(received)]
@@ -43,10 +35,6 @@ def test_lost_repeated_and_late_events_are_counted() -> None:
     kept = [Stored(i, 0.0, Progressed(ZERO, i, 300, 1.0)) for i in (*range(1, DENSE + 1), 200, 300)]
     assert lost({ZERO: 300}, kept) == 0
     assert lost({ZERO: 300}, kept[:-1]) == 1
-
-
-def test_grids_are_as_cubic_as_they_can_be() -> None:
-    assert [str(grid(blocks)) for blocks in (1, 12, 7, 1000)] == ["1x1x1", "3x2x2", "7x1x1", "10x10x10"]
 
 
 def test_a_simulated_run_is_a_run(tmp_path: Path) -> None:
