@@ -4,47 +4,57 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
+from benchmarks.movers.__main__ import TRAININGS
+from benchmarks.runs import history
 from benchmarks.three_days.faults import Fault
+from panolog.orchestrator.run.records import ModelSaved, TaskStarted
+from panolog.scene.colmap import write_colmap
+from panolog.workers.tasks import Stage
 from tests.deploy.files import ROOT
+from tests.prepare.video.videos import HEIGHT, WIDTH, render, walk
+from tests.scenes import write_scene
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]  # the longest takes four minutes alone
 Found = dict[str, Any]
 
 
-def chaos(found: Found) -> None:
+def chaos(found: Found, _: Path) -> None:
     undisturbed, disturbed = found["runs"]
     assert disturbed["costs"]
     assert disturbed["digest"] == undisturbed["digest"], disturbed["end"]
 
 
-def notices(found: Found) -> None:
+def notices(found: Found, _: Path) -> None:
     calm, moved = (run for run in found["runs"] if run["nodes"] == 3)
     assert moved["digest"] == calm["digest"], moved["end"]
     assert moved["cost"]["redone"] == 0
     assert moved["cost"]["checkpoint"] is not None
 
 
-def contention(found: Found) -> None:
+def contention(found: Found, _: Path) -> None:
     assert [phase["taken"] for phase in found["phases"]][:2] == [0, 1]
     assert all(rate > 0 for phase in found["phases"] for rate in phase["rates"])
 
 
-def cuda_resources(found: Found) -> None:
+def cuda_resources(found: Found, _: Path) -> None:
     names = {kernel["name"] for kernel in found["kernels"]}
     assert {"project_forward", "composite_backward", "loss_gradient", "adam_step"} <= names
 
 
-def dashboard(found: Found) -> None:
+def dashboard(found: Found, _: Path) -> None:
     measured = found["report"]
     assert min(measured["warm"], *measured["alone"], *measured["among"]) > 0
 
 
-def driver_scale(found: Found) -> None:
+def driver_scale(found: Found, _: Path) -> None:
     measured = found["report"]
     assert measured["events"] >= 12 * 8
     assert measured["lost"] == 0
@@ -52,26 +62,43 @@ def driver_scale(found: Found) -> None:
     assert all(times["median"] > 0 for times in measured["status"].values())
 
 
-def merge_scale(found: Found) -> None:
+def merge_scale(found: Found, _: Path) -> None:
     assert [turn["name"] for turn in found["turns"]] == ["cat", "merge", "cat"]
     assert 0 < found["turns"][1]["before"] <= found["turns"][1]["peak"]
 
 
-def overhead(found: Found) -> None:
-    first, plain, _ = found["turns"]
-    # Each of two blocks saves twice, but not before the driver has taken its last file: so it may be once.
-    assert first["checkpoints"] in (2, 3, 4) and plain["checkpoints"] == 0
-    assert set(first["digests"]) == {"block/000", "block/001"}
-    assert first["digests"] == plain["digests"]
-    assert all(turn["seconds"] > turn["training"] > 0 for turn in found["turns"])
+def movers(found: Found, _: Path) -> None:
+    trained = [(result["seed"], result["scene"], result["masks"]) for result in found["results"]]
+    assert trained == [(seed, *training) for seed, training in product((0, 1), TRAININGS)]
 
 
-def saving(found: Found) -> None:
+def paper(found: Found, folder: Path) -> None:
+    results = {result["variant"]: result for result in found["results"]}
+    assert list(results) == ["paper", "no-g2ps", "no-sky", "no-depth", "tau-0.7", "tau-0.8", "tau-0.9"]
+    assert results["tau-0.8"]["same_as"] == "paper"
+    curve = results["paper"]["curve"]
+    assert curve == sorted(curve, key=lambda point: point["seconds"])
+    assert {point["stage"] for point in curve} == {"coarse", "block", "merged"}
+    assert results["no-sky"]["gaussians"] < results["paper"]["gaussians"]
+    shared = {name for name, result in results.items() if "Stage I of paper" in result["notes"]}
+    assert "no-g2ps" in shared | {name for name in results if results[name]["same_as"]}
+    assert shared.isdisjoint({"paper", "no-sky", "no-depth"})
+    records = [item.record for item in history(folder / "scene" / "paper@0")]
+    blocks = [r for r in records if isinstance(r, TaskStarted | ModelSaved) and r.task.stage is Stage.BLOCK]
+    assert [type(record) for record in blocks] == 2 * [TaskStarted, ModelSaved]  # one after another
+    assert not list((folder / "scene").glob("*.states"))
+
+
+def performance(found: Found, _: Path) -> None:
+    assert "street" in Path(found["page"]).read_text()
+
+
+def saving(found: Found, _: Path) -> None:
     assert [one["writers"] for one in found["measured"]] == [1, 2, 4]
     assert all(one["most"] <= one["writers"] for one in found["measured"])
 
 
-def scale(found: Found) -> None:
+def scale(found: Found, _: Path) -> None:
     first, resumed = found["driver"]["first"], found["driver"]["resumed"]
     assert first["messages"] > 0 and resumed["messages"] > 0
     assert resumed["lost"] == 0
@@ -84,39 +111,74 @@ def scale(found: Found) -> None:
     assert found["cities"]["cities"][1]["stages"]["coarse"]["count"] == 7  # of at most 12 of 21 panoramas
 
 
-def three_days(found: Found) -> None:
+def sfm(found: Found, _: Path) -> None:
+    plain, ours = found["results"]
+    assert plain["registered"] in (0, 5)  # 0: COLMAP begins with no pair that moves along z
+    assert (ours["registered"], ours["contradictions"]) == (5, 0)
+    assert ours["drift"] < 1.0
+    assert ours["step"] == pytest.approx(1.0, abs=0.05)
+
+
+def three_days(found: Found, folder: Path) -> None:
     assert found["problems"] == []
     assert [bound for bound in found["bounds"] if not bound["met"] and not bound["timed"]] == []
     assert (found["faults"]["driver killed"], found["faults"]["driver stopped"]) == (3, 1)
     assert all(found["faults"][kind.value] for kind in (Fault.NODE_LOST, Fault.BAD_NODE))
     assert found["samples"][-1]["done"] > found["load"]["blocks"]
+    assert (folder / "curves.svg").stat().st_size > 10_000
+    assert [path.name for path in folder.iterdir()] == ["curves.svg"]
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A scene of noise, and a short street that poses can be found in."""
+    root = tmp_path_factory.mktemp("scenes")
+    noise = write_scene(root / "scene", names=[f"{i:02d}.jpg" for i in range(12)], points=500)
+    street, poses = root / "street", []
+    (street / "images").mkdir(parents=True)
+    for number, shot in enumerate(walk([0.9] * 5)):
+        cv2.imwrite(str(street / "images" / f"{number}.png"), render(shot))
+        poses.append((f"{number}.png", np.eye(3), np.array([0.0, 0.0, -shot.along])))
+    write_colmap(
+        street / "sparse" / "0",
+        poses,
+        width=WIDTH,
+        height=HEIGHT,
+        points=np.random.default_rng(0).normal(size=(9, 3)),
+        colors=np.zeros((9, 3), np.uint8),
+        observations=[(np.empty(0, np.int64), np.empty((0, 2)))] * 5,
+    )
+    return {"scene": noise, "street": street}
 
 
 PARTS = "cities,driver,dashboard,merge,levels"
-PROGRAMS: list[tuple[Callable[[Found], None], str, tuple[str, ...]]] = [
-    (chaos, "chaos", ("--runs", "1", "--seed", "4", "--faults", "driver,eio")),
-    (notices, "chaos.notices", ("--runs", "1", "--seconds", "120", "--nodes", "3")),
-    (contention, "contention", ("--quick",)),
-    (cuda_resources, "cuda_resources", ("--arch", "sm_89")),
-    (dashboard, "dashboard", ("--quick",)),
-    (driver_scale, "driver_scale", ("--quick", "--folder", "{folder}")),
-    (merge_scale, "merge_scale", ("--quick", "--folder", "{folder}")),
-    (overhead, "overhead", ("--quick", "--folder", "{folder}")),
-    (saving, "saving", ("--quick", "--folder", "{folder}")),
-    (scale, "scale", ("--quick", "-o", "{folder}", "--only", PARTS)),
-    (three_days, "three_days", ("--quick", "--folder", "{folder}", "--plot", "{folder}/curves.svg")),
+PAPER = (
+    "{scene} -o {folder} --tables ablations,tau --width 32 --iterations 16 --set sky.count=20 --device cpu"
+)
+PROGRAMS: list[tuple[Callable[[Found, Path], None], str, str]] = [
+    (chaos, "chaos", "--runs 1 --seed 4 --faults driver,eio"),
+    (notices, "chaos.notices", "--runs 1 --seconds 120 --nodes 3"),
+    (contention, "contention", "--quick"),
+    (cuda_resources, "cuda_resources", "--arch sm_89"),
+    (dashboard, "dashboard", "--quick"),
+    (driver_scale, "driver_scale", "--quick --folder {folder}"),
+    (merge_scale, "merge_scale", "--quick --folder {folder}"),
+    (movers, "movers", "{scene} -o {folder}/crowd --train --width 64 --iterations 20 --seeds 0,1"),
+    (paper, "paper", PAPER),
+    (performance, "performance", "--quick -o {folder}/performance.md"),
+    (saving, "saving", "--quick --folder {folder}"),
+    (scale, "scale", f"--quick -o {{folder}} --only {PARTS}"),
+    (sfm, "sfm", "{street}"),
+    (three_days, "three_days", "--quick --folder {folder} --plot {folder}/curves.svg"),
 ]
 
 
 @pytest.mark.parametrize(("check", "name", "options"), PROGRAMS, ids=[name for _, name, _ in PROGRAMS])
 def test_a_program_measures(
-    check: Callable[[Found], None], name: str, options: tuple[str, ...], tmp_path: Path
+    check: Callable[[Found, Path], None], name: str, options: str, tmp_path: Path, scenes: dict[str, Path]
 ) -> None:
-    words = [option.format(folder=tmp_path) for option in options]
+    words = [word.format(folder=tmp_path, **scenes) for word in options.split()]
     command = [sys.executable, "-m", f"benchmarks.{name}", "--json", *words]
     ended = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
     assert ended.returncode in (0, 1) and ended.stdout, ended.stderr  # 1: a goal of speed is missed
-    check(json.loads(ended.stdout))
-    if name == "three_days":
-        assert (tmp_path / "curves.svg").stat().st_size > 10_000
-        assert [path.name for path in tmp_path.iterdir()] == ["curves.svg"]
+    check(json.loads(ended.stdout), tmp_path)
