@@ -22,10 +22,6 @@ def test_no_gradient_at_all_leaves_the_geometric_block_only() -> None:
     assert assignment.assigned.tolist() == [[False, True]]
 
 
-def test_tau_of_one_assigns_by_position_only() -> None:
-    assert not assign([0, 1], np.random.default_rng(0).random((2, 5)), 1.0).gradient.any()
-
-
 def test_the_size_of_scores_does_not_matter() -> None:
     scores = np.random.default_rng(1).random((20, 4))
     usual = assign(np.zeros(20, int), scores, 0.8).gradient
@@ -33,15 +29,16 @@ def test_the_size_of_scores_does_not_matter() -> None:
         np.testing.assert_array_equal(assign(np.zeros(20, int), scores * factor, 0.8).gradient, usual)
 
 
-@pytest.mark.parametrize("scores", [[[np.nan, 1.0]], [[-1.0, 1.0]], [[np.inf, 1.0]], [[1.0, 1.0]] * 2])
-def test_bad_scores_are_refused(scores: list[list[float]]) -> None:
-    with pytest.raises(ValueError, match="scores"):
-        assign([0], scores, 0.8)
-
-
-def test_a_camera_outside_of_the_grid_is_refused() -> None:
-    with pytest.raises(ValueError, match="among 0 to 1"):
-        assign([2], [[1.0, 1.0]], 0.8)
+@pytest.mark.parametrize(
+    ("block", "scores", "words"),
+    [
+        *[(0, scores, "scores") for scores in ([[np.nan, 1.0]], [[-1.0, 1.0]], [[np.inf, 1.0]], [[1.0]] * 2)],
+        (2, [[1.0, 1.0]], "among 0 to 1"),
+    ],
+)
+def test_bad_scores_and_blocks_are_refused(block: int, scores: list[list[float]], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        assign([block], scores, 0.8)
 
 
 def test_overlap_grows_as_the_threshold_falls() -> None:

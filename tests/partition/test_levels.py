@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -58,9 +57,8 @@ def test_the_lowest_level_has_the_own_gaussians_and_no_other() -> None:
     assert levels.own == len(scene)
     own = levels.rows(np.arange(levels.own))
     for name, tensor in scene.tensors().items():
-        found = own.tensors()[name].flatten(1) if tensor.ndim > 1 else own.tensors()[name][:, None]
-        expected = tensor.flatten(1) if tensor.ndim > 1 else tensor[:, None]
-        assert sorted(map(tuple, found.tolist())) == sorted(map(tuple, expected.tolist()))
+        found, expected = (it.reshape(len(scene), -1).tolist() for it in (own.tensors()[name], tensor))
+        assert sorted(found) == sorted(expected)
 
 
 @pytest.mark.parametrize("distance", [0.0, 5.0, 40.0, 1e6])
@@ -92,13 +90,6 @@ def test_a_cut_is_no_finer_than_the_cameras_require() -> None:
         seen = _seen_larger(corners, side, cKDTree(centers), angle)
         assert np.array_equal(seen, distance * angle < side)
         assert seen.any()
-
-
-def test_the_farther_the_cameras_the_fewer_gaussians() -> None:
-    levels = make_levels(cloud(4_000), SIDE)
-    counts = [len(levels.cut(np.array([[x, 0.0, 0.0]]), ANGLE)) for x in (0.0, 10.0, 40.0, 1e5)]
-    assert all(more > 2 * less for more, less in pairwise(counts))
-    assert counts[-1] == 1
 
 
 @pytest.mark.parametrize("exact", [False, True])

@@ -1,5 +1,6 @@
 import copy
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,8 +8,8 @@ import pytest
 
 from panolog.partition.audit import audit
 from panolog.partition.bounds import aabb
-from panolog.partition.cells import Cuts, Grid
-from panolog.partition.contraction import contract, expand
+from panolog.partition.cells import Cells, Cuts, Grid
+from panolog.partition.contraction import contract
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.scene.errors import InputError
 
@@ -23,11 +24,11 @@ def plan(scores: Any = None) -> Plan:
     return planned(CENTERS, means, given, GRID)
 
 
-def planned(centers: Any, means: Any, scores: Any, grid: Grid, rho_tri: float = 5.0) -> Plan:
+def planned(centers: Any, means: Any, scores: Any, cells: Cells, **config: Any) -> Plan:
     """A plan for cameras that are the second panorama of a scene and all after it."""
     rows = range(1, len(centers) + 1)
     names = [f"pano{row}.jpg" for row in rows]
-    return make_plan(centers, means, scores, grid, PartitionConfig(rho_tri=rho_tri), rows=rows, names=names)
+    return make_plan(centers, means, scores, cells, PartitionConfig(**config), rows=rows, names=names)
 
 
 def test_a_camera_on_a_face_belongs_to_the_upper_cell() -> None:
@@ -79,9 +80,7 @@ def test_a_plan_with_parts_of_the_box_survives_its_file() -> None:
 
 def test_a_plan_of_balanced_blocks_survives_its_file() -> None:
     cells = Cuts((("x", 0.5, 2), ("y", 0.25, 1), ("y", 0.625, 1)))
-    config = PartitionConfig(cuts=cells.cuts)
-    names = [f"{row}.jpg" for row in range(6)]
-    made = make_plan(CENTERS, CENTERS, np.zeros((6, 4)), cells, config, rows=range(6), names=names)
+    made = planned(CENTERS, CENTERS, np.zeros((6, 4)), cells, cuts=cells.cuts)
     stored = json.loads(json.dumps(made.to_json()))
     assert stored["grid"] is None
     assert stored["cuts"] == [["x", 0.5, 2], ["y", 0.25, 1], ["y", 0.625, 1]]
@@ -92,7 +91,7 @@ def test_a_plan_of_balanced_blocks_survives_its_file() -> None:
         [1.0, 1.0],
     ]
     again = Plan.from_json(stored)
-    assert (again.grid, again.config) == (cells, config)
+    assert (again.grid, again.config) == (cells, made.config)
     with pytest.raises(
         InputError, match=r"contradicts itself: the cut x = 1\.5 with 2 of 4 blocks below has an"
     ):
@@ -143,27 +142,6 @@ def test_scores_of_another_grid_are_refused() -> None:
         plan(scores=np.ones((6, 3)))
 
 
-def test_unknown_config_keys_are_refused() -> None:
-    with pytest.raises(ValueError, match="rho_tree"):
-        PartitionConfig.model_validate({"rho_tree": 5})
-
-
-def test_defaults_are_those_of_the_paper() -> None:
-    assert PartitionConfig() == PartitionConfig(rho_tri=5.0, tau_grad=0.8)
-
-
-def test_audit_says_what_nobody_will_train() -> None:
-    grid = Grid((3, 1, 1))
-    means = expanded_means(grid, counts=(900, 100, 0))
-    scores = np.tile([1.0, 0.0, 0.0], (len(CENTERS), 1))
-    made = planned(CENTERS[:3] * [1, 0, 0], means, scores[:3], grid, rho_tri=0.1)
-    text = "\n".join(audit(made))
-    assert "3 blocks (3x1x1)" in text
-    assert "1,000 Gaussians" in text
-    assert "block 2 has no Gaussians and is skipped" in text
-    assert "trains" in text
-
-
 def test_audit_names_blocks_without_cameras_and_idle_cameras() -> None:
     centers = np.array([[0.0, 0, 0], [0.1, 0, 0]])
     box = aabb(centers, 5.0)
@@ -171,6 +149,8 @@ def test_audit_names_blocks_without_cameras_and_idle_cameras() -> None:
     means = np.array([[0.0, 0, 100 * box.upper[2]]])
     made = planned(centers, means, np.zeros((2, 3)), grid)
     lines = audit(made)
+    assert "3 blocks (1x1x3)" in lines[0] and "2 cameras, 1 Gaussians" in lines[0]
+    assert any("block 0 has no Gaussians and is skipped" in line for line in lines)
     assert any("block 2 has no camera: its 1 Gaussians stay" in line for line in lines)
     assert any(line.startswith("2 cameras train no block") for line in lines)
 
@@ -182,6 +162,8 @@ def test_blocks_with_few_cameras_keep_what_stage_one_made() -> None:
     assert "block 0 has 1 camera, fewer than partition.min_cameras=3: its 1 Gaussians stay as they were" in (
         "\n".join(audit(made))
     )
+    empty = planned(centers, centers[:1], np.zeros((4, 2)), Grid((2, 1, 1)))
+    assert empty.trained.tolist() == [False, False]  # the other has no Gaussians
     stored = json.loads(json.dumps(made.to_json()))
     assert Plan.from_json(stored).trained.tolist() == [False, True]
     del stored["min_cameras"]  # of a version that trained all blocks with a camera
@@ -190,17 +172,7 @@ def test_blocks_with_few_cameras_keep_what_stage_one_made() -> None:
 
 def test_audit_reports_uneven_blocks() -> None:
     made = plan(scores=np.ones((6, 4)))
-    uneven = Plan(
-        made.config,
-        made.grid,
-        made.baseline,
-        made.aabb,
-        made.rows,
-        made.names,
-        made.centers,
-        made.scores,
-        np.array([1000, 10, 10, 10]),
-    )
+    uneven = replace(made, gaussians=np.array([1000, 10, 10, 10]))
     assert any("10 to 1,000 Gaussians" in line for line in audit(uneven))
     assert not any("uneven" in line for line in audit(made) if "cameras" in line)
 
@@ -211,8 +183,7 @@ def sharing(others: list[float], tau_grad: float = 0.8) -> list[str]:
     grid = Grid((2, 1, 1))
     here = grid.block_of(contract(centers, aabb(centers, 5.0)))
     scores = np.where(here[:, None] == np.arange(2), 1.0, np.array(others)[:, None])
-    config, rows = PartitionConfig(tau_grad=tau_grad), range(len(others))
-    made = make_plan(centers, centers, scores, grid, config, rows=rows, names=[str(row) for row in rows])
+    made = planned(centers, centers, scores, grid, tau_grad=tau_grad)
     return [line for line in audit(made) if line.startswith("gradients add")]
 
 
@@ -230,14 +201,3 @@ def test_audit_is_silent_where_gradients_add_enough_or_nothing_is_wanted() -> No
     assert len(sharing([0.9] + [0.0] * 19)) == 1  # 1 of 21 assignments
     assert sharing([0.9] + [0.0] * 18) == []  # 1 of 20: 5 %
     assert sharing([0.5] * 4, tau_grad=1.0) == []
-
-
-def expanded_means(grid: Grid, counts: tuple[int, ...]) -> Any:
-    """World points of which `counts` lie in each block of the plan above."""
-    box = aabb(CENTERS[:3] * [1, 0, 0], 0.1)
-    middles = [np.add(*grid.bounds(block)) / 2 for block in range(grid.count)]
-    points = np.concatenate(
-        [np.tile(expand(m[None], box), (n, 1)) for m, n in zip(middles, counts, strict=True)]
-    )
-    assert np.bincount(grid.block_of(contract(points, box)), minlength=3).tolist() == list(counts)
-    return points
