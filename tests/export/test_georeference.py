@@ -66,16 +66,3 @@ def test_a_scene_with_a_place(tmp_path: Path) -> None:
 def test_georef_json_of_others(content: object) -> None:
     with pytest.raises(SceneError, match=r"^x\.json: is not of this PanoLOG's format"):
         georeference_from(content, "x.json")
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [("{", "offset.json: Invalid JSON"), ('{"offset": [0, 0]}', "offset.json: offset"),
-     ('{"offset": [0, 0, 0], "epsg": 0}', "offset.json: epsg"),
-     ('{"offset": [0, 0, 0], "crs": 1}', "offset.json: crs")],
-)  # fmt: skip
-def test_offset_json_that_is_wrong(tmp_path: Path, content: str, message: str) -> None:
-    root = write_scene(tmp_path / "scene")
-    (root / "offset.json").write_text(content)
-    with pytest.raises(SceneError, match=message):
-        georeference_of(read_scene(root))

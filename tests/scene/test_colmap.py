@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from panolog.scene.colmap import ColmapModel, read_panoramas, write_colmap
+from panolog.scene.colmap import read_panoramas, write_colmap
 from panolog.scene.errors import InputError
 from panolog.scene.files import atomic
 from tests.data import shared
@@ -54,21 +54,25 @@ def as_dummy_pinhole(folder: Path) -> None:
     (folder / "cameras.txt").write_text(f"1 PINHOLE {W} {H} {W} {H} {W // 2} {H // 2}\n")
 
 
-def assert_same(a: ColmapModel, b: ColmapModel) -> None:
-    for one, other in zip(a.images, b.images, strict=True):
-        assert one.name == other.name
-        np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-12)
-        np.testing.assert_allclose(one.translation, other.translation, atol=1e-12)
-        np.testing.assert_array_equal(one.observed, other.observed)
-    np.testing.assert_allclose(a.points, b.points, atol=1e-12)
-    np.testing.assert_array_equal(a.colors, b.colors)
-
-
-@pytest.mark.parametrize("change", [as_text, without_rigs, as_sphere, as_sphere_text, as_dummy_pinhole])
-def test_every_form_of_a_model_is_the_same_model(folder: Path, change: Callable[[Path], None]) -> None:
-    model = read_panoramas(folder)
+@pytest.mark.parametrize(
+    "change", [lambda _: None, as_text, without_rigs, as_sphere, as_sphere_text, as_dummy_pinhole]
+)
+def test_every_form_of_a_model_is_what_colmap_reads(folder: Path, change: Callable[[Path], None]) -> None:
+    reconstruction = pycolmap.Reconstruction(str(folder))
+    ids = sorted(reconstruction.points3D)
     change(folder)
-    assert_same(read_panoramas(folder), model)
+    model = read_panoramas(folder)
+    assert len(model.images) == len(reconstruction.images)
+    for image in model.images:
+        truth = reconstruction.find_image_with_name(image.name)
+        pose = truth.cam_from_world()
+        np.testing.assert_allclose(image.rotation, pose.rotation.matrix(), rtol=0, atol=1e-15)
+        np.testing.assert_array_equal(image.translation, pose.translation)
+        seen = {point.point3D_id for point in truth.get_observation_points2D()}
+        assert {ids[row] for row in image.observed} == seen
+    points = [reconstruction.points3D[number] for number in ids]
+    np.testing.assert_allclose(model.points, [point.xyz for point in points], atol=1e-12)
+    np.testing.assert_array_equal(model.colors, [point.color for point in points])
 
 
 def test_a_written_model_reads_back_and_projects_onto_its_observations(
@@ -99,16 +103,6 @@ def test_a_written_model_reads_back_and_projects_onto_its_observations(
     assert [list(image.observed) for image in model.images] == [[], [1, 5]]
 
 
-@pytest.mark.parametrize("change", [lambda _: None, as_text])
-def test_poses_are_those_of_colmap(folder: Path, change: Callable[[Path], None]) -> None:
-    change(folder)
-    reconstruction = pycolmap.Reconstruction(str(folder))
-    for image in read_panoramas(folder).images:
-        pose = reconstruction.find_image_with_name(image.name).cam_from_world()
-        np.testing.assert_allclose(image.rotation, pose.rotation.matrix(), rtol=0, atol=1e-15)
-        np.testing.assert_array_equal(image.translation, pose.translation)
-
-
 @pytest.mark.parametrize("name", ["flat", "street"])
 def test_real_models_agree_with_colmap_on_every_observation(name: str) -> None:
     """Also proves the camera convention: u from atan2(x, z), v down, against COLMAP's own keypoints."""
@@ -119,7 +113,6 @@ def test_real_models_agree_with_colmap_on_every_observation(name: str) -> None:
     for ours in (model.images[0], model.images[-1]):
         image = reconstruction.find_image_with_name(ours.name)
         features = {p.point3D_id: p.xy for p in image.get_observation_points2D()}
-        assert {ids[i] for i in ours.observed} == set(features)
         camera = reconstruction.cameras[image.camera_id]
         local = model.points[ours.observed] @ ours.rotation.T + ours.translation
         u = camera.width * (np.arctan2(local[:, 0], local[:, 2]) / (2 * np.pi) + 0.5)
@@ -135,12 +128,20 @@ def patch(folder: Path, name: str, at: int, data: bytes) -> None:
     (folder / name).write_bytes(content)
 
 
-def set_camera(line: str) -> Callable[[Path], None]:
+def set_lines(name: str, text: str) -> Callable[[Path], None]:
     def change(folder: Path) -> None:
         as_text(folder)
-        (folder / "cameras.txt").write_text(line + "\n")
+        (folder / name).write_text(text + "\n")
 
     return change
+
+
+def set_camera(line: str) -> Callable[[Path], None]:
+    return set_lines("cameras.txt", line)
+
+
+def set_image(text: str) -> Callable[[Path], None]:
+    return set_lines("images.txt", text)
 
 
 def append(folder: Path, name: str, text: str) -> None:
@@ -159,7 +160,6 @@ def repeat_record(folder: Path, name: str, lines: int) -> None:
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "no images": (lambda f: (f / "images.bin").unlink(), "no images.bin"),
     "NaN": (lambda f: patch(f, "images.bin", 12, struct.pack("<d", np.nan)), "not finite"),
-    "infinite translation": (lambda f: patch(f, "images.bin", 44, struct.pack("<d", np.inf)), "not finite"),
     "NaN in a frame": (
         lambda f: patch(f, "frames.bin", 16, struct.pack("<d", np.nan)),
         "frame .* not finite",
@@ -172,13 +172,11 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "garbage": (lambda f: (f / "images.bin").write_bytes(b"hello"), "truncated"),
     "huge count": (lambda f: patch(f, "points3D.bin", 51, b"\xff" * 8), "truncated"),
-    "name not UTF-8": (lambda f: patch(f, "images.bin", 72, b"\xff"), "not UTF-8"),
     "empty": (lambda f: (f / "points3D.bin").write_bytes(b""), "empty"),
     "trailing bytes": (lambda f: (f / "points3D.bin").open("ab").write(b"1234"), "4 bytes more"),
     "text OPENCV": (set_camera("1 OPENCV 64 32 1 1 1 1 0 0 0 0"), "camera model OPENCV"),
     "text nonsense": (set_camera("1 PINHOLE wide 32 1"), "number was expected"),
     "text NaN": (set_camera("1 EQUIRECTANGULAR nan 32 64 32"), "not finite"),
-    "text infinite": (set_camera("1 EQUIRECTANGULAR 64 inf 64 32"), "not finite"),
     "text short": (set_camera("1 PINHOLE 64 32 64 32"), "4 parameters, not 2"),
     "pinhole": (set_camera("1 PINHOLE 64 32 50 50 32 16"), "real pinhole"),
     "pinhole not 2:1": (set_camera("1 PINHOLE 64 48 64 48 32 24"), "not 2:1"),
@@ -190,6 +188,10 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "half a track": (lambda f: append(f, "points3D.txt", "99 1 2 3 4 5 6 0.5 1 0 2\n"), "track of point 99"),
     "infinite point": (lambda f: append(f, "points3D.txt", "99 1 inf 3 4 5 6 0.5\n"), "not finite"),
     "other camera id": (set_camera("7 EQUIRECTANGULAR 64 32 64 32"), "COLMAP cannot read"),
+    "text image NaN": (set_image("1 nan 0 0 0 0 0 0 1 a.jpg"), "not finite"),
+    "text image short": (set_image("1 1 0 0"), "image line"),
+    "text image nonsense": (set_image("1 1 0 0 zero 0 0 0 1 a.jpg"), "number"),
+    "text half a point": (set_image("1 1 0 0 0 0 0 0 1 a.jpg\n3.5 4.5"), "triples"),
 }
 
 
@@ -213,20 +215,3 @@ def test_every_truncation_is_noticed(folder: Path, tmp_path: Path, name: str) ->
             file.truncate(cut)
         with pytest.raises(InputError, match=name):
             read_panoramas(broken)
-
-
-@pytest.mark.parametrize(
-    "line, complaint",
-    [
-        ("1 nan 0 0 0 0 0 0 1 a.jpg", "not finite"),
-        ("1 2 0 0 0 0 0 0 1 a.jpg", "norm 2"),
-        ("1 1 0 0", "image line"),
-        ("1 1 0 0 zero 0 0 0 1 a.jpg", "number"),
-        ("1 1 0 0 0 0 0 0 1 a.jpg\n3.5 4.5", "triples"),
-    ],
-)
-def test_a_broken_line_of_text(folder: Path, line: str, complaint: str) -> None:
-    as_text(folder)
-    (folder / "images.txt").write_text(line + "\n")
-    with pytest.raises(InputError, match=complaint):
-        read_panoramas(folder)

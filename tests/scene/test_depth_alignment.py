@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from panolog.scene.depth_alignment import (
     MAX_RESIDUAL,
@@ -21,7 +20,6 @@ from panolog.scene.depth_alignment import (
 )
 from panolog.scene.images import View, load_layers, load_view
 from panolog.scene.model import Scene
-from panolog.scene.projection import project_to_pixels
 from panolog.scene.read import read_scene
 from panolog.workers.training.config import DepthConfig
 from tests.data import shared
@@ -37,7 +35,7 @@ def view_of(scene: Scene, row: int = 1) -> View:
     return load_view(scene.panoramas[row], row, WIDTH)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("true", [(0.6, 0.05), (2.5, -0.1), (0.01, 0.3)])
 def test_scale_and_offset_within_one_percent_with_thirty_percent_outliers(
     true: tuple[float, float], seed: int
@@ -53,17 +51,6 @@ def test_scale_and_offset_within_one_percent_with_thirty_percent_outliers(
     assert found.scale == pytest.approx(true[0], rel=0.01)
     assert found.offset == pytest.approx(true[1], abs=0.01 * span)
     assert found.points == 1000 and 680 <= found.inliers <= 760
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_fit_ignores_thirty_percent_outliers(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    prior = random.uniform(0.05, 1, 300)
-    inverse = 0.6 * prior + 0.05 + random.normal(0, 0.002, 300)
-    inverse[:90] = random.uniform(0, 5, 90)
-    found = fit_affine(prior, inverse, seed)
-    assert found.scale == pytest.approx(0.6, rel=0.01)
-    assert found.offset == pytest.approx(0.05, abs=0.005)
     assert found.residual is not None and found.residual < 0.1
     assert found == fit_affine(prior, inverse, seed)
 
@@ -100,15 +87,10 @@ def test_cells_of_equal_solid_angle_count_the_same_and_reach_the_poles_and_the_s
     assert (share > 0).all()
 
 
-def test_fit_is_exact_without_noise() -> None:
-    prior = np.linspace(0.1, 0.9, 20)
-    found = fit_affine(prior, 2 * prior - 0.1, 0)
-    assert (found.scale, found.offset) == pytest.approx((2, -0.1))
-
-
-def test_fit_takes_inverse_depths_that_are_not_positive() -> None:
-    """Two answers of an estimator that leaves the offset open are brought to one scale in the same way."""
-    prior = np.linspace(-0.5, 0.9, 20)
+@pytest.mark.parametrize("least", [0.1, -0.5])
+def test_fit_is_exact_without_noise_also_where_inverse_depths_are_not_positive(least: float) -> None:
+    """As those are of an estimator that leaves the offset open, of which two answers are brought together."""
+    prior = np.linspace(least, 0.9, 20)
     found = fit_affine(prior, 2 * prior - 0.1, 0)
     assert (found.scale, found.offset) == pytest.approx((2, -0.1))
 
@@ -123,14 +105,11 @@ def test_training_has_the_same_defaults() -> None:
     assert (config.kind, config.min_points, config.max_residual) == defaults
 
 
-def test_align_finds_the_affine_of_a_panorama(scene: Scene) -> None:
-    found = align_depth(scene, view_of(scene), 0)
-    assert (found.scale, found.offset) == pytest.approx(AFFINE, rel=0.05)
-
-
-def test_align_takes_depth_as_well(scene: Scene) -> None:
+def test_align_takes_inverse_depth_and_depth(scene: Scene) -> None:
     view = view_of(scene)
     assert view.inverse_depth is not None
+    found = align_depth(scene, view, 0)
+    assert (found.scale, found.offset) == pytest.approx(AFFINE, rel=0.05)
     inverse = AFFINE[0] * view.inverse_depth + AFFINE[1]
     prior = torch.where(view.inverse_depth > 0, 0.1 / inverse, 0)
     found = align_depth(scene, replace(view, inverse_depth=prior), 0, kind="depth")
@@ -171,7 +150,6 @@ def test_an_affine_of_the_scene_that_fits_is_used_as_it_is(scene: Scene, affine:
         ((77.0, 0.05), "its affine 77, 0.05 has the residual"),
         ((AFFINE[0] / 2, AFFINE[1]), "the fit"),
         ((0.0, 0.1), "its affine 0, 0.1 is no alignment"),
-        ((-2.0, 0.1), "is no alignment"),
         ((float("nan"), 0.1), "is no alignment"),
         ((1.0, float("inf")), "is no alignment"),
     ],
@@ -259,44 +237,3 @@ def test_alignment_of_the_streets_maps(every: int | None) -> None:
     slack = 1.3 if every == 10 else 1.0
     assert np.mean(scales) < 0.0125 * slack and max(scales) < 0.035 * slack
     assert np.mean(maps) < 0.01 * slack and max(maps) < 0.0275 * slack
-
-
-def street_points(row: int) -> tuple[Scene, NDArray[np.float64], NDArray[np.float64]]:
-    """The street, and prior and inverse depth of its sparse points in one panorama."""
-    scene = read_scene(shared("street"))
-    panorama = scene.panoramas[row]
-    view = load_layers(panorama, row, 512)
-    assert view.inverse_depth is not None and view.sky is not None
-    distance, v, u = project_to_pixels(panorama, scene.points[panorama.observed], 512, 256)
-    prior = view.inverse_depth.numpy()[v, u].astype(np.float64)
-    usable = (prior > 0) & ~view.sky.numpy()[v, u]
-    return scene, prior[usable], 1 / distance[usable]
-
-
-def spoilt(inverse: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
-    """Thirty percent of the points belong to something else."""
-    random = np.random.default_rng(seed)
-    wrong = random.permutation(len(inverse))[: int(0.3 * len(inverse))]
-    found = inverse.copy()
-    found[wrong] = random.permutation(inverse)[: len(wrong)] * random.uniform(0.3, 4, len(wrong))
-    return found
-
-
-@pytest.mark.parametrize("row", range(0, 64, 8))
-def test_a_known_affine_on_the_streets_points_within_one_percent(row: int) -> None:
-    scene, _, inverse = street_points(row)
-    truth = json.loads((scene.root / "depth_truth.json").read_text())[scene.panoramas[row].stem]
-    prior = (inverse - truth["offset"]) / truth["scale"]
-    found = fit_affine(prior, spoilt(inverse, row), 0)
-    assert found.scale == pytest.approx(truth["scale"], rel=0.01)
-    assert found.offset == pytest.approx(truth["offset"], abs=0.01 * np.median(inverse))
-
-
-@pytest.mark.parametrize("row", range(0, 64, 8))
-def test_outliers_move_the_alignment_of_the_streets_maps_by_two_percent_at_most(row: int) -> None:
-    _, prior, inverse = street_points(row)
-    clean, found = fit_affine(prior, inverse, 0), fit_affine(prior, spoilt(inverse, row), 0)
-    assert found.scale == pytest.approx(clean.scale, rel=0.02)
-    before, after = (it.scale * prior + it.offset for it in (clean, found))
-    assert np.abs(after - before).mean() < 0.02 * before.mean()
-    assert found.inliers < clean.inliers

@@ -1,7 +1,6 @@
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from panolog.scene.files import SUFFIX, atomic, natural_key, remove_partial, write_bytes
@@ -65,12 +64,5 @@ def test_numbers_in_names_sort_by_value() -> None:
 
 
 def test_names_with_leading_zeros_sort_as_text() -> None:
-    random = np.random.default_rng(5)
-    for prefix in ("", "pano_", "R001", "IMG_2024_00_", "frames/left-"):
-        names = [
-            f"{prefix}{number:06d}{suffix}"
-            for number, suffix in zip(
-                random.integers(0, 10**6, 200), random.choice([".jpg", "_a.jpg", "-2.png"], 200), strict=True
-            )
-        ]
-        assert sorted(names, key=natural_key) == sorted(names)
+    names = [f"{stem}{number:06d}{end}" for end in ("-2", "") for number in (99_999, 10, 9) for stem in "aR"]
+    assert sorted(names, key=natural_key) == sorted(names)

@@ -22,6 +22,7 @@ from panolog.scene.images import load_layers
 from panolog.scene.model import Scene
 from panolog.scene.read import check_names, read_scene, read_split
 from tests.data import shared
+from tests.scene.test_colmap import as_text
 from tests.scenes import write_image, write_scene
 
 GREY = np.full((32, 64), 200, np.uint8)
@@ -43,11 +44,7 @@ def as_pano360(root: Path) -> None:
     (root / "images").rename(root / "imgs")
     folder = root / "sparse" / "0"
     reconstruction = pycolmap.Reconstruction(str(folder))
-    for path in folder.iterdir():
-        path.unlink()
-    reconstruction.write_text(str(folder))
-    for name in ("rigs.txt", "frames.txt"):
-        (folder / name).unlink()
+    as_text(folder)
     (folder / "cameras.txt").write_text("1 PINHOLE 64 32 64 32 32 16\n")
     points = [reconstruction.points3D[key] for key in sorted(reconstruction.points3D)]
     rows = np.array(
@@ -63,20 +60,16 @@ def as_pano360(root: Path) -> None:
     (folder / "images.txt").write_text("".join(f"{pose}\n\n" for pose in poses))
 
 
-def test_street_has_all_its_layers() -> None:
-    scene = read_scene(shared("street"))
-    assert (scene.width, scene.height, len(scene.panoramas)) == (1024, 512, 64)
-    assert scene.points.shape == (19942, 3)
-    assert scene.test == tuple(range(0, 64, 8))
-    assert all(p.depth and p.sky_mask and not p.mask and not p.depth_affine for p in scene.panoramas)
-    assert all(len(p.observed) for p in scene.panoramas)
-
-
-def test_flat_is_photographs_alone() -> None:
-    scene = read_scene(shared("flat"))
-    assert (scene.width, len(scene.train), len(scene.test)) == (2048, 9, 2)
-    assert scene.panoramas[0].name == "R0010210.jpg"
-    assert not any(p.depth or p.sky_mask or p.mask for p in scene.panoramas)
+def test_real_scenes() -> None:
+    """One with all layers but masks, one of photographs alone."""
+    street, flat = read_scene(shared("street")), read_scene(shared("flat"))
+    assert (street.width, street.height, len(street.panoramas)) == (1024, 512, 64)
+    assert street.points.shape == (19942, 3) and street.test == tuple(range(0, 64, 8))
+    assert all(p.depth and p.sky_mask and not p.mask and not p.depth_affine for p in street.panoramas)
+    assert all(len(p.observed) for p in street.panoramas)
+    assert (flat.width, len(flat.train), len(flat.test)) == (2048, 9, 2)
+    assert flat.panoramas[0].name == "R0010210.jpg"
+    assert not any(p.depth or p.sky_mask or p.mask for p in flat.panoramas)
 
 
 def test_binary_text_and_pano360_are_one_scene(root: Path) -> None:
@@ -182,6 +175,8 @@ def test_an_image_name_that_is_not_utf8_is_one_clear_line(root: Path, binary: bo
     path.write_bytes(path.read_bytes().replace(b"pano_3", b"pan\xf6_3"))
     with pytest.raises(InputError, match=r"images\.(bin|txt): .*is not UTF-8; rename it"):
         read_scene(root)
+    with pytest.raises(InputError, match=r"pan\?_3\.jpg is not UTF-8; rename the file"):
+        check_names(root, ["a.jpg", os.fsdecode(b"pan\xf6_3.jpg")])
 
 
 def test_a_comment_that_is_not_utf8_does_no_harm(root: Path) -> None:
@@ -192,19 +187,10 @@ def test_a_comment_that_is_not_utf8_does_no_harm(root: Path) -> None:
     assert len(read_scene(root).panoramas) == 9
 
 
-def test_names_of_files_that_are_not_utf8(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"pan\?_3\.jpg is not UTF-8; rename the file"):
-        check_names(tmp_path, ["a.jpg", os.fsdecode(b"pan\xf6_3.jpg")])
-
-
-def test_images_that_the_model_does_not_name_do_not_matter(root: Path) -> None:
-    before = read_scene(root)
-    write_image(root / "images" / "stray.jpg", np.random.default_rng(0), (40, 30))
-    assert read_scene(root).fingerprint == before.fingerprint
-
-
-def test_the_fingerprint_knows_what_training_depends_on(root: Path) -> None:
+def test_the_fingerprint_knows_what_training_depends_on_and_nothing_else(root: Path) -> None:
     seen = {read_scene(root).fingerprint}
+    write_image(root / "images" / "stray.jpg", np.random.default_rng(0), (40, 30))
+    assert seen == {read_scene(root).fingerprint}  # the model does not name it
     (root / "test.txt").write_text("pano_1\n")
     seen.add(read_scene(root).fingerprint)
     add(root, "masks", "pano_2.png", GREY)
@@ -231,9 +217,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "other size": (resized((128, 64)), "pano_3.jpg: 128 x 64 .* one size"),
     "not 2:1": (resized((64, 48)), "pano_3.jpg: 64 x 48 .* not 2:1"),
     "one to train": (lambda r: (r / "train.txt").write_text("pano_3"), "train split has 1 panoramas"),
-    "empty test split": (lambda r: (r / "test.txt").write_text(""), "test split is empty"),
     "split not UTF-8": (lambda r: (r / "train.txt").write_bytes(b"pano_\xff"), "train.txt: is not UTF-8"),
-    "stray name": (lambda r: (r / "train.txt").write_text("pano_77"), "pano_77 is not a panorama"),
     "8 bit depth": (lambda r: add(r, "depths", "pano_1.png", GREY), "8 bits .* with 16 bits"),
     "colour depth": (
         lambda r: add(r, "depths", "pano_1.png", np.zeros((8, 16, 3), np.uint16)),
@@ -302,18 +286,13 @@ def test_training_cameras_at_one_place(root: Path, elsewhere: int) -> None:
 STEMS = [f"walk/{i:02d}" for i in range(17)]
 
 
-def test_every_eighth_is_test(tmp_path: Path) -> None:
-    train, test = read_split(tmp_path, STEMS)
-    assert test == (0, 8, 16)
-    assert sorted(train + test) == list(range(17))
-
-
 @pytest.mark.parametrize(
     "files, train, test",
     [
         ({"test": "walk/03\nwalk/01.jpg\n\n"}, (0, 2, *range(4, 17)), (1, 3)),
         ({"train": "\ufeffwalk/00\r\nwalk/01\r\n"}, (0, 1), tuple(range(2, 17))),
         ({"train": "walk/05", "test": "walk/04"}, (5,), (4,)),
+        ({}, (*range(1, 8), *range(9, 16)), (0, 8, 16)),
     ],
 )
 def test_files_decide(

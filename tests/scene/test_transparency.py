@@ -15,6 +15,8 @@ from panolog.scene.errors import InputError
 from panolog.scene.image_files import decode_panorama, decode_used, decode_with_alpha, read_info
 from panolog.scene.images import PanoramaCache, load_layers, view_bytes
 from panolog.scene.read import read_scene
+from panolog.scene.write import NewScene, PosedImage
+from panolog.scene.write import write_scene as write_new_scene
 from tests.scenes import HEIGHT, WIDTH, write_scene
 
 COLOR = (200, 120, 40)
@@ -42,22 +44,26 @@ def write(path: Path, alpha: NDArray[np.uint8], color: tuple[int, int, int] = CO
     """One colour, black where it is transparent, as stitchers write it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     rgb = np.where(alpha[..., None] > 0, np.array(color, np.uint8), np.uint8(0))
-    rgba = np.dstack([rgb, alpha])
-    if "16" in path.name:
-        cv2.imwrite(str(path), cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA).astype(np.uint16) * 257)
-    elif path.name.startswith("grey"):
-        Image.fromarray(rgba[..., [0, 3]].copy(), "LA").save(path)
+    if path.name.startswith("grey"):
+        Image.fromarray(np.dstack([rgb[..., 0], alpha]), "LA").save(path)
     elif path.name.startswith("palette"):
         picture = Image.fromarray(np.where(alpha > 0, 1, 0).astype(np.uint8), "P")
         picture.putpalette([0, 0, 0, *color])
         picture.save(path, transparency=0)
     elif path.name.startswith("key"):
         Image.fromarray(rgb).save(path, transparency=(0, 0, 0))
-    elif path.suffix == ".webp":
-        Image.fromarray(rgba).save(path, lossless=True, exact=True)
     else:
-        Image.fromarray(rgba).save(path)
+        save(path, np.dstack([rgb, alpha]))
     return path
+
+
+def save(path: Path, rgba: NDArray[np.uint8]) -> None:
+    """A picture (H, W, 4) as it is, in the format that its name says."""
+    if "16" in path.name:
+        cv2.imwrite(str(path), cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA).astype(np.uint16) * 257)
+    else:
+        options = {"lossless": True, "exact": True} if path.suffix == ".webp" else {}
+        Image.fromarray(rgba).save(path, **options)
 
 
 def color_of(name: str) -> tuple[int, int, int]:
@@ -89,17 +95,10 @@ def test_a_resized_panorama_has_no_black_in_its_colours(tmp_path: Path, name: st
 
 @pytest.mark.parametrize("name", ["rgba.png", "rgba16.png", "rgba.tif", "rgba.webp"])
 def test_what_is_partly_transparent_counts_by_its_opacity(tmp_path: Path, name: str) -> None:
-    alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
-    alpha[:, ::2] = 51
     rgba = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
     rgba[:, ::2], rgba[:, 1::2] = (250, 0, 100, 51), (50, 200, 100, 255)
     path = tmp_path / name
-    if "16" in name:
-        cv2.imwrite(str(path), cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA).astype(np.uint16) * 257)
-    elif path.suffix == ".webp":
-        Image.fromarray(rgba).save(path, lossless=True, exact=True)
-    else:
-        Image.fromarray(rgba).save(path)
+    save(path, rgba)
     whole, used = decode_with_alpha(path)
     assert used is None  # nothing is fully transparent
     np.testing.assert_allclose(whole[:, :2], np.broadcast_to(rgba[:, :2, :3], (HEIGHT, 2, 3)), atol=3)
@@ -146,13 +145,14 @@ def test_views_combine_transparency_with_masks(tmp_path: Path) -> None:
 
 
 def test_points_get_no_colour_from_what_is_transparent(tmp_path: Path) -> None:
-    from panolog.scene.write import PosedImage, _sampled, no_progress  # noqa: PLC0415 (private)
-
-    file = write(tmp_path / "rgba.png", opacity())
-    where = np.array([[0.5, 0.25], [0.5, 0.95]])
-    image = PosedImage("rgba.png", file, np.eye(3), np.zeros(3), (np.array([0, 1]), where))
-    colors = _sampled([image], 2, no_progress)
-    assert colors.tolist() == [list(COLOR), [128, 128, 128]]
+    file, seen = write(tmp_path / "rgba.png", opacity()), np.array([[0.5, 0.25], [0.5, 0.95]])
+    images = [
+        PosedImage(f"{row}.png", file, np.eye(3), np.array([row, 0.0, 0.0]), (np.arange(2), seen))
+        for row in range(3)
+    ]
+    new = NewScene(images, (WIDTH, HEIGHT), np.arange(12.0).reshape(4, 3), colors=None)
+    write_new_scene(tmp_path / "scene", new, link=False)
+    assert read_scene(tmp_path / "scene").colors[:2].tolist() == [list(COLOR), [128, 128, 128]]
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:
@@ -160,14 +160,8 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def test_hostile_files_are_one_clear_error_or_opaque(tmp_path: Path) -> None:
-    path = write(tmp_path / "rgba.png", opacity())
-    data = path.read_bytes()
-    for cut in (20, 30, len(data) // 2, len(data) - 1):
-        path.write_bytes(data[:cut])
-        with pytest.raises(InputError, match=r"rgba\.png: "):
-            decode_with_alpha(path)
-    # A chunk that says that it is longer than any file, and more chunks than any program writes.
-    rgb = write(tmp_path / "key.png", opacity()).read_bytes()
+    """A chunk that says that it is longer than any file, and more chunks than any program writes."""
+    path, rgb = tmp_path / "rgba.png", write(tmp_path / "key.png", opacity()).read_bytes()
     path.write_bytes(rgb[:33] + struct.pack(">I", 2**32 - 1) + b"tEXt" + rgb[33:])
     with pytest.raises(InputError, match=r"rgba\.png: "):
         decode_with_alpha(path)

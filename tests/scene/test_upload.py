@@ -20,6 +20,7 @@ from panolog.scene.errors import ImageError
 from panolog.scene.images import CudaUpload, PanoramaCache, Staged, Upload, View, load_view, passing_views
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
+from tests.on_device import needs_a_card
 from tests.scenes import HEIGHT, WIDTH, write_scene
 
 VIEW = 3 * WIDTH * HEIGHT  # bytes of a view without layers
@@ -75,17 +76,6 @@ class Recorder(Upload):
             self.here -= 1
 
 
-def count_decodes(monkeypatch: pytest.MonkeyPatch) -> "Counter[int]":
-    decoded: Counter[int] = Counter()
-
-    def counted(panorama: Any, row: int, *rest: Any) -> View:
-        decoded[row] += 1
-        return load_view(panorama, row, *rest)
-
-    monkeypatch.setattr(images, "load_view", counted)
-    return decoded
-
-
 def run(scene: Scene, recorder: Recorder, *, budget: int, room: int, threads: int = 2) -> None:
     """Three epochs, requested ahead as training does."""
     order = [row for epoch in EPOCHS for row in epoch]
@@ -105,32 +95,27 @@ def test_views_are_moved_by_the_threads_that_decode_and_taken_by_the_one_that_co
     assert recorder.threads <= {f"decode_{i}" for i in range(3)}
 
 
-def test_views_that_have_room_are_decoded_and_moved_once(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("budget", "room", "again"), [(0, 6 * VIEW, False), (6 * VIEW, 2 * VIEW + 1, False), (1, 0, True)]
+)
+def test_views_are_decoded_and_moved_again_only_where_there_is_no_room(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, budget: int, room: int, again: bool
 ) -> None:
-    decoded, recorder = count_decodes(monkeypatch), Recorder()
-    run(scene, recorder, budget=0, room=6 * VIEW)
-    assert set(decoded.values()) == set(recorder.staged.values()) == {1}
+    """Room on the device for all, or for two while the host holds the others, or nowhere."""
+    decoded: Counter[int] = Counter()
 
+    def counted(panorama: Any, row: int, *rest: Any) -> View:
+        decoded[row] += 1
+        return load_view(panorama, row, *rest)
 
-def test_views_without_room_wait_in_the_memory_of_the_host(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of six two stay; one thread leaves three on their way."""
-    decoded, recorder = count_decodes(monkeypatch), Recorder()
-    run(scene, recorder, budget=6 * VIEW, room=2 * VIEW + 1, threads=1)
-    assert set(decoded.values()) == {1}
-    first, second, *others = (recorder.staged[row] for row in EPOCHS[0])
-    assert first == second == 1 and max(others) > 1
-    assert recorder.most <= 2 + passing_views(1) + 1  # one more until the last of its users lets it go
-
-
-def test_what_the_host_has_no_room_for_is_decoded_again(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    decoded, recorder = count_decodes(monkeypatch), Recorder()
-    run(scene, recorder, budget=1, room=0, threads=1)
-    assert max(decoded.values()) > 1
+    monkeypatch.setattr(images, "load_view", counted)
+    recorder = Recorder()
+    run(scene, recorder, budget=budget, room=room, threads=1)
+    assert (max(decoded.values()) > 1) == again
+    staying = room // VIEW
+    moves = [recorder.staged[row] for row in EPOCHS[0]]
+    assert moves[:staying] == [1] * staying and (max(moves) > 1) == (staying < len(ROWS))
+    assert recorder.most <= staying + passing_views(1) + 1  # one more until the last of its users lets it go
 
 
 def test_cores_decide_how_many_threads_decode_for_a_gpu(scene: Scene) -> None:
@@ -248,8 +233,7 @@ def test_a_larger_view_gets_a_larger_buffer(scene: Scene, cuda: Torch) -> None:
     assert cuda.pinned == [small.image.nbytes, view.image.nbytes]
 
 
-@pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA card")
+@needs_a_card
 @pytest.mark.parametrize("room", [0, 2 * VIEW, 100 * VIEW])
 def test_on_a_card_views_are_equal_and_the_host_does_not_wait(layered: Scene, room: int) -> None:
     order = [row for epoch in EPOCHS for row in epoch]
