@@ -9,11 +9,9 @@ import kubernetes_validate
 import pytest
 import ray
 import yaml
-from typer.main import get_command
 
-from panolog.orchestrator.cli import app
 from panolog.orchestrator.cluster.jobs import RUN_KEY
-from tests.deploy.files import DEPLOY, load_all
+from tests.deploy.files import DEPLOY, load_all, parsed
 
 SCHEMA = json.loads((Path(__file__).parent / "rayjob.schema.json").read_text())
 
@@ -32,14 +30,10 @@ def check(kind: Any) -> None:
     kubernetes_validate.validate(kind, kubernetes_validate.latest_version(), strict=True)
 
 
-def check_pod(template: Any) -> None:
-    check({"apiVersion": "v1", "kind": "PodTemplate", "metadata": {"name": "any"}, "template": template})
-
-
 def test_kubernetes_would_accept_it(job: Any) -> None:
     jsonschema.validate(job, SCHEMA)
     for template in pods(job):
-        check_pod(template)
+        check({"apiVersion": "v1", "kind": "PodTemplate", "metadata": {"name": "any"}, "template": template})
     for other in load_all("kuberay.yaml")[1:]:
         check(other)
 
@@ -49,8 +43,7 @@ def test_a_worker_that_ends_has_time_to_let_its_tasks_move(job: Any) -> None:
     program, *words = worker["containers"][0]["lifecycle"]["preStop"]["exec"]["command"]
     assert (program, words[:2]) == ("panolog", ["cluster", "leave"])
     assert int(words[2]) < worker["terminationGracePeriodSeconds"]
-    leave = get_command(app.app).commands["cluster"].commands["leave"]  # type: ignore[attr-defined]
-    assert leave.make_context("leave", words[2:]).params["seconds"] == int(words[2])
+    assert parsed(words)["seconds"] == int(words[2])
 
 
 def test_versions_volumes_and_names_fit_together(job: Any) -> None:

@@ -5,11 +5,8 @@ import shlex
 from pathlib import Path
 
 import pytest
-import typer
-from typer.main import get_command
 
-from panolog.orchestrator.cli import app
-from tests.deploy.files import DEPLOY
+from tests.deploy.files import DEPLOY, parsed
 
 PAGES = sorted(DEPLOY.glob("*.md"))
 
@@ -42,10 +39,5 @@ def shown() -> list[list[str]]:
 
 def test_commands_are_as_the_pages_show_them() -> None:
     assert len(shown()) > 8
-    for arguments in shown():
-        command, words, name, parent = get_command(app.app), list(arguments), "panolog", None
-        while isinstance(command, typer.core.TyperGroup):
-            parent = typer.Context(command, info_name=name, parent=parent)
-            name = words.pop(0)
-            command = command.commands[name]
-        command.make_context(name, words, parent=parent)
+    for words in shown():
+        parsed(words)

@@ -8,7 +8,7 @@ import pytest
 from ray.autoscaler._private.util import prepare_config, validate_config
 
 from panolog.orchestrator.resources.scaling import IDLE_S
-from tests.deploy.files import DEPLOY, commands, load
+from tests.deploy.files import DEPLOY, commands, load, programs
 from tests.ray_head import BIN, environment
 
 pytestmark = pytest.mark.system
@@ -41,11 +41,7 @@ def test_ray_up_does_what_the_page_says(tmp_path: Path) -> None:
         (tmp_path / file).parent.mkdir(exist_ok=True)
         (tmp_path / file).write_text("x")
     calls = tmp_path / "calls"
-    for program in ("ssh", "rsync"):
-        fake = tmp_path / "bin" / program
-        fake.parent.mkdir(exist_ok=True)
-        fake.write_text(f'#!/bin/sh\necho "{program} $*" >> {calls}\n')
-        fake.chmod(0o755)
+    programs(tmp_path / "bin", {it: f'#!/bin/sh\necho "{it} $*" >> {calls}\n' for it in ("ssh", "rsync")})
     ours = environment() | {"HOME": str(tmp_path), "RAY_TMPDIR": str(tmp_path / "ray")}
     ours["PATH"] = f"{tmp_path / 'bin'}{os.pathsep}{ours['PATH']}"
     command = [f"{BIN}/ray", "up", "--yes", "--no-config-cache", f"{DEPLOY}/on-premises.yaml"]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.deploy.files import DEPLOY, ROOT, commands, load, load_all
+from tests.deploy.files import DEPLOY, ROOT, commands, load, load_all, programs
 from tests.ray_head import BIN, wait_until
 
 pytestmark = pytest.mark.system
@@ -44,13 +44,9 @@ class Slurm:
     def __init__(self, folder: Path, driver: str) -> None:
         self.calls = folder / "calls"
         self.run = folder / "run"
-        programs = {"srun": RUNS, "scontrol": RECORDS, "panolog": driver}
-        programs["ray"] = RECORDS + "[[ $1 == health-check ]] || exec sleep 600\n"
-        for name, text in programs.items():
-            program = folder / ".venv" / "bin" / name
-            program.parent.mkdir(parents=True, exist_ok=True)
-            program.write_text(text)
-            program.chmod(0o755)
+        ray = RECORDS + "[[ $1 == health-check ]] || exec sleep 600\n"
+        scripts = {"srun": RUNS, "scontrol": RECORDS, "panolog": driver, "ray": ray}
+        programs(folder / ".venv" / "bin", scripts)
         (folder / ".venv/bin/activate").write_text(f"PATH={folder}/.venv/bin:$PATH\n")
         (folder / "deploy").symlink_to(DEPLOY)
         slurm = {"SLURM_SUBMIT_DIR": folder, "SLURMD_NODENAME": "n0", "SLURM_NNODES": 3, "SLURM_JOB_ID": 7}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.deploy.files import DEPLOY, ROOT, load
+from tests.deploy.files import DEPLOY, ROOT, load, programs
 
 RECORDS = '#!/bin/bash\necho "${0##*/} $*" >> "$CALLS"\n'
 SCENE, RUN = "s3://bucket/scene", "s3://bucket/run"
@@ -15,15 +15,13 @@ SCENE, RUN = "s3://bucket/scene", "s3://bucket/run"
 def started(tmp_path: Path, rank: int, *, exists: bool = False, heads: int = 1) -> list[str]:
     """What `nodes.sh` calls. Args: exists, whether the run does; heads, times the first machine answers."""
     calls = tmp_path / "calls"
-    programs = {
+    scripts = {
         "panolog": RECORDS + ("" if exists else "[[ $1 != status ]] || exit 2\n"),
         "ray": RECORDS
         + '[[ $1 != health-check ]] || (($(grep --count health-check "$CALLS") <= HEADS)) || exit 1\n',
         "sleep": "#!/bin/bash\n",
     }
-    for name, text in programs.items():
-        (tmp_path / name).write_text(text)
-        (tmp_path / name).chmod(0o755)
+    programs(tmp_path, scripts)
     environment = os.environ | {
         "PATH": f"{tmp_path}:{os.environ['PATH']}",
         "CALLS": str(calls),

@@ -8,11 +8,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-import typer
-from typer.main import get_command
 
-from panolog.orchestrator.cli import app
-from tests.deploy.files import DEPLOY
+from tests.deploy.files import DEPLOY, parsed, programs
 
 UNIT = DEPLOY / "panolog@.service"
 QUEUE = DEPLOY / "panolog-queue.service"
@@ -57,9 +54,7 @@ def test_its_command_begins_or_resumes_the_run(tmp_path: Path, made: bool) -> No
     match = re.fullmatch(r"/bin/sh -c '(.*)'", shell)
     assert match is not None
     run, calls = tmp_path / "my run", tmp_path / "calls"
-    program = tmp_path / "panolog"
-    program.write_text(f'#!/bin/sh\nfor word in "$@"; do echo "$word" >> {calls}; done\n')
-    program.chmod(0o755)
+    programs(tmp_path, {"panolog": f'#!/bin/sh\nfor word in "$@"; do echo "$word" >> {calls}; done\n'})
     if made:
         run.mkdir()
         (run / "run.json").touch()
@@ -83,8 +78,4 @@ def test_the_queue_restarts_after_any_failure_and_stops_as_a_run_does() -> None:
         assert service[name] == run[name]
     words = service["ExecStart"].replace("${AT_ONCE}", "2").split()
     assert words[0] == "/opt/panolog/.venv/bin/panolog"
-    command = get_command(app.app)
-    for word in words[1:3]:
-        assert isinstance(command, typer.core.TyperGroup)
-        command = command.commands[word]
-    assert command.make_context("run", words[3:]).params["wait"] is True
+    assert parsed(words[1:])["wait"] is True

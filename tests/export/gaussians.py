@@ -1,10 +1,14 @@
 """Gaussians for the tests of file formats."""
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from panolog.export.reading import read_model
 from panolog.export.splats import REST, Splats
+from panolog.scene.errors import InputError
 
 Triple = tuple[float, float, float]
 
@@ -72,3 +76,15 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
         if not changed:
             break
     return bytes(changed)
+
+
+def line_of(path: Path) -> str:
+    """What is wrong with a file, on one line; nothing if it can be read as Gaussians that are finite."""
+    try:
+        found = read_model(path)
+    except InputError as error:
+        assert "\n" not in str(error) and len(str(error)) < 500
+        return str(error)
+    assert all(np.isfinite(column).all() for column in found.columns().values())
+    assert len({len(column) for column in found.columns().values()}) == 1
+    return ""

@@ -1,28 +1,17 @@
 """Which Gaussians of a large model remain."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from panolog.export.reduce import Reduced, extent
 from panolog.export.splats import ROWS, InMemory, Splats
+from tests.export.gaussians import scattered
 
 
-def some(count: int, seed: int = 0) -> Splats:
-    """Random Gaussians about (10, 20, 30); every third one is hardly visible."""
-    random = np.random.default_rng(seed)
-
-    def normal(*shape: int) -> NDArray[np.float32]:
-        return random.normal(size=shape).astype(np.float32)
-
-    quats = normal(count, 4)
-    return Splats(
-        means=normal(count, 3) * 2 + np.array([10, 20, 30], np.float32),
-        quats=quats / np.linalg.norm(quats, axis=1, keepdims=True),
-        scales=normal(count, 3) * np.float32(0.2) - 4,
-        opacities=np.where(np.arange(count) % 3 == 0, -9, 3).astype(np.float32),
-        sh0=normal(count, 3),
-        shN=np.zeros((count, 0, 3), np.float32),
-    )
+def some(count: int) -> Splats:
+    """Random Gaussians; every third one is hardly visible."""
+    model = scattered(count, 0, extent=3)
+    model.opacities[:] = np.where(np.arange(count) % 3 == 0, -9, 3)
+    return model
 
 
 def all_of(source: Reduced) -> Splats:

@@ -18,7 +18,7 @@ from panolog.scene.ply import read_ply, write_ply
 from tests.export.gaussians import scattered, turn_between
 from tests.export.gltf.reading import read_glb
 from tests.export.peers import node, peer
-from tests.export.sog.models import gaussians, source, splats
+from tests.export.sog.models import source, splats
 
 pytestmark = [pytest.mark.system, pytest.mark.nightly]
 
@@ -92,7 +92,7 @@ def test_sog(tmp_path: Path, count: int, degree: int) -> None:
 def test_sog_of_theirs_and_in_a_folder(tmp_path: Path, name: str) -> None:
     write_sog_folder(tmp_path / "ours", source(800))
     assert_equal(read_sog(tmp_path / "ours"), as_read(tmp_path / "ours/meta.json"))
-    write_ply(tmp_path / "model.ply", gaussians(splats(3000)))
+    write_ply(tmp_path / "model.ply", splats(3000).gaussians())
     transformed("-g", "cpu", tmp_path / "model.ply", tmp_path / name)
     assert_equal(read_sog(tmp_path / name), as_read(tmp_path / name))
 
@@ -113,7 +113,7 @@ def test_levels_of_a_streamed_sog(tmp_path: Path) -> None:
 def test_glb(tmp_path: Path) -> None:
     """The same attributes from the same model, whose y splat-transform takes to be down in a PLY."""
     model = scattered(1000)
-    write_ply(tmp_path / "a.ply", gaussians(model))
+    write_ply(tmp_path / "a.ply", model.gaussians())
     transformed("-q", tmp_path / "a.ply", tmp_path / "theirs.glb")
     write_glb(tmp_path / "ours.glb", InMemory(model), None)
     ours, theirs = read_glb(tmp_path / "ours.glb"), read_glb(tmp_path / "theirs.glb")

@@ -11,7 +11,7 @@ import zstandard
 from panolog.export.splats import InMemory, Splats
 from panolog.export.spz import Version, read_spz, write_spz
 from panolog.scene.errors import FormatError
-from tests.export.gaussians import matched, mutated, scattered, turn_between
+from tests.export.gaussians import matched, scattered, turn_between
 
 MAGIC = b"NGSP"
 BOTH: tuple[Version, ...] = (3, 4)
@@ -65,6 +65,7 @@ def test_bytes_are_as_the_format_says(tmp_path: Path, version: Version) -> None:
     path = tmp_path / "one.spz"
     write_spz(path, InMemory(one), version)
     found = plain(path)
+    assert version == 4 or path.read_bytes()[:8] == b"\x1f\x8b\x08\x00\x00\x00\x00\x00"  # no name, no time
     expected = MAGIC + struct.pack("<IIBBBB", version, 1, 1, 12, 0, 6 if version == 4 else 0)
     for coordinate in (1.5, -2, 0.25):
         expected += struct.pack("<i", round(coordinate * 4096))[:3]
@@ -118,19 +119,6 @@ def test_positions_have_as_many_bits_as_the_extent_permits(tmp_path: Path) -> No
         header = plain(path)[:16]
         assert header[13] == bits
         assert np.abs(read_spz(path).means - matched(splats, read_spz(path).means).means).max() <= 2.0**-bits
-
-
-@pytest.mark.parametrize("version", BOTH)
-def test_equal_models_are_equal_bytes(tmp_path: Path, version: Version) -> None:
-    splats = scattered(70_000, 1)  # more than a piece
-    for name in ("a", "b"):
-        write_spz(tmp_path / name, InMemory(splats), version)
-    packed = (tmp_path / "a").read_bytes()
-    assert packed == (tmp_path / "b").read_bytes()
-    assert version == 4 or packed[:8] == b"\x1f\x8b\x08\x00\x00\x00\x00\x00"  # no name, no time
-    assert len(read_spz(tmp_path / "a")) == 70_000
-    with pytest.raises(FormatError, match="no Gaussian"):
-        write_spz(tmp_path / "a", InMemory(scattered(0)), version)
 
 
 def header(version: int, count: int, degree: int = 0, bits: int = 12, streams: int = 0) -> bytes:
@@ -189,28 +177,6 @@ def test_what_is_no_spz_is_one_line(tmp_path: Path, name: str) -> None:
     with pytest.raises(FormatError, match=reason) as error:
         read_spz(path)
     assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("mutations", [40, pytest.param(400, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize("version", [2, *BOTH])
-def test_damage_is_an_error_or_other_gaussians(tmp_path: Path, version: int, mutations: int) -> None:
-    path, rng = tmp_path / "a.spz", np.random.default_rng(version)
-    if version == 2:
-        path.write_bytes(gzip.compress(header(2, 40, 1) + rng.bytes(40 * (9 + 1 + 3 + 3 + 3 + 9))))
-    else:
-        write_spz(path, InMemory(scattered(40, 1)), 4 if version == 4 else 3)
-    whole, read = path.read_bytes(), 0
-    for _ in range(mutations):
-        damaged = mutated(whole, rng)
-        path.write_bytes(damaged)
-        try:
-            found = read_spz(path)
-        except FormatError as error:
-            assert "\n" not in str(error)
-        else:
-            read += 1
-            assert all(np.isfinite(column).all() for column in found.columns().values())
-    assert read < mutations  # damage has been found
 
 
 @pytest.mark.parametrize("version", [2, 3])

@@ -11,7 +11,7 @@ import pytest
 from panolog.export.gltf import glb
 from panolog.export.gltf.glb import Compression, write_glb
 from panolog.export.splats import REST, InMemory, Splats
-from panolog.export.spz import decode, read_spz, write_spz
+from panolog.export.spz import decode
 from panolog.scene.errors import FormatError
 from tests.export.gaussians import C0, matched, scattered
 from tests.export.gltf.reading import read_glb
@@ -71,18 +71,13 @@ def test_compressed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", ["spz", None])
-def test_equal_models_are_equal_bytes_and_what_does_not_fit_is_refused(
+def test_what_does_not_fit_is_refused(
     tmp_path: Path, compression: Compression, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in "ab":
-        write_glb(tmp_path / name, InMemory(scattered(1000)), compression)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-    with pytest.raises(FormatError, match="no Gaussian"):
-        write_glb(tmp_path / "c", InMemory(scattered(0)), compression)
     monkeypatch.setattr(glb, "_MOST", 1000)
     with pytest.raises(FormatError, match="may have 1000"):
         write_glb(tmp_path / "c", InMemory(scattered(100)), compression)
-    assert len(list(tmp_path.iterdir())) == 2
+    assert not list(tmp_path.iterdir())
 
 
 def issues(path: Path, *plain: str) -> list[dict[str, Any]]:
@@ -108,13 +103,3 @@ def test_khronos_validator(tmp_path: Path, compression: Compression) -> None:
     broken[broken.index(b'"min":[-') + 7] = ord(" ")  # the validator looks at the numbers
     path.write_bytes(broken)
     assert compression or any(issue["code"].startswith("ACCESSOR_M") for issue in issues(path, "plain"))
-
-
-def test_an_spz_in_a_glb_is_that_of_a_file(tmp_path: Path) -> None:
-    splats = scattered(300)  # whose centre is at the origin, up to half a unit
-    write_glb(tmp_path / "a.glb", InMemory(splats))
-    found = read_glb(tmp_path / "a.glb")
-    moved = Splats(**splats.columns() | {"means": splats.means - found.matrix[:3, 3].astype(np.float32)})
-    write_spz(tmp_path / "a.spz", InMemory(moved))
-    assert found.view(0) == (tmp_path / "a.spz").read_bytes()
-    assert len(read_spz(tmp_path / "a.spz")) == 300

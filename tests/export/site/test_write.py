@@ -9,11 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from panolog.export.frame import Frame
 from panolog.export.site import write
-from panolog.export.site.page import Page, PageCamera, Pose, described, photograph_rotation
+from panolog.export.site.page import Page, PageCamera, Pose, described
 from panolog.export.site.write import site_files, write_page, write_site
 from panolog.scene.errors import InputError
 
@@ -125,14 +123,6 @@ def test_poses_look_where_they_say() -> None:
         ahead = np.array([-np.sin(a) * np.cos(b), np.sin(b), -np.cos(a) * np.cos(b)])
         pose = Pose.towards(np.array([1, 2, 3]), 5 * ahead)
         assert np.allclose([pose.yaw, pose.pitch], [yaw, pitch], atol=1e-3)
-
-
-def test_rotations_turn_a_panoramas_axes_into_the_exported_frame() -> None:
-    rotation = Rotation.random(random_state=3).as_matrix()
-    frame = Frame.upright((0, 0, 1))
-    turned = Rotation.from_quat(photograph_rotation(frame, rotation)).as_matrix()
-    ahead = frame.rotation @ rotation[2]  # what the panorama looks at
-    assert np.allclose(turned @ [0, 0, 1], ahead, atol=1e-5)
 
 
 def test_a_description_gets_the_photographs_of_cameras_with_a_rotation() -> None:

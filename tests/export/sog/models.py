@@ -1,11 +1,9 @@
 """Models for the tests of SOG."""
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from panolog.export.splats import REST, InMemory, Splats
-from panolog.scene.gaussians import Gaussians
 
 Quats = NDArray[np.float32]
 
@@ -35,12 +33,3 @@ def source(count: int, degree: int = 3, seed: int = 1) -> InMemory:
 def turned_alike(quats: Quats, as_these: Quats) -> Quats:
     """(N, 4) quaternions (N, 4), each with the sign of its counterpart: q and −q are the same rotation."""
     return np.asarray(quats * np.sign((quats * as_these).sum(axis=1, keepdims=True)), np.float32)
-
-
-def gaussians(model: Splats) -> Gaussians:
-    """The same for a PLY."""
-    rest = np.zeros((len(model), REST[-1], 3), np.float32)
-    rest[:, : model.shN.shape[1]] = model.shN
-    columns = model.columns() | {"sh0": model.sh0[:, None], "shN": rest}
-    means, quats, scales, opacities, sh0, shN = map(torch.from_numpy, columns.values())
-    return Gaussians(means, quats, scales, opacities, sh0, shN)

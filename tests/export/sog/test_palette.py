@@ -3,7 +3,6 @@
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from panolog.export.sog.palette import MOST, Palette, make_palette, palette_size, step_of, units
@@ -40,24 +39,6 @@ def test_it_is_near_the_best_of_k_means() -> None:
         sums = np.stack([np.bincount(nearest, column, minlength=256) for column in model.T], axis=1)
         entries = np.where(counts[:, None] > 0, sums / counts.clip(1)[:, None], entries)
     assert np.square(found - model).sum() < 1.1 * np.square(entries[nearest] - model).sum()
-
-
-@pytest.mark.parametrize("count", [1, 2, 63, 64, 65, 1000])
-def test_small_models(count: int) -> None:
-    model, weights = vectors(count), np.ones(count, np.float32)
-    palette = made(model, weights, palette_size(count))
-    labels = palette.labels(units(model, palette.step))
-    assert palette.entries.shape == (palette_size(count), 45) and labels.max() < len(palette.entries)
-
-
-@pytest.mark.parametrize("factor", [0, 1])
-def test_equal_vectors(factor: int) -> None:
-    model = factor * np.tile(vectors(1), (500, 1))
-    palette = made(model, np.ones(500, np.float32), 64)
-    steps = units(model, palette.step)
-    labels = palette.labels(steps)
-    palette.add(steps, labels, np.ones(500, np.float32))
-    np.testing.assert_allclose(palette.means()[labels] * palette.step, model, atol=palette.step)
 
 
 def test_threads_and_blas_do_not_change_it() -> None:
