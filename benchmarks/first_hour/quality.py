@@ -66,17 +66,18 @@ def _compared(
 ) -> Outcome:
     """A run on the device and one on the CPU. Args: if_time, estimate the second before it is begun."""
     ends = time.monotonic() + context.seconds
-    results = [_reconstruct(context, place, context.device, settings)]
-    outcome = _outcome(results, commands)
+    results = [reconstruct(context, place, context.device, settings)]
+    outcome = outcome_of(results, commands)
     if not context.cuda:
         return outcome
     context.save(outcome)
     if if_time and (why := _too_long(place, settings, ends - time.monotonic())):
         return Outcome(**asdict(outcome) | {"reason": f"not run on the CPU: {why}"})
-    return _outcome([*results, _reconstruct(context, place, "cpu", settings)], commands)
+    return outcome_of([*results, reconstruct(context, place, "cpu", settings)], commands)
 
 
-def _outcome(results: list[Result], commands: tuple[str, ...]) -> Outcome:
+def outcome_of(results: list[Result], commands: tuple[str, ...]) -> Outcome:
+    """The outcome of runs on some devices: failed if the first is much worse than the last, the CPU."""
     figure = "PSNR " + ", ".join(f"{result.psnr:.2f} dB on {result.device}" for result in results)
     content = {"runs": [asdict(result) for result in results]}
     text = markdown(HEAD, [tuple(asdict(result).values()) for result in results])
@@ -85,7 +86,7 @@ def _outcome(results: list[Result], commands: tuple[str, ...]) -> Outcome:
     return Outcome("passed", figure, "", commands, content, text)
 
 
-def _reconstruct(context: Context, place: Path, device: str, settings: Settings) -> Result:
+def reconstruct(context: Context, place: Path, device: str, settings: Settings) -> Result:
     """Trains, merges and evaluates a scene by the command, or without Ray if that is not installed."""
     root = context.work / f"run-{device}"
     began = time.monotonic()

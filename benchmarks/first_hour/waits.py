@@ -27,7 +27,7 @@ def count(context: Context) -> Outcome:
     town = make_town(context.work / "town", panoramas=9, width=64, points=2_000)
     flags = {"device": context.device, "iterations": iterations, "sky.count": 500}
     found: Counter[str] = Counter()
-    with _counted(found) if context.cuda else warnings.catch_warnings():
+    with counted(found) if context.cuda else warnings.catch_warnings():
         events = list(panolog.train(town, load_config(flags=flags)))
     rates = [event.rate for event in events if isinstance(event, Progress) and event.rate]
     if not rates:
@@ -44,7 +44,7 @@ def count(context: Context) -> Outcome:
 
 
 @contextmanager
-def _counted(found: Counter[str]) -> Iterator[None]:
+def counted(found: Counter[str]) -> Iterator[None]:
     """Counts the waits within it by file and line: torch warns of each."""
     torch.cuda.set_sync_debug_mode("warn")
     try:

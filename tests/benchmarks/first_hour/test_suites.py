@@ -9,8 +9,6 @@ import pytest
 from benchmarks.first_hour import sanitizer, suites, supervise
 from benchmarks.first_hour.outcome import ROOT, Context, Outcome
 
-Fake = Callable[[str], None]
-
 CRASHES = """
 import os, pytest
 def test(): pass
@@ -26,7 +24,9 @@ some_tests.py::test_hangs """
 CARD, REHEARSAL = (Context("tests", "", device, 60) for device in ("cuda", "cpu"))
 
 
-def test_a_test_that_ends_the_process_is_named_and_the_others_run(tmp_path: Path, fake: Fake) -> None:
+def test_a_test_that_ends_the_process_is_named_and_the_others_run(
+    tmp_path: Path, fake: Callable[[str], None]
+) -> None:
     (tmp_path / "some_tests.py").write_text(CRASHES)
     (tmp_path / "more_tests.py").write_text("import a_package_that_is_missing")
     options = ["-vv", "-o", "junit_family=xunit1", "-p", "no:cacheprovider", "some_tests.py", "more_tests.py"]
@@ -48,10 +48,8 @@ def test_a_test_that_ends_the_process_is_named_and_the_others_run(tmp_path: Path
 
 def test_a_test_that_hangs_is_named() -> None:
     outcome = suites.judged(CARD, suites.read_log(LOG), (), whole=False)
-    assert (outcome.figure, outcome.reason) == (
-        "1 passed, 1 failed, 1 skipped",
-        "1 fail; not all of them ran",
-    )
+    assert outcome.figure == "1 passed, 1 failed, 1 skipped"
+    assert outcome.reason == "1 fail; not all of them ran"
     assert list(outcome.content["failed"]) == ["some_tests.py::test_hangs"]
 
 
@@ -61,29 +59,24 @@ def test_skipped_tests_are_a_failure_on_a_card() -> None:
     assert [(it.ending, it.reason) for it in found] == [("skipped", "no card"), ("failed", "no test passed")]
 
 
-def test_what_fails_after_an_error_of_the_card_runs_again_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_fails_after_an_error_of_the_card_runs_again_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(_context: Context, command: list[str], *_: object) -> tuple[suites.Suite, bool]:
         second = command[-1] == "b"
         return suites.Suite(passed=["b"] * second, failed={} if second else {"a": "x"}), True
 
     first = suites.Suite(failed={"a": "RuntimeError: CUDA error: illegal", "b": "RuntimeError: CUDA error"})
     monkeypatch.setattr(suites, "run", run)
-    alone = dict(suites.alone(CARD, first.failed, float("inf")))
-    assert alone == {"a": False, "b": True}
-    first.alone = alone
+    first.alone = dict(suites.alone(CARD, first.failed, float("inf")))
+    assert first.alone == {"a": False, "b": True}
     outcome = suites.judged(CARD, first, (), whole=True)
     assert outcome.reason == "1 fail; 1 fail only after an error of another test"
     assert "`b` (passes alone)" in outcome.text
 
 
-CLEAN = "========= COMPUTE-SANITIZER\n========= ERROR SUMMARY: 0 errors\n"
 OUT_OF_BOUNDS = """========= COMPUTE-SANITIZER
 ========= Invalid __global__ write of size 4 bytes
 =========     at composite_forward+0x1b0 in composite.cu:34
 =========     by thread (7,0,0) in block (1,0,0)
-=========     Address 0x7f is out of bounds
 ========= Invalid __global__ read of size 16 bytes
 =========     at project_backward+0x70 in project.cu:80
 ========= ERROR SUMMARY: 2 errors
@@ -97,44 +90,26 @@ RACE = """========= COMPUTE-SANITIZER
 OF_TORCH = """========= COMPUTE-SANITIZER
 ========= Uninitialized __global__ memory read of size 4 bytes
 =========     at void cub::DeviceRadixSortOnesweepKernel<int>(int *, int)+0x70
-=========     by thread (0,0,0) in block (0,0,0)
 ========= ERROR SUMMARY: 1 error
 """
 
 
 @pytest.mark.parametrize(
-    ("log", "ending", "figure", "reason"),
+    ("log", "ending", "reports", "reason"),
     [
-        (CLEAN, "passed", "0 reports, 0 of them in our kernels; 61 passed", ""),
+        ("========= ERROR SUMMARY: 0 errors\n", "passed", "0 reports, 0 of them in our kernels; ", ""),
         (
             OUT_OF_BOUNDS,
             "failed",
-            "2 reports, 2 of them in our kernels; 61 passed",
+            "2 reports, 2 of them in our kernels; ",
             "reports in composite_forward, project_backward",
         ),
-        (RACE, "failed", "1 reports, 1 of them in our kernels; 61 passed", "reports in loss_similarity"),
-        (OF_TORCH, "passed", "1 reports, 0 of them in our kernels; 61 passed", ""),
-        (
-            "========= Error: Device not supported.\n",
-            "failed",
-            "61 passed",
-            "compute-sanitizer: Error: Device not supported.",
-        ),
-        ("", "failed", "61 passed", "compute-sanitizer: it wrote no summary"),
+        (RACE, "failed", "1 reports, 1 of them in our kernels; ", "reports in loss_similarity"),
+        (OF_TORCH, "passed", "1 reports, 0 of them in our kernels; ", ""),
+        ("========= Error: No device.\n", "failed", "", "compute-sanitizer: Error: No device."),
+        ("", "failed", "", "compute-sanitizer: it wrote no summary"),
     ],
 )
-def test_what_a_sanitizer_reports(log: str, ending: str, figure: str, reason: str) -> None:
+def test_what_a_sanitizer_reports(log: str, ending: str, reports: str, reason: str) -> None:
     found = sanitizer.judged(Outcome("passed", "61 passed"), log)
-    assert (found.ending, found.figure, found.reason) == (ending, figure, reason)
-
-
-def test_the_sanitizer_of_a_wheel_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not that of a wheel without the programs that start the target."""
-    for name in ("PATH", "CUDA_HOME", "CUDA_PATH"):
-        monkeypatch.setenv(name, "")
-    program = tmp_path / "nvidia" / "cu99" / "compute-sanitizer" / "compute-sanitizer"
-    for file in (program, tmp_path / "nvidia" / "cu98" / "bin" / "compute-sanitizer"):
-        file.parent.mkdir(parents=True)
-        file.touch(mode=0o755)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    assert sanitizer.find_program() == program
+    assert (found.ending, found.figure, found.reason) == (ending, f"{reports}61 passed", reason)
