@@ -1,11 +1,15 @@
-"""Models and images to time."""
+"""Models and images to time, and gsplat's side of the comparison, with a stand-in for gsplat."""
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from benchmarks.rasterizer.cases import BLOCKS, CaseSpec, street, street_camera
+from benchmarks.rasterizer import peers
+from benchmarks.rasterizer.cases import BLOCKS, CaseSpec, street, street_camera, street_case
+from panolog.renderer.camera import facing
 from panolog.renderer.render import render
 from panolog.scene.errors import InputError
 from panolog.scene.ply import write_ply
@@ -16,8 +20,7 @@ def test_a_recipe_makes_a_street_or_a_trained_model(tmp_path: Path) -> None:
     scene, model = write_scene(tmp_path / "town"), tmp_path / "model.ply"
     write_ply(model, street(100))
     case = CaseSpec(2 * WIDTH, model=str(model), scene=str(scene), views=2).make()  # larger than its images
-    assert case.name == "trained on town"
-    assert len(case.gaussians) == 100
+    assert (case.name, len(case.gaussians)) == ("trained on town", 100)
     assert [view.target.shape for view in case.views] == [(WIDTH, 2 * WIDTH, 3)] * 2
     assert case.near > 0
     with pytest.raises(InputError, match="nowhere"):
@@ -42,11 +45,44 @@ def test_a_block_is_a_slab_of_the_street_and_looks_as_the_whole(exact: bool) -> 
 
 def test_a_street_is_sound_and_the_same_every_time() -> None:
     first, second = street(1000, sky=0.1), street(1000, sky=0.1)
-    assert len(first) == 1000
-    assert first.sky == 100
-    for name, tensor in first.tensors().items():
-        assert torch.isfinite(tensor).all(), name
-        assert torch.equal(tensor, getattr(second, name)), name
+    assert (len(first), first.sky) == (1000, 100)
+    assert all(torch.equal(tensor, getattr(second, name)) for name, tensor in first.tensors().items())
     rendered = render(first, street_camera(128))
     assert not rendered.invalid.any()
     assert rendered.alpha.mean() > 0.8  # little shines through
+
+
+def test_the_faces_look_where_they_are_resampled_from() -> None:
+    """A point in the direction of a pixel of a face is projected to this pixel."""
+    case = street_case(50, 64)
+    camera = case.views[0].camera
+    lens = peers.face(64)
+    assert lens.focal == pytest.approx(64 / (2 * np.pi), rel=0.1)  # as fine as the panorama
+    given = peers.arguments(case.gaussians, camera, lens)
+    for view, K, turn in zip(given["viewmats"], given["Ks"], peers.FACES, strict=True):
+        pixel = torch.tensor([3.5, 9.5, 1.0])
+        ray = torch.linalg.inv(K) @ pixel
+        in_panorama = torch.from_numpy(facing(*turn)).float() @ ray
+        point = camera.rotation.T @ (7 * in_panorama - camera.translation)
+        seen = K @ (view[:3, :3] @ point + view[:3, 3])
+        assert torch.allclose(seen / seen[2], pixel, atol=1e-3)
+    assert given["colors"].shape == (50, 16, 3)
+    assert (given["scales"] > 0).all() and (given["opacities"] < 1).all()
+
+
+def test_rows_of_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stand-in returns grey faces."""
+
+    def rasterization(**given: Any) -> tuple[torch.Tensor, None, dict[str, torch.Tensor]]:
+        shape = (len(given["viewmats"]), given["height"], given["width"], 3)
+        return given["means"].sum() * 0 + torch.full(shape, 0.5), None, {"flatten_ids": torch.zeros(321)}
+
+    monkeypatch.setattr(peers, "load_gsplat", lambda: rasterization)
+    case = street_case(200, 64)
+    ours, panorama = peers.ours(case, repeats=1)
+    theirs = peers.theirs(case, 1, panorama)
+    assert (ours.images, ours.pixels) == (1, 64 * 32)
+    assert ours.pairs >= int(case.gaussians.opacities.shape[0] / 4)
+    assert (theirs.images, theirs.pixels, theirs.pairs) == (6, 6 * 23 * 23, 321)
+    assert theirs.psnr is not None and 0 < theirs.psnr < 40
+    assert "gsplat" in peers.table([ours, theirs])

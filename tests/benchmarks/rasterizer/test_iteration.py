@@ -1,13 +1,22 @@
-"""What is timed is a real training iteration that leaves the model as it was."""
+"""What is timed is a real training iteration that leaves the model as it was; what it launches and meets."""
+
+import json
 
 import pytest
 import torch
 
+from benchmarks.rasterizer import pairs
 from benchmarks.rasterizer.cases import CaseSpec, street_case
 from benchmarks.rasterizer.iteration import TrainingStep, measure, stages
 from panolog.renderer import ops
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.cuda.stubbed import stubbed
+
+LAUNCHES = [
+    *("project_forward", "bin_narrow", "composite_forward", "loss_similarity", "loss_gradient"),
+    *("loss_absolute", "composite_backward", "project_backward", "iteration_guard", "adam_step"),
+    "iteration_statistics",
+]
 
 
 @pytest.mark.parametrize("block", [None, "middle"])
@@ -42,3 +51,20 @@ def test_parts_are_those_of_the_iteration() -> None:
     times, spent = (work(case, threads=1, repeats=1) for work in (measure, stages))
     assert all(milliseconds > 0 for each in (times, spent) for milliseconds in vars(each).values())
     assert ops.threads() == 1
+
+
+def test_each_kernel_is_launched_once(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core")
+    from benchmarks.rasterizer import launches  # noqa: PLC0415
+
+    assert launches.main(["--quick", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["launches"] == dict.fromkeys(LAUNCHES, 1)
+    assert 0 < found["fastest_ms"] <= found["median_ms"]
+
+
+def test_no_more_pairs_than_the_estimate_assumes(capsys: pytest.CaptureFixture[str]) -> None:
+    pairs.main(["--random", "2000,20000", "--width", "256,512", "--json"])
+    rows = json.loads(capsys.readouterr().out)
+    assert len(rows) == 4
+    assert all(1 < row["pairs"] < row["assumed"] for row in rows)
