@@ -7,21 +7,14 @@ pytestmark = pytest.mark.system
 RUNS = recorded()
 
 
-@pytest.mark.parametrize("machines", ["1 GPU", "2 GPUs", "4 GPUs", "1 and 1 at 60 %"])
+@pytest.mark.parametrize("machines", MACHINES)
 @pytest.mark.parametrize("run", RUNS)
 def test_recorded_runs_end_within_five_percent_of_the_best_possible(run: str, machines: str) -> None:
-    assert excess(RUNS[run], MACHINES[machines]) <= 0.05
-
-
-@pytest.mark.parametrize("run", RUNS)
-def test_among_unequal_gpus_not_all_is_foreseen(run: str) -> None:
-    """Two of ten are above 5%: how fast a GPU is and what a block costs is learned while they are trained."""
-    assert excess(RUNS[run], MACHINES["2 and 1 of half the speed"]) <= 0.06
-
-
-def test_there_are_ten_of_them_and_each_has_more_blocks_than_gpus() -> None:
-    assert len(RUNS) == 10
-    assert min(len(blocks) for blocks in RUNS.values()) > 4
+    """Two are above it where one GPU is slow: how fast it is, is learned while blocks are trained."""
+    assert len(RUNS) == 10 and len(RUNS[run]) > 4
+    assert excess(RUNS[run], MACHINES[machines]) <= (
+        0.06 if machines == "2 and 1 of half the speed" else 0.05
+    )
 
 
 def test_the_bound_is_what_can_be_reached() -> None:
