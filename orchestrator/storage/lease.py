@@ -57,10 +57,14 @@ class Lease:
 
     def release(self) -> None:
         """Ends the lease; another driver may have the run at once. Raises as `Store`."""
-        self._ended.set()
-        self._thread.join()
+        self.end()
         if not self._lost:
             self._store.write(numbered(LEASES, self.number), self._owner.content(released=True))
+
+    def end(self) -> None:
+        """Refreshes the lease no more: it expires, as that of a driver that was killed."""
+        self._ended.set()
+        self._thread.join()
 
     def _keep(self) -> None:
         while not self._ended.wait(_REFRESH_S) and not self._lost:

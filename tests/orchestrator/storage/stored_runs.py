@@ -55,11 +55,11 @@ def mirror_of(driver: Driver, store: Store, *, force: bool = False) -> tuple[Mir
     return Mirror(driver.folder, store, lease, current(store)), lease
 
 
-def rounds(mirror: Mirror) -> None:
+def rounds(mirror: Mirror, patience: float = 300.0) -> None:
     """As many rounds as it takes, as when the driver has ended."""
     over = threading.Event()
     over.set()
-    mirror.follow(over, threading.Event(), 0.01, 300.0)
+    mirror.follow(over, threading.Event(), 0.01, patience)
 
 
 def fetched(store: Store, root: Path) -> RunFolder:

@@ -30,7 +30,7 @@ from panolog.orchestrator.storage.mirror import Mirror
 from panolog.orchestrator.storage.state import MirrorState, read_state, write_state
 from panolog.scene.errors import RunFolderError, RunLockedError, StoreError, StoreLostError
 from panolog.scene.files import write_bytes
-from panolog.scene.stores.store import open_store
+from panolog.scene.stores.store import Store, open_store
 from panolog.workers.tasks import COARSE
 from tests.object_store import ObjectStore, object_store
 from tests.orchestrator.storage.stored_runs import Driver, Watched, fetched, mirror_of, rounds
@@ -60,6 +60,15 @@ def test_the_store_is_whole_after_every_change(tmp_path: Path) -> None:
     assert len(files(fresh.root)) == 3
 
 
+def stored(tmp_path: Path) -> tuple[Driver, Store, Mirror]:
+    """A run with a checkpoint, of which a store has everything."""
+    store, driver = open_store(f"file://{tmp_path}/store"), Driver(tmp_path / "run")
+    mirror, _ = mirror_of(driver, store)
+    driver.save()
+    mirror.round()
+    return driver, store, mirror
+
+
 def files(root: Path) -> dict[str, bytes]:
     """All that a mirror copies, but for run.db, whose pages a copy may have in another order."""
     found = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
@@ -67,8 +76,7 @@ def files(root: Path) -> dict[str, bytes]:
 
 
 def test_what_was_replaced_is_removed_and_results_have_their_names(tmp_path: Path) -> None:
-    store = open_store(f"file://{tmp_path}/store")
-    driver = Driver(tmp_path / "run")
+    store, driver = open_store(f"file://{tmp_path}/store"), Driver(tmp_path / "run")
     mirror, lease = mirror_of(driver, store)
     for _ in range(5):
         driver.save()
@@ -120,10 +128,7 @@ def test_results_of_a_run_that_a_limit_has_ended_are_replaced_when_it_is_complet
 
 
 def test_a_run_that_was_refused_leaves_nothing(tmp_path: Path) -> None:
-    store = open_store(f"file://{tmp_path}/store")
-    driver = Driver(tmp_path / "run")
-    mirror, _ = mirror_of(driver, store)
-    mirror.round()
+    driver, store, mirror = stored(tmp_path)
     assert current(store) is not None
     driver.folder.info.unlink()
     rounds(mirror)
@@ -132,8 +137,7 @@ def test_a_run_that_was_refused_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_a_store_that_fails_delays_only_the_mirror_and_says_so(tmp_path: Path) -> None:
-    store = Watched(open_store(f"file://{tmp_path}/store").url)
-    driver = Driver(tmp_path / "run")
+    store, driver = Watched(open_store(f"file://{tmp_path}/store").url), Driver(tmp_path / "run")
     mirror, _ = mirror_of(driver, store)
     driver.save()
     failing = iter([True] * 3)
@@ -143,7 +147,9 @@ def test_a_store_that_fails_delays_only_the_mirror_and_says_so(tmp_path: Path) -
             raise StoreLostError("the store fails (503)")
 
     store.after = fail
-    assert not mirror._try(last=False)
+    stopped = threading.Event()
+    stopped.set()
+    mirror.follow(threading.Event(), stopped, 0.01, 300.0)  # until the first failure
     state = read_state(driver.folder.mirror)
     assert state is not None
     assert state.problem == "the store fails (503)"
@@ -158,8 +164,7 @@ def test_a_store_that_fails_delays_only_the_mirror_and_says_so(tmp_path: Path) -
 
 
 def test_a_mirror_without_a_store_gives_up_and_keeps_what_is_left_in_mind(tmp_path: Path) -> None:
-    store = Watched(open_store(f"file://{tmp_path}/store").url)
-    driver = Driver(tmp_path / "run")
+    store, driver = Watched(open_store(f"file://{tmp_path}/store").url), Driver(tmp_path / "run")
     mirror, _ = mirror_of(driver, store)
     driver.end()
 
@@ -167,16 +172,12 @@ def test_a_mirror_without_a_store_gives_up_and_keeps_what_is_left_in_mind(tmp_pa
         raise StoreLostError("the store fails (503)")
 
     store.after = fail
-    ended = threading.Event()
-    ended.set()
-    mirror.follow(ended, threading.Event(), 0.01, 0.05)
-    assert not mirror.state.complete
-    assert mirror.state.problem
+    rounds(mirror, patience=0.05)
+    assert (mirror.state.complete, mirror.state.problem) == (False, "the store fails (503)")
 
 
-def test_one_driver_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = open_store(f"file://{tmp_path}/store")
-    driver = Driver(tmp_path / "run")
+def test_one_driver_at_a_time(tmp_path: Path) -> None:
+    store, driver = open_store(f"file://{tmp_path}/store"), Driver(tmp_path / "run")
     mirror, lease = mirror_of(driver, store)
     driver.save()
     mirror.round()
@@ -199,8 +200,7 @@ def test_one_driver_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_the_mirror_of_a_live_driver_is_replaced_but_not_that_of_another(tmp_path: Path) -> None:
-    store = open_store(f"file://{tmp_path}/store")
-    driver = Driver(tmp_path / "run")
+    store, driver = open_store(f"file://{tmp_path}/store"), Driver(tmp_path / "run")
     with lock.hold(driver.folder.lock):
         mirror_of(driver, store)
         with pytest.raises(RunLockedError):
@@ -211,11 +211,7 @@ def test_the_mirror_of_a_live_driver_is_replaced_but_not_that_of_another(tmp_pat
 
 
 def test_a_mirror_that_was_killed_after_its_pointer_leaves_a_folder_that_is_kept(tmp_path: Path) -> None:
-    store = open_store(f"file://{tmp_path}/store")
-    driver = Driver(tmp_path / "run")
-    mirror, _ = mirror_of(driver, store)
-    driver.save()
-    mirror.round()
+    driver, store, _ = stored(tmp_path)
     state = read_state(driver.folder.mirror)
     assert state is not None
     write_state(driver.folder.mirror, replace(state, published="before"))
@@ -231,11 +227,7 @@ def test_a_lease_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_damaged_store_is_one_line(tmp_path: Path) -> None:
-    store = open_store(f"file://{tmp_path}/store")
-    driver = Driver(tmp_path / "run")
-    mirror, _ = mirror_of(driver, store)
-    driver.save()
-    mirror.round()
+    _, store, mirror = stored(tmp_path)
     (checkpoint,) = store.list(f"{OBJECTS}/coarse/checkpoint.safetensors")
     store.write(checkpoint, b"other")
     with pytest.raises(StoreError, match="its digest differs"):
@@ -257,8 +249,7 @@ def test_a_manifest_that_names_what_is_no_file_of_a_run_is_refused(tmp_path: Pat
 
 
 def test_which_folder_is_brought_up_to_date_and_which_is_kept(tmp_path: Path) -> None:
-    store = open_store(f"file://{tmp_path}/store")
-    driver = Driver(tmp_path / "run")
+    store, driver = open_store(f"file://{tmp_path}/store"), Driver(tmp_path / "run")
     mirror, lease = mirror_of(driver, store)
     driver.save()
     mirror.round()
@@ -286,11 +277,7 @@ def test_which_folder_is_brought_up_to_date_and_which_is_kept(tmp_path: Path) ->
 
 
 def test_a_reader_gets_what_it_needs(tmp_path: Path) -> None:
-    store = open_store(f"file://{tmp_path}/store")
-    driver = Driver(tmp_path / "run")
-    mirror, _ = mirror_of(driver, store)
-    driver.save()
-    mirror.round()
+    _, store, _ = stored(tmp_path)
     with viewed(store.url, for_status) as found:
         names = {path.name for path in found.root.rglob("*") if path.is_file()}
         assert names == {"run.json", "run.db"}
