@@ -15,7 +15,6 @@ from panolog.orchestrator.queue.store import Queue
 from panolog.orchestrator.queue.view import view_queue
 from panolog.orchestrator.resources.machine import memory, memory_total, memory_usage
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.units import gib
 from panolog.scene.errors import ConfigError
 from tests.nvidia_smi import print_gpus
 from tests.orchestrator.queue.queues import ANY, Scripted
@@ -126,7 +125,7 @@ def test_a_run_counts_on_its_share_of_the_memory(monkeypatch: pytest.MonkeyPatch
 
 def test_four_gpus_are_given_out_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A large run gets its turn, one that never fits fails, and no GPU is in two runs."""
-    print_gpus(tmp_path, monkeypatch, listing(4))
+    print_gpus(tmp_path, monkeypatch, "".join(f"{i}, GPU-{i}, NVIDIA L4, 22000, 23000\n" for i in range(4)))
     queue = Scripted(tmp_path, at_once=4)
     for name, gpus in (("a", 2), ("b", 1), ("c", 2), ("d", 5), ("e", 1)):
         queue.add(name, needs=Needs(gpus), held=True)
@@ -134,6 +133,10 @@ def test_four_gpus_are_given_out_in_order(tmp_path: Path, monkeypatch: pytest.Mo
     wait_until(lambda: queue.entries()[2].reason != "", "what the third waits for")
     assert queue.entries()[2].reason == "waits for 2 GPUs: 1 of 4 free"
     assert queue.states() == [State.RUNNING] * 2 + [State.WAITING] * 3  # nothing overtakes
+    with closing(Queue(queue.folder)) as opened:
+        first, _, third, *_ = view_queue(opened).lines()
+    assert first.startswith(f"1  running      {tmp_path}/a  (2 GPUs, ")
+    assert third.endswith("/c  (waits for 2 GPUs: 1 of 4 free)")
     (tmp_path / "a" / "wait").unlink()
     wait_until(lambda: queue.share("e") != {}, "the last one")
     assert queue.states() == [State.DONE, State.RUNNING, State.RUNNING, State.FAILED, State.RUNNING]
@@ -149,48 +152,8 @@ def test_four_gpus_are_given_out_in_order(tmp_path: Path, monkeypatch: pytest.Mo
         (tmp_path / name / "wait").unlink()
     code, said = ended(runner)
     assert code == 1
+    assert queue.entries()[2].reason == ""
     assert "3: waits for 2 GPUs: 1 of 4 free" in said
-
-
-def test_what_a_run_waits_for_is_forgotten_once_it_does_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    print_gpus(
-        tmp_path, monkeypatch, "0, GPU-0, NVIDIA L4, 22000, 23000\n1, GPU-1, NVIDIA L4, 22000, 23000\n"
-    )
-    queue = Scripted(tmp_path, at_once=3)
-    for name, gpus in (("a", 1), ("b", 2), ("c", 1)):
-        queue.add(name, needs=Needs(gpus), held=True)
-    runner = queue.start()
-    wait_until(lambda: queue.entries()[1].reason != "", "what the second waits for")
-    with closing(Queue(queue.folder)) as opened:
-        first, second, third = view_queue(opened).lines()
-        assert first == f"1  running      {tmp_path}/a  (1 GPU, 1 core, {part()})"
-        assert second.endswith("/b  (waits for 2 GPUs: 1 of 2 free)")
-        assert third.endswith("/c  (1 GPU)")
-        opened.move(3, before=2)
-    wait_until(lambda: queue.share("c") != {}, "the one that was moved")
-    wait_until(lambda: queue.entries()[2].reason == "waits for 2 GPUs: 0 of 2 free", "the other one")
-    runner.kill()
-    runner.wait()
-    with closing(Queue(queue.folder)) as opened:
-        shown = view_queue(opened)
-        assert [shown.reason(entry) for entry in shown.entries] == ["", "", ""]
-    for name in "abc":
-        (tmp_path / name / "wait").unlink()
-    queue.at_once = 1
-    assert ended(queue.start())[0] == 0
-    assert [entry.reason for entry in queue.entries()] == ["", "", ""]
-
-
-def listing(gpus: int) -> str:
-    """What nvidia-smi prints of so many GPUs."""
-    return "".join(f"{index}, GPU-{index}, NVIDIA L4, 22000, 23000\n" for index in range(gpus))
-
-
-def part() -> str:
-    """An even part of three of this machine's memory, in words."""
-    return gib(int(0.9 * memory_total()) // 3)
 
 
 def test_one_at_a_time_has_the_whole_machine(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,9 @@ import pytest
 from panolog.orchestrator.queue.entries import Command, Needs, Share, State
 from panolog.orchestrator.queue.processes import Processes
 from panolog.orchestrator.queue.store import DATABASE, Queue, default_folder, opened
+from panolog.orchestrator.queue.view import view_queue
 from panolog.scene.errors import QueueError
+from tests.orchestrator.fakes import SetClock
 
 VERSION_1 = """
 CREATE TABLE entries (
@@ -24,22 +25,6 @@ CREATE TABLE entries (
     reason TEXT NOT NULL DEFAULT '');
 PRAGMA user_version = 1;
 """
-
-
-@dataclass
-class Clock:
-    """A clock that is set by hand."""
-
-    now: float
-
-    def time(self) -> float:
-        return self.now
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
 
 
 def command(name: str) -> Command:
@@ -123,7 +108,7 @@ def test_a_start_is_on_disk_with_its_process(queue: Queue, tmp_path: Path) -> No
 
 
 def test_kills_count_in_a_row_only_if_they_come_soon(tmp_path: Path) -> None:
-    clock = Clock(1e9)
+    clock = SetClock()
     with closing(Queue(tmp_path / "queue", clock)) as queue:
         queue.add(command("a"))
         queue.claim(1)
@@ -146,6 +131,7 @@ def test_needs_and_shares_come_back(queue: Queue) -> None:
     share = Share(("GPU-a",), (0, 2), 2**33)
     queue.note(1, "waits for memory")
     assert queue.entry(1).reason == "waits for memory"
+    assert view_queue(queue).reason(queue.entry(1)) == ""  # no runner is at work
     queue.launched(1, Processes().identity(1), share)
     assert (queue.entry(1).share, queue.entry(1).reason) == (share, "")
     queue.end(1, State.DONE, 0, "")
