@@ -25,8 +25,11 @@ def call(*arguments: object) -> Result:
     return CliRunner().invoke(app.app, [str(argument) for argument in arguments])
 
 
-def one_line(result: Result) -> str:
-    """What is said of wrong input: one line on stderr, nothing on stdout, and exit code 2."""
+def one_line(result: Any) -> str:
+    """What is said of wrong input: one line on stderr, nothing on stdout, and exit code 2.
+
+    Args: result, a `Result`, or what has its attributes.
+    """
     assert (result.exit_code, result.stdout) == (2, ""), result.output
     (line,) = [line for line in without_progress(result.stderr) if line not in STEPS]
     return line

@@ -10,10 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from typer.core import TyperGroup
-from typer.main import get_command
 
-from panolog.orchestrator.cli import app
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.run.records import Noticed, Progressed, RunBegan, TaskStarted
 from panolog.orchestrator.run.store import Database
@@ -234,23 +231,10 @@ def test_what_only_reads_imports_neither_torch_nor_ray(run: Path, tmp_path: Path
     script = (
         "import sys\nfrom panolog.orchestrator.cli.app import app\nimport panolog.orchestrator.queue.view\n"
         "assert 'pydantic' not in sys.modules\n"
+        "import panolog.orchestrator.commands.supervise\n"
         f"for command in {commands!r}:\n"
         "    app(command, standalone_mode=False)\n"
         "    assert not {'torch', 'ray', 'cv2'} & set(sys.modules), (command, sorted(sys.modules))"
     )
     ended = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
-
-
-def test_the_commands_are_those_of_the_contract() -> None:
-    program = get_command(app.app)
-    assert isinstance(program, TyperGroup)
-    running = {"run", "resume", "stop", "pause", "unpause", "retry", "release", "demo"}
-    reading = {"status", "events", "eval", "render", "partition", "view", "report", "dashboard", "doctor"}
-    reading |= {"compare", "export"}
-    assert program.commands.keys() == running | reading | {"clean", "scene", "cluster", "notify", "queue"}
-    groups = {name: group for name, group in program.commands.items() if isinstance(group, TyperGroup)}
-    assert list(groups["cluster"].commands) == ["submit", "resume", "status", "stop", "leave"]
-    assert list(groups["notify"].commands) == ["test"]
-    assert list(groups["queue"].commands) == ["add", "list", "move", "remove", "retry", "run"]
-    assert set(groups["scene"].commands) == {"info", "check", "import", "sfm", "mask", "depth"}

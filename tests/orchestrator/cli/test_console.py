@@ -1,7 +1,6 @@
-"""Progress on stderr, hints that can be pasted, and the usage of every command."""
+"""Progress on stderr, and the usage of every command."""
 
 import re
-import shlex
 from collections.abc import Iterator
 from contextlib import closing
 from io import StringIO
@@ -63,11 +62,6 @@ def test_a_terminal_shows_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(output, StringIO)
     assert "reading the scene" in output.getvalue()
     assert "3 of 1,200" in output.getvalue()
-
-
-def test_hints_can_be_pasted_into_a_shell() -> None:
-    hint = console.command("resume", "runs/old town's")
-    assert shlex.split(hint.strip("`")) == ["panolog", "resume", "runs/old town's"]
 
 
 def commands() -> Iterator[list[str]]:

@@ -197,7 +197,7 @@ def test_a_run_whose_scene_is_gone(run: RunFolder, tmp_path: Path) -> None:
     assert file.read_bytes() == (tmp_path / "all" / "place.sog").read_bytes()
 
 
-@pytest.mark.parametrize("content", [b"", b"ply\n", b"PK\x03\x04", b"\x1f\x8b\x08", b"NGSP", b"\x00" * 100])
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04"])
 def test_files_that_are_no_models(run: RunFolder, tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "a.sog"
     file.write_bytes(content)

@@ -6,7 +6,10 @@ from pathlib import Path
 import pytest
 
 from tests.orchestrator.cli.program import call, one_line
+from tests.orchestrator.follower import histories
+from tests.orchestrator.follower.mail_server import mailbox
 from tests.orchestrator.follower.receivers import receiver
+from tests.ray_head import living, wait_until
 from tests.scenes import write_scene
 
 
@@ -50,26 +53,33 @@ def test_wrong_options_begin_no_run(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_gives_its_secrets_to_no_process_that_it_starts(
+def test_a_run_gives_its_secrets_to_no_process_and_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A follower of its own gets them, on a pipe; Ray and the workers would inherit the environment."""
-    seen: list[dict[str, str]] = []
+    seen: list[str] = []
 
-    def start(*_: object) -> None:
-        seen.append(dict(os.environ))
+    def start(_: object, root: Path, *__: object) -> None:
+        seen.append(repr(os.environ))
+        wait_until(lambda: living("panolog.orchestrator.follower"), "the follower")
+        (follower,) = living("panolog.orchestrator.follower")
+        seen.append(repr((follower.cmdline(), follower.environ())))
+        histories.write(root)
 
     monkeypatch.setattr("panolog.orchestrator.commands.session.start", start)
     monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
     secrets = ["HOOK", "PANOLOG_NOTIFY", "PANOLOG_NOTIFY_SECRET", "PANOLOG_NTFY_TOKEN"]
     secrets += ["PANOLOG_SMTP_USER", "PANOLOG_SMTP_PASSWORD"]
-    with receiver() as server:
+    with receiver() as server, mailbox() as box:
         for name in secrets:
             monkeypatch.setenv(name, "T0PSECRET")
         monkeypatch.setenv("HOOK", f"{server.url}/T0PSECRET")
         monkeypatch.setenv("PANOLOG_NOTIFY", f"ntfy:{server.url}/T0PSECRET")
-        options = ("--notify", "webhook:env:HOOK", "--notify", "mail:smtp://127.0.0.1:1/you@there")
+        options = ("--notify", "webhook:env:HOOK", "--notify", f"mail:smtp://127.0.0.1:{box.port}/you@there")
         result = call("run", write_scene(tmp_path / "town"), "-o", tmp_path / "run", *options)
     assert result.exit_code == 0, result.output
-    (environment,) = seen
-    assert not {name for name, value in environment.items() if "T0PSECRET" in value}
+    assert sorted(it.path for it in server.received) == ["/", "/T0PSECRET"]
+    assert len(box.messages) == 1
+    written = [path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()]
+    assert len(written) > 3
+    assert not [said for said in (*seen, result.output, *map(repr, written)) if "T0PSECRET" in said]

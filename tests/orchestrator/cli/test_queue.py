@@ -1,10 +1,7 @@
-"""`panolog queue`: what is added is checked as by `run`, and comes back as its words; two real runs."""
+"""`panolog queue`: what is added is checked as by `run`, and comes back as its words."""
 
 import os
 import shutil
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,18 +9,8 @@ import pytest
 from panolog.orchestrator.queue.entries import Needs, State
 from panolog.orchestrator.queue.store import opened
 from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import RunBegan
-from panolog.orchestrator.run.store import read_records
-from panolog.synthetic.make import make_town
 from tests.orchestrator.cli.program import begun, call, one_line, shown
-from tests.ray_head import environment, wait_until
 from tests.scenes import write_scene
-
-SETTINGS = ["--iterations", "60", "--device", "cpu", "--blocks", "1", "--width", "64"]
-SETTINGS += ["--set", "sky.count=100", "--set", "checkpoint.every=10", "--set", "checkpoint.share=1"]
-SETTINGS += ["--set", "refine=false", "--set", "deliver=false"]
-
 
 PRICES = Path(__file__).parents[3] / "deploy" / "prices.toml"
 
@@ -141,16 +128,10 @@ def test_a_run_that_found_no_room_is_given_more(here: Path) -> None:
         (["town", "-o", "{}/run", "--address", "auto", "--ram", "2"], "--ram 2.0: with --address Ray"),
         (["town", "-o", "{}/run", "--device", "cpu", "--gpus", "1"], "--gpus 1: the run computes on the CPU"),
         (["town", "-o", "{}/run", "--device", "cuda", "--gpus", "0"], "--gpus 0: the run computes on a GPU"),
-        (
-            ["town", "-o", "{}/run", "--set", "sky.cuont=1"],
-            "unknown setting sky.cuont; did you mean sky.count?",
-        ),
+        (["town", "-o", "{}/run", "--set", "sky.cuont=1"], "did you mean sky.count?"),
         (["nowhere", "-o", "{}/run"], "nowhere"),
         (["town", "-o", "{}/taken"], "is not empty and not a run; choose another output folder"),
-        (
-            ["town", "-o", "{}/made"],
-            "is a run already; `panolog resume {}/made` resumes it, or give another -o",
-        ),
+        (["town", "-o", "{}/made"], "is a run already; `panolog resume {}/made` resumes it, or give"),
         (["town", "-o", "{}/run", "--no-gps"], "is a scene already; leave out the options for panoramas"),
         (["town", "-o", "{}/run", "--log", "paper"], "--log paper: there is no such sink"),
         (["town", "-o", "s3://bucket/run"], "takes files and folders of this machine only"),
@@ -202,43 +183,3 @@ def test_a_queue_runs_the_program(here: Path) -> None:
     assert (
         failed.startswith(f"panolog: failed 1: {here}/run") and f"{gone}: there is no such folder" in failed
     )
-
-
-@pytest.mark.nightly
-@pytest.mark.system
-def test_two_real_runs_whose_runner_is_killed(here: Path) -> None:
-    """The first run is resumed by the second runner, then the other one starts; both end with equal bytes."""
-    town = make_town(here / "larger", panoramas=9, width=64, points=300)
-    for name in ("first", "second"):
-        assert call("queue", "add", town, "-o", here / name, *SETTINGS).exit_code == 0
-
-    def start() -> "subprocess.Popen[str]":
-        command = [sys.executable, "-m", "panolog.orchestrator.cli", "queue", "run"]
-        return subprocess.Popen(
-            command, stderr=subprocess.PIPE, text=True, env=environment(), start_new_session=True
-        )
-
-    def begins(name: str) -> list[RunBegan]:
-        database = RunFolder(here / name).database
-        records = [item.record for item in read_records(database)] if database.exists() else []
-        return [record for record in records if isinstance(record, RunBegan)]
-
-    runner = start()
-    checkpoint = here / "first" / "coarse" / "checkpoint.safetensors"
-    wait_until(lambda: checkpoint.exists() or runner.poll() is not None, "a checkpoint", 600)
-    os.kill(runner.pid, signal.SIGKILL)
-    runner.communicate()
-    runner = start()
-    _, said = runner.communicate(timeout=1200)
-    assert runner.returncode == 0, said
-    lines = said.splitlines()
-    assert lines[0] == f"panolog: resumed 1: {here}/first"
-    assert lines[1:] == [
-        f"panolog: done 1: {here}/first",
-        f"panolog: started 2: {here}/second",
-        f"panolog: done 2: {here}/second",
-    ]
-    assert [record.resumed for record in begins("first")] == [False, True]
-    assert [record.resumed for record in begins("second")] == [False]
-    models = [(here / name / "point_cloud.ply").read_bytes() for name in ("first", "second")]
-    assert models[0] == models[1]
