@@ -1,15 +1,6 @@
 """Histories of runs made by hand."""
 
-from panolog.orchestrator.run.records import ModelSaved, Record, Stored, TaskStarted
-from panolog.workers.tasks import TaskId
-
-
-def started(task: TaskId, attempt: int = 1) -> TaskStarted:
-    return TaskStarted(task, attempt, 0, "node", 1, "cpu", 1)
-
-
-def model(task: TaskId) -> ModelSaved:
-    return ModelSaved(task, "model.ply", 10, 100, 30, 1.0)
+from panolog.orchestrator.run.records import Record, Stored
 
 
 def history(*timed: tuple[float, Record]) -> list[Stored]:

@@ -8,14 +8,13 @@ from panolog.orchestrator.run.records import (
     Outcome,
     Part,
     Preparing,
-    RunBegan,
     RunEnded,
     ScoresSaved,
 )
 from panolog.workers.tasks import COARSE, TaskId
-from tests.benchmarks.histories import history, model, started
+from tests.benchmarks.histories import history
+from tests.orchestrator.history import AGAIN, BEGAN, model, started
 
-BEGAN, AGAIN = RunBegan("host", 1, resumed=False), RunBegan("host", 2, resumed=True)
 ZERO = TaskId.block(0)
 
 

@@ -4,16 +4,9 @@ import pytest
 
 from benchmarks.three_days.checks import Life, Sent, wrong
 from benchmarks.three_days.faults import Host, Period
-from panolog.orchestrator.run.records import (
-    CheckpointSaved,
-    ModelSaved,
-    Record,
-    RunBegan,
-    Stored,
-    TaskFailed,
-    TaskStarted,
-)
+from panolog.orchestrator.run.records import CheckpointSaved, Record, Stored, TaskFailed
 from panolog.workers.tasks import TaskId
+from tests.orchestrator.history import BEGAN, model, started
 
 TASK = TaskId.block(0)
 
@@ -25,13 +18,12 @@ def sent(*kinds: tuple[str, int], begin: float = 0.0) -> list[Sent]:
 def stored(*records: Record, begin: float = 0.0) -> list[Stored]:
     """Each when the message of `sent` at its place was taken; before them the start of the run."""
     made = [Stored(i, EPOCH + begin + 100.0 * (i - 1), record) for i, record in enumerate(records, 1)]
-    return made if begin else [Stored(0, EPOCH, RunBegan("host", 1, resumed=False)), *made]
+    return made if begin else [Stored(0, EPOCH, BEGAN), *made]
 
 
 EPOCH = 1e9
-STARTED = TaskStarted(TASK, 1, 0, "node", 1, "cuda", 4)
+STARTED, MODEL = started(TASK), model(TASK)
 SAVED = CheckpointSaved(TASK, 500, "path", 1)
-MODEL = ModelSaved(TASK, "path", 1, 1, 1000, 1.0)
 WHOLE = sent(("Hello", 0), ("Checkpoint", 500), ("Trained", 0))
 QUIET = [Life(0.0, 1000.0, killed=False)]
 KILLED = [Life(0.0, 200.0, killed=True), Life(290.0, 1000.0, killed=False)]

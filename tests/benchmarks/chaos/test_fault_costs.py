@@ -9,26 +9,25 @@ from panolog.orchestrator.run.records import (
     Failure,
     Outcome,
     Record,
-    RunBegan,
     RunEnded,
     ScoresSaved,
     TaskFailed,
 )
 from panolog.workers.tasks import COARSE, EVAL, TaskId
-from tests.benchmarks.histories import history, model, started
+from tests.benchmarks.histories import history
+from tests.orchestrator.history import AGAIN, BEGAN, model, started
 
 
 def saved(task: TaskId) -> CheckpointSaved:
     return CheckpointSaved(task, 10, "checkpoint", 1)
 
 
-BEGAN, AGAIN = RunBegan("host", 1, resumed=False), RunBegan("host", 2, resumed=True)
 ZERO, ONE = TaskId.block(0), TaskId.block(1)
 Timed = tuple[float, Record]
 
 
-def lost(task: TaskId, attempt: int = 1) -> TaskFailed:
-    return TaskFailed(task, attempt, "died", final=False, kind=Failure.LOST)
+def lost(task: TaskId) -> TaskFailed:
+    return TaskFailed(task, 1, "died", final=False, kind=Failure.LOST)
 
 
 def unread(task: TaskId) -> TaskFailed:
@@ -44,14 +43,14 @@ CASES: dict[str, tuple[list[Timed], float, Kind, tuple[TaskId, ...], float, floa
     "a worker's work since its checkpoint, and the time to its next start": (
         [
             *[(0.0, BEGAN), (1.0, started(ZERO)), (1.5, started(ONE)), (4.0, saved(ZERO))],
-            *[(9.0, lost(ZERO)), (11.0, started(ZERO, 2)), (20.0, model(ONE)), (21.0, model(ZERO))],
+            *[(9.0, lost(ZERO)), (11.0, started(ZERO)), (20.0, model(ONE)), (21.0, model(ZERO))],
         ],
         *(6.0, Kind.WORKER, (ZERO,), 2.0, 5.0),
     ),
     "a task that takes the place of the dead one ends the recovery": (
         [
             *[(0.0, BEGAN), (1.0, started(ZERO)), (5.0, lost(ZERO)), (7.0, started(ONE))],
-            *[(30.0, model(ONE)), (31.0, started(ZERO, 2))],
+            *[(30.0, model(ONE)), (31.0, started(ZERO))],
         ],
         *(4.0, Kind.WORKER, (ZERO,), 3.0, 3.0),
     ),
@@ -73,7 +72,7 @@ CASES: dict[str, tuple[list[Timed], float, Kind, tuple[TaskId, ...], float, floa
     "a bad node costs each attempt that fails there": (
         [
             *[(0.0, BEGAN), (1.0, started(COARSE)), (4.0, saved(COARSE)), (6.0, unread(COARSE))],
-            *[(8.0, started(COARSE, 2)), (20.0, model(COARSE)), (22.0, started(ZERO)), (23.0, unread(ZERO))],
+            *[(8.0, started(COARSE)), (20.0, model(COARSE)), (22.0, started(ZERO)), (23.0, unread(ZERO))],
             *[(24.0, started(ONE)), (50.0, model(ONE))],
         ],
         *(2.0, Kind.BADNODE, (COARSE, ZERO), 2.0 + 1.0, 2.0 + 1.0),
@@ -83,7 +82,7 @@ CASES: dict[str, tuple[list[Timed], float, Kind, tuple[TaskId, ...], float, floa
         *(3.0, Kind.WORKER, (), 0.0, 0.0),
     ),
     "a task that had not begun loses no work": (
-        [(3.0, BEGAN), (4.0, lost(COARSE)), (6.0, started(COARSE, 2)), (9.0, model(COARSE))],
+        [(3.0, BEGAN), (4.0, lost(COARSE)), (6.0, started(COARSE)), (9.0, model(COARSE))],
         *(2.0, Kind.RAYLET, (COARSE,), 0.0, 4.0),
     ),
 }
@@ -102,8 +101,8 @@ def test_the_cost_of_a_fault(
 
 def test_kills_before_the_recovery_count_together() -> None:
     records = history(
-        *[(0.0, BEGAN), (1.0, started(ZERO)), (4.0, lost(ZERO)), (9.0, AGAIN), (12.0, started(ZERO, 2))],
-        *[(20.0, saved(ZERO)), (24.0, lost(ZERO, 2)), (25.0, started(ZERO, 3))],
+        *[(0.0, BEGAN), (1.0, started(ZERO)), (4.0, lost(ZERO)), (9.0, AGAIN), (12.0, started(ZERO))],
+        *[(20.0, saved(ZERO)), (24.0, lost(ZERO)), (25.0, started(ZERO))],
     )
     kills = [fault(3.0, Kind.WORKER), fault(5.0, Kind.DRIVER), fault(23.0, Kind.WORKER)]
     first, second = fault_costs(records, kills)
@@ -119,7 +118,7 @@ def test_a_worker_that_hangs_has_recovered_when_its_next_attempt_begins(
     """Neither with the next fault, which counts together with it, nor with its hello."""
     records = history(
         *[(0.0, BEGAN), (begun, started(COARSE)), (13.0, lost(COARSE))],
-        *[(16.0, started(COARSE, 2)), (30.0, model(COARSE))],
+        *[(16.0, started(COARSE)), (30.0, model(COARSE))],
     )
     (cost,) = fault_costs(records, [fault(3.0, Kind.HANG), *others])
     assert [one.kind for one in cost.faults] == [Kind.HANG, *(one.kind for one in others)]

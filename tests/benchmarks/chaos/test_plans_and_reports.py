@@ -22,14 +22,13 @@ from panolog.orchestrator.run.records import (
     NodeLeaving,
     Progressed,
     Record,
-    RunBegan,
     TaskFailed,
-    TaskStarted,
     TaskYielded,
 )
 from panolog.orchestrator.run.store import Database
 from panolog.workers.tasks import COARSE
 from tests.benchmarks.histories import history
+from tests.orchestrator.history import AGAIN, BEGAN, started
 
 
 def test_equal_seeds_give_equal_plans_with_every_kind_equally_often() -> None:
@@ -63,7 +62,7 @@ def begun(folder: RunFolder, time: float, model: bytes) -> None:
     folder.root.mkdir()
     folder.point_cloud.write_bytes(model)
     with closing(Database(folder.database)) as database:
-        database.store([(time, RunBegan("host", 1, False)), (time + 9, RunBegan("host", 2, True))])
+        database.store([(time, BEGAN), (time + 9, AGAIN)])
 
 
 def test_states_order_and_bytes_of_queued_runs_are_checked(tmp_path: Path) -> None:
@@ -85,21 +84,19 @@ def test_states_order_and_bytes_of_queued_runs_are_checked(tmp_path: Path) -> No
     assert queued.wrong() == ["entry 4 is failed: why", "entry 3 has other bytes than the first"]
 
 
-def began(iteration: int, node: str) -> TaskStarted:
-    return TaskStarted(COARSE, 1, iteration, node, 1, "cpu", 1, node_id=node)
-
-
-LEAVES = NodeLeaving("a", "a", Leaving.PREEMPTION, 120.0)
-BEFORE: list[tuple[float, Record]] = [(0.0, began(0, "a")), (10.0, Progressed(COARSE, 20, 100, 2.0))]
+BEFORE: list[tuple[float, Record]] = [
+    (0.0, started(COARSE, node="a")),
+    (10.0, Progressed(COARSE, 20, 100, 2.0)),
+]
 
 
 def test_a_task_that_moves_loses_its_checkpoint_and_its_start() -> None:
     records = history(
         *BEFORE,
-        (12.0, LEAVES),
+        (12.0, NodeLeaving("a", "a", Leaving.PREEMPTION, 120.0)),
         (12.5, CheckpointSaved(COARSE, 24, "c", 1)),
         (13.0, TaskYielded(COARSE, "a")),
-        (15.0, began(24, "b")),
+        (15.0, started(COARSE, 24, node="b")),
     )
     cost = notice_cost(records, "a", 11.0)
     assert cost == NoticeCost(COARSE, 1.0, 1.0, 2.0, 0, 3.0)
@@ -109,7 +106,7 @@ def test_a_task_that_moves_loses_its_checkpoint_and_its_start() -> None:
 
 def test_without_notice_a_task_repeats_what_followed_its_checkpoint() -> None:
     lost = TaskFailed(COARSE, 1, "gone", final=False, kind=Failure.LOST)
-    records = history(*BEFORE, (14.0, lost), (16.0, began(10, "b")))
+    records = history(*BEFORE, (14.0, lost), (16.0, started(COARSE, 10, node="b")))
     cost = notice_cost(records, "a", 11.0)
     assert cost == NoticeCost(COARSE, None, None, 2.0, 10, 10.0)
     assert cost.too_much() == ["coarse has trained 10 iterations twice", "coarse has lost 10.0 s of 5.0 s"]
