@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from panolog.prepare.importers.interface import ImportSource
 from tests.prepare.importers.files import write_colmap_text, write_split
-from tests.prepare.importers.known import Array, Known, make_known
+from tests.prepare.importers.known import Known, make_known
 
 
 def _sphere_model(folder: Path, known: Known, size: int, suffix: str = ".png") -> None:
@@ -42,20 +42,16 @@ def egonerf(folder: Path) -> tuple[Known, ImportSource]:
     return known, ImportSource(folder)
 
 
-def faces(pitches: Sequence[float]) -> list[Array]:
-    """The rotations of pycolmap's panorama_sfm from the panorama: four yaws for each pitch, in degrees."""
-    rotations = []
-    for pitch in pitches:
-        for yaw in np.arange(4) * 90.0 + (45.0 if pitch > 0 else 0.0):
-            rotations.append(Rotation.from_euler("XY", [-pitch, -yaw], degrees=True).as_matrix())
-    return rotations
-
-
 def panorama_sfm(folder: Path, pitches: Sequence[float] = (-35.0, 0.0, 35.0)) -> tuple[Known, ImportSource]:
-    """Faces of 90 degrees, 16 pixels wide; they see what lies within them."""
+    """The faces of pycolmap's panorama_sfm, of 90 degrees and 16 pixels wide; they see what lies within them.
+
+    Args: pitches, in degrees; there are four yaws for each.
+    """
     known = make_known(folder, images="panoramas")
     images = []
-    for number, face in enumerate(faces(pitches)):
+    yaws = np.arange(4) * 90.0
+    for number, (pitch, yaw) in enumerate((p, y + 45.0 * (p > 0)) for p in pitches for y in yaws):
+        face = Rotation.from_euler("XY", [-pitch, -yaw], degrees=True).as_matrix()
         for index, name in enumerate(known.names):
             rotation = face @ known.rotations[index]
             translation = face @ known.translations[index]
@@ -67,7 +63,3 @@ def panorama_sfm(folder: Path, pitches: Sequence[float] = (-35.0, 0.0, 35.0)) ->
             images.append((f"pano_camera{number}/{name}", 1, rotation, translation, pixels, seen))
     write_colmap_text(folder / "sparse" / "0", ["1 SIMPLE_PINHOLE 16 16 8.0 8.0 8.0"], images, known)
     return known, ImportSource(folder, images=folder / "panoramas")
-
-
-def panorama_sfm_horizontal(folder: Path) -> tuple[Known, ImportSource]:
-    return panorama_sfm(folder, (0.0,))

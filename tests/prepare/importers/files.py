@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
 from tests.prepare.importers.known import Array, Known
@@ -15,21 +16,8 @@ from tests.prepare.importers.known import Array, Known
 def write_ply(path: Path, points: Array, colors: NDArray[np.uint8], *, ascii_ply: bool = False) -> None:
     """A cloud with doubles, as no format has to be that exact."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    head = [
-        "ply",
-        f"format {'ascii' if ascii_ply else 'binary_little_endian'} 1.0",
-        f"element vertex {len(points)}",
-    ]
-    head += [f"property double {axis}" for axis in "xyz"]
-    head += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
-    text = "\n".join([*head, "end_header\n"])
-    if ascii_ply:
-        rows = zip(points.tolist(), np.asarray(colors).tolist(), strict=True)
-        path.write_text(text + "".join(" ".join(map(repr, [*point, *color])) + "\n" for point, color in rows))
-        return
-    table = np.empty(len(points), [("p", "<f8", 3), ("c", "u1", 3)])
-    table["p"], table["c"] = points, colors
-    path.write_bytes(text.encode() + table.tobytes())
+    table = np.rec.fromarrays([*points.T, *colors.T], names="x,y,z,red,green,blue")
+    PlyData([PlyElement.describe(np.asarray(table), "vertex")], text=ascii_ply).write(str(path))
 
 
 def write_json(path: Path, content: Any) -> None:

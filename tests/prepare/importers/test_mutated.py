@@ -2,13 +2,12 @@
 
 import random
 import re
-import time
 import tracemalloc
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 
 from panolog.prepare.importers.import_scene import FORMATS, import_scene
@@ -17,39 +16,16 @@ from panolog.scene.colmap import read_colmap
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from tests.prepare.importers.writers import WRITERS
+from tests.scenes import write_scene
 
 ROUNDS = 24  # of each file
-NASTY = [
-    "null",
-    "-1",
-    "1e999",
-    "NaN",
-    "1e300",
-    "18446744073709551615",
-    '""',
-    "[]",
-    "{}",
-    "true",
-    '"../../x"',
-    "9" * 400,
-]
-_NUMBER = re.compile(rb"-?\d+(\.\d+)?(e-?\d+)?")
+NASTY = [b"null", b"-1", b"1e999", b"NaN", b"1e300", b"18446744073709551615", b'""', b"[]", b"{}", b"true"]
+NASTY += [b'"../../x"', b"9" * 400]
 
 
-def _swap_number(data: bytes, dice: random.Random) -> bytes:
-    found = list(_NUMBER.finditer(data))
-    where = dice.choice(found) if found else None
-    return (
-        data if where is None else data[: where.start()] + dice.choice(NASTY).encode() + data[where.end() :]
-    )
-
-
-def _swap_text(data: bytes, dice: random.Random) -> bytes:
-    found = list(re.finditer(rb'"[^"]*"', data))
-    where = dice.choice(found) if found else None
-    return (
-        data if where is None else data[: where.start()] + dice.choice(NASTY).encode() + data[where.end() :]
-    )
+def _swap(pattern: re.Pattern[bytes], data: bytes, dice: random.Random) -> bytes:
+    where = dice.choice(list(pattern.finditer(data)) or [None])
+    return data if where is None else data[: where.start()] + dice.choice(NASTY) + data[where.end() :]
 
 
 def _flip(data: bytes, dice: random.Random) -> bytes:
@@ -74,8 +50,8 @@ def _repeat(data: bytes, dice: random.Random) -> bytes:
 
 
 MUTATIONS: list[Callable[[bytes, random.Random], bytes]] = [
-    _swap_number,
-    _swap_text,
+    partial(_swap, re.compile(rb"-?\d+(\.\d+)?(e-?\d+)?")),
+    partial(_swap, re.compile(rb'"[^"]*"')),
     _flip,
     _cut,
     _drop,
@@ -105,7 +81,7 @@ def test_mutated_files(case: str, tmp_path: Path) -> None:
         for path in sorted((tmp_path / "source").rglob("*"))
         if path.suffix in (".json", ".xml", ".csv", ".txt", ".ply")
     ]
-    dice, began = random.Random(case), time.monotonic()
+    dice = random.Random(case)
     for path in files:
         original = path.read_bytes()
         for turn in range(ROUNDS):
@@ -116,7 +92,6 @@ def test_mutated_files(case: str, tmp_path: Path) -> None:
                 assert str(tmp_path) in str(error)
                 assert len(str(error)) < 600 and "\n" not in str(error)
         path.write_bytes(original)
-    assert time.monotonic() - began < 60
 
 
 @pytest.mark.parametrize("case", ["opensfm", "spheresfm", "nerfstudio"])
@@ -137,32 +112,17 @@ def test_mutated_to_the_end(case: str, tmp_path: Path) -> None:
         assert not list(tmp_path.glob(".scene*"))
 
 
-def _binary_model(folder: Path) -> Path:
-    """A COLMAP binary model with SPHERE cameras, from what the text importer reads."""
-    _, source = WRITERS["nerfstudio"][1](folder / "source")
-    import_scene(source, folder / "scene")
-    model = folder / "scene" / "sparse" / "0"
-    pycolmap.Reconstruction(str(model)).write_binary(str(model))
-    return model
-
-
-def test_mutated_binaries(tmp_path: Path) -> None:
-    model, dice = _binary_model(tmp_path), random.Random(1)
-    for name in ("cameras.bin", "images.bin", "points3D.bin"):
-        original = (model / name).read_bytes()
-        for turn in range(2 * ROUNDS):
-            (model / name).write_bytes((_flip, _cut, _drop, _repeat)[turn % 4](original, dice))
-            try:
-                read_colmap(model)
-            except InputError as error:
-                assert str(model) in str(error)
-        (model / name).write_bytes(original)
-
-
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_huge_counts_in_binaries(name: str, tmp_path: Path) -> None:
-    model = _binary_model(tmp_path)
+def test_mutated_binaries(name: str, tmp_path: Path) -> None:
+    """Of a COLMAP model; counts that are too large take no memory."""
+    model, dice = write_scene(tmp_path) / "sparse" / "0", random.Random(1)
     data = (model / name).read_bytes()
+    for turn in range(2 * ROUNDS):
+        (model / name).write_bytes((_flip, _cut, _drop, _repeat)[turn % 4](data, dice))
+        try:
+            read_colmap(model)
+        except InputError as error:
+            assert str(model) in str(error)
     for count in (2**64 - 1, 2**63, 10**9):
         (model / name).write_bytes(count.to_bytes(8, "little") + data[8:])
         tracemalloc.start()

@@ -1,5 +1,6 @@
 """Structure of any length is read in pieces, and what is hostile in it takes no memory."""
 
+import itertools
 import json
 import tracemalloc
 from pathlib import Path
@@ -11,12 +12,12 @@ import pytest
 from panolog.prepare.importers import json_xml
 from panolog.prepare.importers.interface import ImportSource
 from panolog.prepare.importers.json_xml import JsonNode, load_json_in_pieces
-from panolog.prepare.importers.openmvg import _OBSERVATION, _Structure, read
+from panolog.prepare.importers.openmvg import _OBSERVATION, _Structure
 from panolog.prepare.importers.opensfm import read as read_opensfm
 from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.scene.errors import InputError
 from tests.prepare.importers.files import write_json
-from tests.prepare.importers.writers import openmvg, openmvg_parts, opensfm
+from tests.prepare.importers.writers import opensfm
 
 LIST: list[Any] = [1, -2.5e3, True, None, 'a"]}é𝄞\\', [], {}, [[1, 2], {"b": [3]}], {"x": {"y": "z" * 300}}]
 
@@ -68,21 +69,15 @@ def test_pieces_are_the_whole(
         '{"many": ' + "[" * 100_000,
         '{"a": ' + '{"a": ' * 100_000,
         '{"many": [' + "9" * 5_000 + "]}",
+        '{"many": ["\xff\xfe"]}',
     ],
 )
 def test_what_is_no_json(text: str, tmp_path: Path) -> None:
     path = tmp_path / "x.json"
-    path.write_text(text)
+    path.write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=r"x\.json: (is not JSON \(.+\)|an object)") as error:
         pieces(path)
     assert "\n" not in str(error.value) and len(str(error.value)) < 300
-
-
-def test_text_that_is_not_utf8(tmp_path: Path) -> None:
-    path = tmp_path / "x.json"
-    path.write_bytes(b'{"many": ["\xff\xfe"]}')
-    with pytest.raises(InputError, match=r"x\.json: is not JSON"):
-        pieces(path)
 
 
 @pytest.mark.parametrize(
@@ -115,18 +110,13 @@ def test_a_mistake_is_found_where_it_is(tmp_path: Path) -> None:
 
 
 def test_a_long_list_takes_the_memory_of_its_members(tmp_path: Path) -> None:
-    path, count = tmp_path / "x.json", 0
+    path, count = tmp_path / "x.json", itertools.count()
     path.write_text('{"many": [' + '{"key": 1, "value": [1.5, 2.5]},' * 100_000 + "{}]}")
-
-    def each(_: JsonNode) -> None:
-        nonlocal count
-        count += 1
-
     tracemalloc.start()
-    load_json_in_pieces(path, "many", each, 8_000_000)
+    load_json_in_pieces(path, "many", lambda _: next(count), 8_000_000)
     assert tracemalloc.get_traced_memory()[1] < 8_000_000
     tracemalloc.stop()
-    assert count == 100_001
+    assert next(count) == 100_001
 
 
 def test_openmvg_is_refused_only_where_its_observations_do_not_fit(tmp_path: Path) -> None:
@@ -141,31 +131,6 @@ def test_openmvg_is_refused_only_where_its_observations_do_not_fit(tmp_path: Pat
     np.testing.assert_array_equal(where, np.broadcast_to([1, 2.5], (count, 2)))
     with pytest.raises(InputError, match=r"x\.json: it has more observations than the memory"):
         load_json_in_pieces(path, "many", _Structure(path, 10 * count * _OBSERVATION - 1).add)
-
-
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"key": -1}, r"observations\[0\]\.key: a whole number"),
-        ({"key": "a"}, r"observations\[0\]\.key: a whole number"),
-        ({"value": {"x": [1]}}, r"observations\[0\]\.value\.x: 2 finite"),
-        ({"value": {"x": [1, "a"]}}, r"observations\[0\]\.value\.x: 2 "),
-        ({"value": {"x": [1, 1e300]}}, r"observations\[0\]\.value\.x: 2 finite"),
-        ({"value": {}}, r"observations\[0\]\.value: has no 'x'"),
-        ({"value": 5}, r"observations\[0\]\.value: an object"),
-    ],
-)
-def test_a_wrong_observation_is_named(change: dict[str, Any], field: str, tmp_path: Path) -> None:
-    known, source = openmvg(tmp_path / "source")
-    parts = openmvg_parts(known)
-    parts["structure"][4]["value"]["observations"][0].update(change)
-    write_json(tmp_path / "source" / "sfm_data.json", parts)
-    with pytest.raises(InputError, match=r"sfm_data\.json: structure\[4\]\.value\." + field):
-        read(source)
-    parts["structure"][4]["value"]["observations"] = 7
-    write_json(tmp_path / "source" / "sfm_data.json", parts)
-    with pytest.raises(InputError, match=r"structure\[4\]\.value\.observations: a list"):
-        read(source)
 
 
 def test_limits_follow_the_memory(tmp_path: Path) -> None:

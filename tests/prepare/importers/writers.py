@@ -1,6 +1,7 @@
 """The known scene in every format that can be imported, written from what the formats say of themselves."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +9,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from panolog.prepare.importers.interface import ImportSource
-from tests.prepare.importers.colmap_writers import egonerf, panorama_sfm, panorama_sfm_horizontal, spheresfm
+from tests.prepare.importers.colmap_writers import egonerf, panorama_sfm, spheresfm
 from tests.prepare.importers.files import write_json, write_ply, write_split
 from tests.prepare.importers.known import Array, Known, make_known
 
-OPENGL = np.diag([1.0, -1.0, -1.0])  # x right, y up, z backward  # x right, y up, z backward
+OPENGL = np.diag([1.0, -1.0, -1.0])  # x right, y up, z backward
 Writer = Callable[[Path], tuple[Known, ImportSource]]
+
+
+def _frames(known: Known, key: str, axes: Array, folder: str = "") -> list[dict[str, Any]]:
+    """Each panorama's name at `key`, and its camera-to-world pose with other axes (3, 3) of the camera."""
+    return [
+        {key: folder + name, "transform_matrix": known.camera_to_world(index, axes).tolist()}
+        for index, name in enumerate(known.names)
+    ]
 
 
 def openmvg_parts(known: Known, *, mirrored: bool = False) -> dict[str, Any]:
@@ -26,17 +35,12 @@ def openmvg_parts(known: Known, *, mirrored: bool = False) -> dict[str, Any]:
         data |= {"id_view": key, "id_intrinsic": 0, "id_pose": 10 + key}
         wrapper = {"id": 2**31 + key + 2, "data": data}
         views.append({"key": key, "value": {"polymorphic_id": 2**30, "ptr_wrapper": wrapper}})
-        pose = {
-            "rotation": (flip @ half @ known.rotations[key] @ flip).tolist(),
-            "center": (flip @ known.centers[key]).tolist(),
-        }
+        pose = {"rotation": (flip @ half @ known.rotations[key] @ flip).tolist()}
+        pose["center"] = (flip @ known.centers[key]).tolist()
         extrinsics.append({"key": 10 + key, "value": pose})
     size = {"value0": {"width": known.width, "height": known.height}}
-    spherical = {
-        "polymorphic_id": 2**31 + 1,
-        "polymorphic_name": "spherical",
-        "ptr_wrapper": {"id": 2**31 + 99, "data": size},
-    }
+    spherical = {"polymorphic_id": 2**31 + 1, "polymorphic_name": "spherical"}
+    intrinsic = spherical | {"ptr_wrapper": {"id": 2**31 + 99, "data": size}}
     structure = []
     for row, point in enumerate(known.points @ flip):
         observations = []
@@ -49,7 +53,7 @@ def openmvg_parts(known: Known, *, mirrored: bool = False) -> dict[str, Any]:
         "sfm_data_version": "0.3",
         "root_path": "",
         "views": views,
-        "intrinsics": [{"key": 0, "value": spherical}],
+        "intrinsics": [{"key": 0, "value": intrinsic}],
         "extrinsics": extrinsics,
         "structure": structure,
         "control_points": [],
@@ -68,10 +72,6 @@ def openmvg(folder: Path, *, mirrored: bool = False) -> tuple[Known, ImportSourc
     write_json(folder / "sfm_data.json", openmvg_parts(known, mirrored=mirrored))
     _colorized(known, folder / "colorized.ply", np.diag([1.0, -1.0 if mirrored else 1.0, 1.0]))
     return known, ImportSource(folder)
-
-
-def openmvg_mirrored(folder: Path) -> tuple[Known, ImportSource]:
-    return openmvg(folder, mirrored=True)
 
 
 def omnigs_input(folder: Path) -> tuple[Known, ImportSource]:
@@ -117,19 +117,15 @@ def opensfm(folder: Path) -> tuple[Known, ImportSource]:
     for name, rows, pixels in zip(known.names, known.observed, known.pixels, strict=True):
         middle = (known.width / 2, known.height / 2)
         for at, (row, (x, y)) in enumerate(zip(rows, (pixels - middle) / known.width, strict=True)):
-            lines.append(
-                f"{name}\t{3 * row + 5}\t{at}\t{x!r}\t{y!r}\t0.004\t1\t2\t3\t-1\t-1".replace("np.float64", "")
-            )
-    (folder / "tracks.csv").write_text("\n".join(lines).replace("(", "").replace(")", "") + "\n")
+            words = (name, 3 * row + 5, at, float(x), float(y), 0.004, 1, 2, 3, -1, -1)
+            lines.append("\t".join(map(str, words)))
+    (folder / "tracks.csv").write_text("\n".join(lines) + "\n")
     return known, ImportSource(folder)
 
 
 def nerfstudio(folder: Path) -> tuple[Known, ImportSource]:
     known = make_known(folder)
-    frames = [
-        {"file_path": f"./images/{name}", "transform_matrix": known.camera_to_world(index, OPENGL).tolist()}
-        for index, name in enumerate(known.names)
-    ]
+    frames = _frames(known, "file_path", OPENGL, "./images/")
     content = {"camera_model": "EQUIRECTANGULAR", "w": known.width, "h": known.height, "frames": frames}
     content |= {"fl_x": known.height, "fl_y": known.height, "cx": known.width / 2, "cy": known.height / 2}
     content |= {"ply_file_path": "sparse_pc.ply", "applied_transform": np.eye(4)[[2, 0, 1]].tolist()}
@@ -141,11 +137,8 @@ def nerfstudio(folder: Path) -> tuple[Known, ImportSource]:
 def metashape(folder: Path) -> tuple[Known, ImportSource]:
     """Cameras in a chunk's own coordinates, a component that leads to the world, labels without extension."""
     known = make_known(folder)
-    scale, turn, shift = (
-        2.5,
-        Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_matrix(),
-        np.array([4.0, -7.0, 1.5]),
-    )
+    scale, shift = 2.5, np.array([4.0, -7.0, 1.5])
+    turn = Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_matrix()
 
     def words(values: Array) -> str:
         return " ".join(map(repr, values.ravel().tolist()))
@@ -173,10 +166,7 @@ def metashape(folder: Path) -> tuple[Known, ImportSource]:
 
 def omniblender(folder: Path) -> tuple[Known, ImportSource]:
     known = make_known(folder)
-    frames = [
-        {"file_path": name, "transform_matrix": known.camera_to_world(index, OPENGL).tolist()}
-        for index, name in enumerate(known.names)
-    ]
+    frames = _frames(known, "file_path", OPENGL)
     content = {"width": known.width, "height": known.height, "indoor": True, "frames": frames}
     write_json(folder / "transform.json", content)
     write_ply(folder / "elsewhere" / "cloud.ply", known.points, known.colors)
@@ -186,10 +176,7 @@ def omniblender(folder: Path) -> tuple[Known, ImportSource]:
 
 def roam360(folder: Path) -> tuple[Known, ImportSource]:
     known = make_known(folder)
-    frames = [
-        {"rgb_file": name, "transform_matrix": known.camera_to_world(index, np.eye(3)).tolist()}
-        for index, name in enumerate(known.names)
-    ]
+    frames = _frames(known, "rgb_file", np.eye(3))
     write_json(folder / "pose_c2w.json", {"train": frames[:2] + frames[4:], "test": frames[2:4]})
     write_ply(folder / "scene.ply", known.points, known.colors)
     return known, ImportSource(folder)
@@ -197,16 +184,9 @@ def roam360(folder: Path) -> tuple[Known, ImportSource]:
 
 def roam360_prepared(folder: Path) -> tuple[Known, ImportSource]:
     known = make_known(folder)
-    parts = openmvg_parts(known)
-    empty = {
-        "sfm_data_version": "0.3",
-        "root_path": "",
-        "intrinsics": [],
-        "structure": [],
-        "control_points": [],
-    }
-    write_json(folder / "data_views.json", empty | {"views": parts["views"], "extrinsics": []})
-    write_json(folder / "data_extrinsics.json", empty | {"views": [], "extrinsics": parts["extrinsics"]})
+    parts = openmvg_parts(known) | {"intrinsics": [], "structure": []}
+    write_json(folder / "data_views.json", parts | {"extrinsics": []})
+    write_json(folder / "data_extrinsics.json", parts | {"views": []})
     write_ply(folder / "pcd.ply", known.points, known.colors, ascii_ply=True)
     write_split(folder, known)
     return known, ImportSource(folder)
@@ -214,7 +194,7 @@ def roam360_prepared(folder: Path) -> tuple[Known, ImportSource]:
 
 WRITERS: dict[str, tuple[str, Writer]] = {
     "openmvg": ("openmvg", openmvg),
-    "openmvg, old": ("openmvg", openmvg_mirrored),
+    "openmvg, old": ("openmvg", partial(openmvg, mirrored=True)),
     "openmvg for OmniGS": ("openmvg", omnigs_input),
     "omnigs": ("omnigs", omnigs),
     "opensfm": ("opensfm", opensfm),
@@ -226,7 +206,7 @@ WRITERS: dict[str, tuple[str, Writer]] = {
     "360roam": ("360roam", roam360),
     "360roam, prepared": ("360roam", roam360_prepared),
     "panorama_sfm": ("panorama_sfm", panorama_sfm),
-    "panorama_sfm, one ring": ("panorama_sfm", panorama_sfm_horizontal),
+    "panorama_sfm, one ring": ("panorama_sfm", partial(panorama_sfm, pitches=(0.0,))),
 }
 WITH_TRACKS = {"openmvg", "openmvg, old", "opensfm", "spheresfm", "egonerf"}
 WITH_SPLIT = {"egonerf", "omniblender", "360roam", "360roam, prepared"}
