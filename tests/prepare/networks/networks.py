@@ -21,7 +21,6 @@ def save(
     *,
     shape: Sequence[int | str | None],
     constants: Mapping[str, NDArray[Any]] | None = None,
-    name: str = "net.onnx",
     dtype: int = FLOAT,
 ) -> Path:
     """Writes a network from "image" of `shape` to `outputs`, and its manifest; returns the ONNX file."""
@@ -33,7 +32,7 @@ def save(
         [onnx.numpy_helper.from_array(value, key) for key, value in (constants or {}).items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    path = folder / name
+    path = folder / "net.onnx"
     onnx.save(model, path)
     path.with_suffix(".yaml").write_text(yaml.safe_dump(dict(manifest)))
     return path
@@ -41,21 +40,13 @@ def save(
 
 def given(height: int = 16, **changes: Any) -> dict[str, Any]:
     """The input of a manifest: RGB / 255, NCHW."""
-    wrap = changes.get("wrap", 0)
-    base = {
-        "name": "image",
-        "width": 2 * height + 2 * wrap,
-        "height": height,
-        "layout": "NCHW",
-        "channels": "RGB",
-        "divisor": 255,
-    }
-    return base | changes
+    size = {"width": 2 * height + 2 * changes.get("wrap", 0), "height": height}
+    return {"name": "image", **size, "layout": "NCHW", "channels": "RGB", "divisor": 255} | changes
 
 
-def channel(source: str, index: int, target: str, *, axis: int = 1) -> list[onnx.NodeProto]:
-    """Nodes that take one channel of `source`, keeping the axis. Needs `channel_constants`."""
-    return [helper.make_node("Gather", [source, f"index{index}"], [target], axis=axis)]
+def channel(index: int, target: str, *, axis: int = 1) -> onnx.NodeProto:
+    """A node that takes one channel of "image", keeping the axis. Needs CHANNELS as constants."""
+    return helper.make_node("Gather", ["image", f"index{index}"], [target], axis=axis)
 
 
 CHANNELS = {f"index{index}": np.array([index], np.int64) for index in range(3)}
@@ -63,11 +54,7 @@ CHANNELS = {f"index{index}": np.array([index], np.int64) for index in range(3)}
 
 def red_depth(folder: Path, manifest: Mapping[str, Any], *, batch: int | str = "N", axis: int = 1) -> Path:
     """A network whose outputs depth, sky and sure are the first, second and third channel that it sees."""
-    nodes = [
-        *channel("image", 0, "depth", axis=axis),
-        *channel("image", 1, "sky", axis=axis),
-        *channel("image", 2, "sure", axis=axis),
-    ]
-    put = manifest["input"]
+    outputs, put = ["depth", "sky", "sure"], manifest["input"]
+    nodes = [channel(index, output, axis=axis) for index, output in enumerate(outputs)]
     size = [3, put["height"], put["width"]] if axis == 1 else [put["height"], put["width"], 3]
-    return save(folder, nodes, ["depth", "sky", "sure"], manifest, shape=[batch, *size], constants=CHANNELS)
+    return save(folder, nodes, outputs, manifest, shape=[batch, *size], constants=CHANNELS)

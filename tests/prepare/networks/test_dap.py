@@ -11,7 +11,6 @@ import torch
 
 from panolog.prepare.networks.depth_maps import make_depth, plan_depth
 from panolog.prepare.networks.inverse_depth import FULL, NEAREST
-from panolog.prepare.networks.manifest import DepthManifest, read_manifest
 from panolog.prepare.panorama_files import list_posed_panoramas
 from tests.scenes import write_scene
 
@@ -53,13 +52,6 @@ def export(code: Path, *more: str) -> subprocess.CompletedProcess[str]:
     script = [sys.executable, "-W", "ignore", str(DAP / "export_onnx.py"), "--code", str(code)]
     rest = ["--weights", str(code.parent / "model.pth"), "--output", str(code.parent / "DAP.onnx"), *more]
     return subprocess.run(script + rest, check=False, capture_output=True, text=True, cwd=code.parent)
-
-
-def test_the_manifest_is_the_published_interface() -> None:
-    manifest = read_manifest(DAP / "DAP.yaml", DepthManifest)
-    assert (manifest.input.height, manifest.input.width, manifest.input.divisor) == (512, 1024, 255)
-    assert (manifest.depth.output, manifest.depth.kind, manifest.depth.factor) == ("pred_depth", "depth", 100)
-    assert manifest.sky is not None and (manifest.sky.output, manifest.sky.threshold) == ("pred_mask", 0.5)
 
 
 def test_the_exported_network_gives_maps(code: Path) -> None:

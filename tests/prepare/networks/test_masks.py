@@ -1,10 +1,12 @@
 """Masks: the cone at the nadir, what the camera carries, movers; and the user's own, which are never lost."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import onnx
 import pytest
 from numpy.typing import NDArray
 from onnx import helper
@@ -12,7 +14,6 @@ from onnx import helper
 from panolog.prepare.networks.masks import (
     GIVEN,
     MaskJob,
-    find_nadir,
     find_static,
     make_masks,
     share_of_sphere,
@@ -25,7 +26,7 @@ from panolog.prepare.panorama_files import list_panoramas, load_grey, load_resiz
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from tests.data import shared
-from tests.prepare.networks.networks import CHANNELS, channel, given, red_depth, save
+from tests.prepare.networks.networks import CHANNELS, channel, given, save
 from tests.scenes import HEIGHT, WIDTH, write_scene
 
 NAMES = [f"{index}.png" for index in range(3)]
@@ -52,6 +53,11 @@ def put(path: Path, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), np.where(mask, 255, 0).astype(np.uint8))
     return mask
+
+
+def put_striped(path: Path) -> NDArray[np.bool_]:
+    """A user's mask without the first columns."""
+    return put(path, np.arange(WIDTH)[None] + np.zeros((HEIGHT, 1)) > 9)
 
 
 def test_the_cone_is_a_cap_of_the_sphere() -> None:
@@ -81,7 +87,7 @@ def test_masks_that_are_as_they_should_be_are_not_made_again(scene: Path) -> Non
 
 
 def test_the_users_mask_is_combined_and_kept(scene: Path) -> None:
-    own = put(scene / "masks" / NAMES[0], np.arange(WIDTH)[None] + np.zeros((HEIGHT, 1)) > 9)
+    own = put_striped(scene / "masks" / NAMES[0])
     bytes_before = (scene / "masks" / NAMES[0]).read_bytes()
     for degrees in (60.0, 30.0):  # the second call starts from the user's mask, not from the first call's
         assert masked(scene, MaskJob(nadir=degrees))[0]
@@ -93,7 +99,7 @@ def test_the_users_mask_is_combined_and_kept(scene: Path) -> None:
 
 
 def test_a_mask_by_colmaps_name_is_combined_and_stays(scene: Path) -> None:
-    own = put(scene / "masks" / "0.png.png", np.arange(WIDTH)[None] + np.zeros((HEIGHT, 1)) > 9)
+    own = put_striped(scene / "masks" / "0.png.png")
     masked(scene)
     np.testing.assert_array_equal(pixels(scene / "masks" / NAMES[0]) > 0, own & ~nadir_cone(HEIGHT, 30))
     np.testing.assert_array_equal(pixels(scene / "masks" / "0.png.png") > 0, own)
@@ -124,31 +130,22 @@ def test_a_mask_of_another_size_loses_nothing(scene: Path) -> None:
     assert (pixels(scene / "masks" / NAMES[1])[2:4, 2:4] == 0).all()
 
 
-def classes(folder: Path, **changes: Any) -> Path:
-    """A network whose classes are red, green and blue: the strongest wins."""
-    manifest = {
-        "task": "mask",
-        "input": given(HEIGHT),
-        "classes": {"output": "scores", "ignore": [0]},
-    } | changes
-    size = manifest["input"]
-    shape = [3, size["height"], size["width"]]
-    shape = shape if size["layout"] == "NCHW" else [*shape[1:], 3]
-    return save(
-        folder,
-        [helper.make_node("Identity", ["image"], ["scores"])],
-        ["scores"],
-        manifest,
-        shape=["N", *shape],
-    )
+def movers(scene: Path, nodes: list[onnx.NodeProto], layout: str = "NCHW", **head: Any) -> MaskJob:
+    """A job by a network whose output is `found`, with the manifest's head, "classes" or "ignore"."""
+    manifest = {"task": "mask", "input": given(HEIGHT, layout=layout), **head}
+    shape = ["N", 3, HEIGHT, WIDTH] if layout == "NCHW" else ["N", HEIGHT, WIDTH, 3]
+    model = save(scene.parent, nodes, ["found"], manifest, shape=shape, constants=CHANNELS)
+    return MaskJob(movers=MoverNetwork(model))
+
+
+SCORES = [helper.make_node("Identity", ["image"], ["found"])]  # red, green and blue are classes
 
 
 @pytest.mark.parametrize("layout", ["NCHW", "NHWC"])
 @pytest.mark.parametrize("ignore", [[0], [1, 2]])
 def test_movers_by_class(scene: Path, ignore: list[int], layout: str) -> None:
-    head = {"output": "scores", "ignore": ignore}
-    model = classes(scene.parent, classes=head, input=given(HEIGHT, layout=layout))
-    masked(scene, MaskJob(movers=MoverNetwork(model)))
+    """The class with the highest score counts."""
+    masked(scene, movers(scene, SCORES, layout, classes={"output": "found", "ignore": ignore}))
     image = load_resized(scene / "images" / NAMES[0], WIDTH)
     np.testing.assert_array_equal(
         pixels(scene / "masks" / NAMES[0]) == 0, np.isin(image.argmax(axis=2), ignore)
@@ -156,35 +153,19 @@ def test_movers_by_class(scene: Path, ignore: list[int], layout: str) -> None:
 
 
 @pytest.mark.parametrize("above", ["ignore", "keep"])
-def test_movers_by_threshold_beside_everything_else(scene: Path, above: str) -> None:
-    own = put(scene / "masks" / NAMES[0], np.arange(WIDTH)[None] + np.zeros((HEIGHT, 1)) > 9)
-    head = {"output": "people", "threshold": 0.501, "above": above}
-    manifest = {"task": "mask", "input": given(HEIGHT), "ignore": head}
-    model = save(
-        scene.parent,
-        channel("image", 1, "people"),
-        ["people"],
-        manifest,
-        shape=["N", 3, HEIGHT, WIDTH],
-        constants=CHANNELS,
-    )
-    masked(scene, MaskJob(nadir=30, movers=MoverNetwork(model)))
+def test_movers_by_threshold_and_everything_else(scene: Path, above: str) -> None:
+    own = put_striped(scene / "masks" / NAMES[0])
+    head = {"output": "found", "threshold": 0.501, "above": above}
+    masked(scene, replace(movers(scene, [channel(1, "found")], ignore=head), nadir=30.0))
     green = load_resized(scene / "images" / NAMES[0], WIDTH)[..., 1] / 255
-    people = green > 0.501 if above == "ignore" else green <= 0.501
-    np.testing.assert_array_equal(
-        pixels(scene / "masks" / NAMES[0]) > 0, own & ~people & ~nadir_cone(HEIGHT, 30)
-    )
+    people = (green > 0.501) == (above == "ignore")
+    wanted = own & ~people & ~nadir_cone(HEIGHT, 30)
+    np.testing.assert_array_equal(pixels(scene / "masks" / NAMES[0]) > 0, wanted)
 
 
-def test_a_network_that_is_no_segmentation_is_refused(scene: Path) -> None:
+def test_a_network_without_a_class_is_refused(scene: Path) -> None:
     with pytest.raises(InputError, match="no class 3 among 3"):
-        masked(
-            scene,
-            MaskJob(movers=MoverNetwork(classes(scene.parent, classes={"output": "scores", "ignore": [3]}))),
-        )
-    depth = red_depth(scene.parent, {"task": "depth", "input": given(HEIGHT)})
-    with pytest.raises(InputError, match=r"net\.yaml: task"):
-        MoverNetwork(depth)
+        masked(scene, movers(scene, SCORES, classes={"output": "found", "ignore": [3]}))
 
 
 def walk(count: int, *, carried: bool) -> list[NDArray[np.uint8]]:
@@ -216,6 +197,8 @@ def test_what_the_camera_carries_is_found() -> None:
 
 def test_where_nothing_is_carried_nothing_is_found() -> None:
     assert not static_region(walk(12, carried=False)).disc.any()
+    with pytest.raises(ValueError, match="too few"):
+        static_region(walk(2, carried=True))
 
 
 def test_the_tripod_of_the_flat_is_found_and_the_street_has_none() -> None:
@@ -223,13 +206,6 @@ def test_the_tripod_of_the_flat_is_found_and_the_street_has_none() -> None:
     assert flat[-40:].mean() > 0.99  # tripod and handle
     assert share_of_sphere(flat) < 0.06
     assert not find_static(list_panoramas(shared("street"))[::4]).disc.any()
-
-
-def test_too_few_panoramas_say_nothing(scene: Path) -> None:
-    with pytest.raises(InputError, match="--static: 3 panoramas are too few"):
-        find_static(list_panoramas(scene))
-    with pytest.raises(ValueError, match="too few"):
-        static_region(walk(2, carried=True))
 
 
 def test_a_static_region_is_part_of_the_mask(scene: Path) -> None:
@@ -260,19 +236,6 @@ def test_a_black_cap_is_found_with_its_rim(tmp_path: Path) -> None:
     assert black_nadir([*pictures, np.full((512, 1024, 3), 90, np.uint8)]) is None
     assert black_nadir([np.zeros((512, 1024, 3), np.uint8)]) is None  # all of it is black
     assert black_nadir([]) is None
-
-
-def test_a_black_cap_becomes_a_mask(scene: Path) -> None:
-    with pytest.raises(InputError, match=r"--nadir auto: the panoramas are not black"):
-        find_nadir(list_panoramas(scene))
-    for name in NAMES:
-        picture = np.asarray(cv2.imread(str(scene / "images" / name)))
-        picture[HEIGHT * 3 // 4 :] = 0
-        cv2.imwrite(str(scene / "images" / name), picture)
-    angle = find_nadir(list_panoramas(scene))
-    assert 45 <= angle <= 54.5
-    masked(scene, MaskJob(nadir=angle))
-    assert not pixels(scene / "masks" / NAMES[0])[HEIGHT * 3 // 4 :].any()
 
 
 def test_what_is_transparent_is_in_the_mask_and_no_edge_for_networks(scene: Path) -> None:

@@ -1,12 +1,12 @@
 """Where a network runs, and what is said of files that are none. Nothing here needs a GPU."""
 
-import builtins
 import hashlib
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import onnxruntime
@@ -50,25 +50,18 @@ def test_providers(device: str, available: Sequence[str], tensorrt: bool, wanted
     assert providers(device, available, tensorrt=tensorrt) == wanted
 
 
-def test_devices_that_are_not_there_are_refused(model: Path) -> None:
+def test_devices_that_are_not_there_are_refused() -> None:
     with pytest.raises(InputError, match="--device gpu: choose auto, cpu, cuda, tensorrt"):
-        opened(model, "gpu")
+        providers("gpu", [CPU], tensorrt=False)
     with pytest.raises(InputError, match="--device cuda: this onnxruntime cannot"):
         providers("cuda", [CPU], tensorrt=False)
 
 
-class FakeSession:
-    """A session of a build for GPUs where CUDA is broken: it goes to the CPU without a word."""
-
-    def __init__(self, *_: object, **__: object) -> None: ...
-
-    def get_providers(self) -> list[str]:
-        return [CPU]
-
-
 def test_a_gpu_that_does_not_start_is_no_silent_cpu(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a build for GPUs where CUDA is broken, a session goes to the CPU without a word."""
+    session = Mock(**{"get_providers.return_value": [CPU]})
     monkeypatch.setattr("onnxruntime.get_available_providers", lambda: [CUDA, CPU])
-    monkeypatch.setattr("onnxruntime.InferenceSession", FakeSession)
+    monkeypatch.setattr("onnxruntime.InferenceSession", lambda *_, **__: session)
     monkeypatch.setattr("onnxruntime.preload_dlls", lambda: None)
     with pytest.raises(InputError, match="--device cuda: onnxruntime could not start it"):
         opened(model, "cuda")
@@ -94,23 +87,9 @@ def test_where_the_gpu_fails_the_cpu_works(
 
 
 def test_without_onnxruntime_it_says_what_to_install(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def missing(name: str, *rest: Any) -> Any:
-        if name == "onnxruntime":
-            raise ImportError(name)
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(InputError, match="pip install onnxruntime"):
         opened(model)
-
-
-def test_training_loads_no_onnxruntime() -> None:
-    code = "import sys, panolog.workers.training.trainer\n"
-    code += "import panolog.prepare.networks.depth_maps, panolog.prepare.networks.masks\n"
-    code += "sys.exit('onnxruntime' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_the_key_is_of_all_bytes(tmp_path: Path) -> None:
@@ -151,20 +130,11 @@ print(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
 
 
 def test_mutated_networks_are_refused_or_run(model: Path) -> None:
-    found = subprocess.run(
-        [sys.executable, "-c", MUTATE, str(model)], check=False, capture_output=True, text=True, timeout=120
-    )
+    command = [sys.executable, "-c", MUTATE, str(model)]
+    found = subprocess.run(command, check=False, capture_output=True, text=True)
     assert found.returncode == 0, found.stderr
     assert found.stderr == ""  # onnxruntime's own lines would repeat ours
     assert int(found.stdout) < 2**20  # KiB
-
-
-@pytest.mark.parametrize("data", [b"", b"\x00" * 100, b"no network", b"\x08\x09" + b"\xff" * 50])
-def test_what_is_no_network_is_refused_in_one_line(model: Path, data: bytes) -> None:
-    model.write_bytes(data)
-    with pytest.raises(InputError, match=r"net\.onnx: ") as error:
-        opened(model)
-    assert "\n" not in str(error.value)
 
 
 def test_a_batch_is_what_the_network_gets(model: Path) -> None:
