@@ -4,7 +4,7 @@ Each file appears whole and records its provenance. A second call makes the file
 made by another network, and no others. Files of the user are never overwritten.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -72,28 +72,18 @@ def make_depth(job: DepthJob, batch: int = BATCH, progress: Progress = no_progre
         InputError: a panorama is damaged, or an output is not what the manifest says.
         RunError: the network failed.
     """
-    given = job.manifest.input
-    loaded = prefetch(lambda picture: load_resized(picture.path, 2 * given.height), job.todo)
-    with closing(loaded) as images:  # also where the network fails: its thread ends
-        _make_all(images, job, batch, progress)
-
-
-def _make_all(
-    images: Iterator[tuple[PanoramaFile, NDArray[np.uint8]]], job: DepthJob, batch: int, progress: Progress
-) -> None:
-    """Writes the maps of panoramas and their pixels (H, 2 H, 3)."""
     given, done = job.manifest.input, 0
     many = max(1, (job.network.batch or batch) // (2 if given.seam == "turn" else 1))
-    for group in iter(lambda: list(islice(images, many)), []):
-        pictures = [network_images(image, given) for _, image in group]
-        outputs = run_all(job.network, np.concatenate(pictures), batch)
-        each = len(pictures[0])
-        for index, (picture, _) in enumerate(group):
-            _write(
-                picture, {name: it[index * each : (index + 1) * each] for name, it in outputs.items()}, job
-            )
-            done += 1
-            progress(done, len(job.todo))
+    loaded = prefetch(lambda picture: load_resized(picture.path, 2 * given.height), job.todo)
+    with closing(loaded) as images:  # also where the network fails: its thread ends
+        for group in iter(lambda: list(islice(images, many)), []):
+            pictures = [network_images(image, given) for _, image in group]
+            outputs, each = run_all(job.network, np.concatenate(pictures), batch), len(pictures[0])
+            for index, (picture, _) in enumerate(group):
+                part = slice(index * each, (index + 1) * each)
+                _write(picture, {name: it[part] for name, it in outputs.items()}, job)
+                done += 1
+                progress(done, len(job.todo))
 
 
 def _state(picture: PanoramaFile, job: DepthJob) -> str:
