@@ -16,13 +16,12 @@ from PIL.TiffImagePlugin import IFDRational
 
 BASE, GPS = ExifTags.Base, ExifTags.GPS
 SUFFIXES = (".jpg", ".png", ".tif", ".webp")
-_XMP = (
-    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-    '<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"{}/></rdf:RDF>'
-    "</x:xmpmeta>"
-)
+_HEAD = '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n<x:xmpmeta xmlns:x="adobe:ns:meta/">'
+_RDF = '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about=""'
+_TAIL = "</rdf:RDF></x:xmpmeta>" + " " * 2000 + '<?xpacket end="w"?>'
 CAMERA: dict[int, object] = {
     BASE.DateTimeOriginal: "2024:05:31 12:34:56",
+    BASE.SubsecTimeOriginal: "25",
     BASE.ExposureTime: Fraction(1, 250),
     BASE.FNumber: Fraction(21, 10),
     BASE.ISOSpeedRatings: 200,
@@ -39,9 +38,14 @@ PLACE: dict[int, object] = {
 }
 
 
-def gpano(values: Mapping[str, float | str]) -> bytes:
-    """An XMP packet with values of GPano by name."""
-    return _XMP.format("".join(f' GPano:{name}="{value}"' for name, value in values.items())).encode()
+def gpano(values: Mapping[str, float | str], *, elements: bool = False) -> bytes:
+    """An XMP packet with values of GPano by name, as attributes or as elements."""
+    if elements:
+        inside = "".join(f"<GPano:{name}>{value}</GPano:{name}>" for name, value in values.items())
+        content = f">{inside}</rdf:Description>"
+    else:
+        content = "".join(f' GPano:{name}="{value}"' for name, value in values.items()) + "/>"
+    return f'{_HEAD}{_RDF} xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"{content}{_TAIL}'.encode()
 
 
 def crop(full: tuple[int, int], left: int, top: int, size: tuple[int, int]) -> dict[str, float | str]:
@@ -62,12 +66,17 @@ def write_still(
     *,
     camera: Mapping[int, object] = CAMERA,
     place: Mapping[int, object] | None = PLACE,
-    panorama: Mapping[str, float | str] | None = None,
+    panorama: Mapping[str, float | str] | bytes | None = None,
     orientation: int | None = None,
+    changed: str = "2025:01:01 00:00:00",
 ) -> Path:
-    """Writes (H, W, 3 or 4) RGB in the format of the suffix, lossless where that can be."""
+    """Writes (H, W, 3 or 4) RGB in the format of the suffix, lossless where that can be.
+
+    Args: camera, place, tags of EXIF; panorama, values of GPano or an XMP packet; changed, the file's time.
+    """
     tags = Image.Exif()
     tags[BASE.Make] = "RICOH"
+    tags[BASE.DateTime] = changed
     tags[ExifTags.IFD.Exif] = {
         tag: IFDRational(value) if isinstance(value, Fraction) else value for tag, value in camera.items()
     }
@@ -75,14 +84,14 @@ def write_still(
         tags[ExifTags.IFD.GPSInfo] = dict(place)
     if orientation is not None:
         tags[BASE.Orientation] = orientation
-    xmp = gpano(panorama) if panorama else None
+    xmp = gpano(panorama) if isinstance(panorama, Mapping) else panorama
     more: dict[str, Any] = {"xmp": xmp} if xmp else {}
     image = Image.fromarray(pixels)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".png":
         info = PngInfo()
         if xmp is not None:
-            info.add_itxt("XML:com.adobe.xmp", xmp.decode())
+            info.add_itxt("XML:com.adobe.xmp", xmp.decode(), zip=True)
         image.save(path, exif=tags, pnginfo=info)
     elif path.suffix == ".tif":
         whole = Image.Exif()

@@ -1,6 +1,6 @@
 """What image files say of themselves, in all the ways that cameras write it, and damaged."""
 
-import io
+import math
 import struct
 import zlib
 from collections.abc import Callable
@@ -10,94 +10,39 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
-from PIL.PngImagePlugin import PngInfo
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.world.exif import Attitude, Exif, GpsFix, read_exif
+from panolog.prepare.world.exif import Attitude, Crop, Exif, GpsFix, read_exif
 from panolog.scene.errors import InputError
+from tests.prepare.world.stills import BASE, CAMERA, GPS, PLACE, SUFFIXES, crop, gpano, write_still
 
-GPS, BASE = ExifTags.GPS, ExifTags.Base
-Angle = tuple[Fraction | int, Fraction | int, Fraction | int]
-ZURICH: dict[int, object] = {
-    GPS.GPSLatitudeRef: "N",
-    GPS.GPSLatitude: (47, 22, Fraction(3912, 100)),
-    GPS.GPSLongitudeRef: "E",
-    GPS.GPSLongitude: (8, Fraction(325, 10), 0),
-    GPS.GPSAltitudeRef: b"\0",
-    GPS.GPSAltitude: Fraction(4085, 10),
-}
 FIX = GpsFix(47 + 22 / 60 + 39.12 / 3600, 8 + 32.5 / 60, 408.5)
 TAKEN = datetime(2024, 5, 31, 12, 34, 56, 250_000)
-HEAD = b'<?xpacket begin="\xef\xbb\xbf" id="W5M0MpCehiHzreSzNTczkc9d"?>\n<x:xmpmeta xmlns:x="adobe:ns:meta/">'
-RDF = b'<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about=""'
-GPANO = b' xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"'
-TAIL = b"</rdf:RDF></x:xmpmeta>" + b" " * 2000 + b'<?xpacket end="w"?>'
-ATTRIBUTES = (
-    HEAD + RDF + GPANO + b' GPano:PoseHeadingDegrees="225.0" GPano:PosePitchDegrees="17.0"'
-    b' GPano:PoseRollDegrees="-121.0"/>' + TAIL
-)
-ELEMENTS = (
-    HEAD
-    + RDF
-    + GPANO
-    + b"><GPano:PoseHeadingDegrees>225.0</GPano:PoseHeadingDegrees><GPano:PosePitchDegrees>"
-    b"17.0</GPano:PosePitchDegrees><GPano:PoseRollDegrees>-121.0</GPano:PoseRollDegrees></rdf:Description>"
-    + TAIL
-)
-ATTITUDE = Attitude(225, 17, -121)
+STOPS = math.log2(1 / 250 * 200 / 100 / 2.1**2)
+POSE: dict[str, float | str] = {"PoseHeadingDegrees": 225.5, "PosePitchDegrees": 17, "PoseRollDegrees": -121}
+ATTITUDE = Attitude(225.5, 17, -121)
+SIZE = (16, 8)
+CROP = crop((32, 16), 4, 2, SIZE)
+BLACK = np.zeros((8, 16, 3), np.uint8)
 
 
-def exif(gps: dict[int, object] | None = None, time: bool = True) -> Image.Exif:
-    tags = Image.Exif()
-    tags[BASE.Make] = "RICOH"
-    if gps is not None:
-        tags[ExifTags.IFD.GPSInfo] = gps
-    if time:
-        tags[BASE.DateTime] = "2025:01:01 00:00:00"
-        tags[ExifTags.IFD.Exif] = {
-            BASE.DateTimeOriginal: "2024:05:31 12:34:56",
-            BASE.SubsecTimeOriginal: "25",
-            BASE.MakerNote: b"\x01" * 500,
-        }
-    return tags
-
-
-def write(path: Path, tags: Image.Exif, xmp: bytes | None = None) -> Path:
-    image = Image.new("RGB", (16, 8))
-    if path.suffix == ".png":
-        info = PngInfo()
-        if xmp is not None:
-            info.add_itxt("XML:com.adobe.xmp", xmp.decode(), zip=True)
-        image.save(path, exif=tags, pnginfo=info)
-    elif path.suffix == ".tif" and xmp is not None:
-        whole = Image.Exif()
-        whole.load(tags.tobytes())  # with its directories in one block, from which the TIFF's are copied
-        whole[700] = xmp
-        image.save(path, exif=whole)
-    elif xmp is not None:
-        image.save(path, exif=tags, xmp=xmp)
-    else:
-        image.save(path, exif=tags)
-    return path
-
-
-def gps(**changes: object) -> dict[int, object]:
-    return {**ZURICH, **{int(GPS[name]): value for name, value in changes.items()}}
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
-@pytest.mark.parametrize("xmp", [ATTRIBUTES, ELEMENTS])
-def test_all_that_a_camera_writes(tmp_path: Path, suffix: str, xmp: bytes) -> None:
-    found = read_exif(write(tmp_path / f"a{suffix}", exif(ZURICH), xmp))
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("elements", [False, True])
+def test_all_that_a_camera_writes(tmp_path: Path, suffix: str, elements: bool) -> None:
+    xmp = gpano({**POSE, **CROP}, elements=elements)
+    found = read_exif(write_still(tmp_path / f"a{suffix}", BLACK, panorama=xmp, orientation=6))
     assert found.fix is not None
     assert (found.fix.latitude, found.fix.longitude) == pytest.approx((FIX.latitude, FIX.longitude), abs=1e-9)
     assert found.fix.altitude == 408.5
     assert found.time == TAKEN
     assert found.attitude == ATTITUDE
+    assert found.exposure_stops == pytest.approx(STOPS)
+    assert found.crop == Crop((32, 16), 4, 2, SIZE)
+    assert found.orientation == 6
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_files_that_say_nothing(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     Image.new("RGB", (16, 8)).save(path)
@@ -114,18 +59,18 @@ def test_missing_file_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "wanted"),
     [
-        ({"GPSLatitudeRef": "S", "GPSLongitudeRef": "W"}, GpsFix(-FIX.latitude, -FIX.longitude, 408.5)),
-        ({"GPSAltitudeRef": b"\1"}, GpsFix(FIX.latitude, FIX.longitude, -408.5)),
-        ({"GPSAltitude": Fraction(10**8)}, GpsFix(FIX.latitude, FIX.longitude, None)),
-        ({"GPSLatitude": (0, 0, 0), "GPSLongitude": (0, 0, 0)}, None),
-        ({"GPSLatitude": (90, 30, 0)}, None),
-        ({"GPSLongitude": (181, 0, 0)}, None),
-        ({"GPSLatitudeRef": ""}, None),
-        ({"GPSLatitude": (1, 2)}, None),
+        ({GPS.GPSLatitudeRef: "S", GPS.GPSLongitudeRef: "W"}, GpsFix(-FIX.latitude, -FIX.longitude, 408.5)),
+        ({GPS.GPSAltitudeRef: b"\1"}, GpsFix(FIX.latitude, FIX.longitude, -408.5)),
+        ({GPS.GPSAltitude: Fraction(10**8)}, GpsFix(FIX.latitude, FIX.longitude, None)),
+        ({GPS.GPSLatitude: (0, 0, 0), GPS.GPSLongitude: (0, 0, 0)}, None),
+        ({GPS.GPSLatitude: (90, 30, 0)}, None),
+        ({GPS.GPSLongitude: (181, 0, 0)}, None),
+        ({GPS.GPSLatitudeRef: ""}, None),
+        ({GPS.GPSLatitude: (1, 2)}, None),
     ],
 )
-def test_places(tmp_path: Path, change: dict[str, object], wanted: GpsFix | None) -> None:
-    found = read_exif(write(tmp_path / "a.jpg", exif(gps(**change)))).fix
+def test_places(tmp_path: Path, change: dict[int, object], wanted: GpsFix | None) -> None:
+    found = read_exif(write_still(tmp_path / "a.jpg", BLACK, place={**PLACE, **change})).fix
     if wanted is None:
         assert found is None
     else:
@@ -136,37 +81,38 @@ def test_places(tmp_path: Path, change: dict[str, object], wanted: GpsFix | None
 
 def test_numbers_without_denominator(tmp_path: Path) -> None:
     """Receivers without a place write 0/0."""
-    path = write(tmp_path / "a.jpg", exif(gps(GPSLatitude=(47, 22, Fraction(391_234, 10_000)))))
+    place = {**PLACE, GPS.GPSLatitude: (47, 22, Fraction(391_234, 10_000))}
+    path = write_still(tmp_path / "a.jpg", BLACK, place=place)
     data = path.read_bytes()
-    (tmp_path / "a.jpg").write_bytes(data.replace(struct.pack(">II", 195_617, 5_000), bytes(8)))
-    assert read_exif(path).fix is None
     assert struct.pack(">II", 195_617, 5_000) in data
+    path.write_bytes(data.replace(struct.pack(">II", 195_617, 5_000), bytes(8)))
+    assert read_exif(path).fix is None
 
 
 def test_time_of_the_file_where_the_camera_wrote_none(tmp_path: Path) -> None:
-    tags = exif(time=False)
-    assert read_exif(write(tmp_path / "a.jpg", tags)).time is None
-    tags[BASE.DateTime] = "2025:01:02 03:04:05"
-    assert read_exif(write(tmp_path / "a.jpg", tags)).time == datetime(2025, 1, 2, 3, 4, 5)
-    tags[BASE.DateTime] = "0000:00:00 00:00:00"
-    assert read_exif(write(tmp_path / "a.jpg", tags)).time is None
+    for changed, wanted in (
+        ("", None),
+        ("0000:00:00 00:00:00", None),
+        ("2025:01:02 03:04:05", datetime(2025, 1, 2, 3, 4, 5)),
+    ):
+        path = write_still(tmp_path / "a.jpg", BLACK, camera={}, changed=changed)
+        assert read_exif(path).time == wanted
 
 
 @pytest.mark.parametrize(
     ("written", "wanted"),
     [
-        (b'GPano:PosePitchDegrees="-5"', Attitude(None, -5, 0)),
-        (b'GPano:PoseHeadingDegrees="360"', Attitude(0, 0, 0)),
-        (b'GPano:PosePitchDegrees="91" GPano:PoseRollDegrees="2"', Attitude(None, 0, 2)),
-        (b'GPano:PosePitchDegrees="nan" GPano:PoseRollDegrees="inf"', None),
-        (b'GPano:PosePitchDegrees="five"', None),
-        (b'GPano:PosePitchDegrees="' + b"1" * 1000 + b'"', None),
-        (b'GPano:ProjectionType="equirectangular"', None),
+        ({"PosePitchDegrees": "-5"}, Attitude(None, -5, 0)),
+        ({"PoseHeadingDegrees": "360"}, Attitude(0, 0, 0)),
+        ({"PosePitchDegrees": "91", "PoseRollDegrees": "2"}, Attitude(None, 0, 2)),
+        ({"PosePitchDegrees": "nan", "PoseRollDegrees": "inf"}, None),
+        ({"PosePitchDegrees": "five"}, None),
+        ({"PosePitchDegrees": "1" * 1000}, None),
+        ({"ProjectionType": "equirectangular"}, None),
     ],
 )
-def test_attitudes(tmp_path: Path, written: bytes, wanted: Attitude | None) -> None:
-    packet = HEAD + RDF + GPANO + b" " + written + b"/>" + TAIL
-    assert read_exif(write(tmp_path / "a.jpg", exif(), packet)).attitude == wanted
+def test_attitudes(tmp_path: Path, written: dict[str, str], wanted: Attitude | None) -> None:
+    assert read_exif(write_still(tmp_path / "a.jpg", BLACK, panorama=written)).attitude == wanted
 
 
 def test_up_is_what_the_standard_says() -> None:
@@ -183,12 +129,12 @@ def test_up_is_what_the_standard_says() -> None:
 
 def test_metadata_behind_the_pixels_of_a_png(tmp_path: Path) -> None:
     """Where ExifTool puts it."""
-    path = tmp_path / "a.png"
-    Image.new("RGB", (16, 8)).save(path)
+    path, exif = tmp_path / "a.png", Image.open(write_still(tmp_path / "a.jpg", BLACK)).info["exif"][6:]
+    Image.new("RGB", SIZE).save(path)
     data, end = path.read_bytes()[:-12], path.read_bytes()[-12:]
     for kind, content in (
-        (b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + ELEMENTS),
-        (b"eXIf", exif(ZURICH).tobytes()[6:]),
+        (b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + gpano(POSE)),
+        (b"eXIf", exif),
     ):
         part = kind + content
         data += struct.pack(">I", len(content)) + part + struct.pack(">I", zlib.crc32(part))
@@ -238,10 +184,10 @@ def test_hostile_files_say_nothing(tmp_path: Path, hostile: Callable[[], bytes])
     assert read_exif(path) == Exif()
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_mutations_never_raise(tmp_path: Path, suffix: str) -> None:
     """Bytes changed, cut and repeated: what comes out is nothing or plausible."""
-    whole = write(tmp_path / f"whole{suffix}", exif(ZURICH), ELEMENTS).read_bytes()
+    whole = write_still(tmp_path / f"whole{suffix}", BLACK, panorama=POSE).read_bytes()
     random = np.random.default_rng(0)
     path = tmp_path / "mutated"
     for _ in range(200):
@@ -261,7 +207,7 @@ def test_mutations_never_raise(tmp_path: Path, suffix: str) -> None:
 
 
 def test_a_damaged_part_leaves_the_other(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.jpg", exif(ZURICH), ELEMENTS)
+    path = write_still(tmp_path / "a.jpg", BLACK, panorama=POSE)
     data = path.read_bytes()
     path.write_bytes(data.replace(b"<rdf:RDF", b"<rdf;RDF"))
     assert (read_exif(path).attitude, read_exif(path).time) == (None, TAKEN)
@@ -271,8 +217,51 @@ def test_a_damaged_part_leaves_the_other(tmp_path: Path) -> None:
 
 def test_pixels_are_not_read(tmp_path: Path) -> None:
     """A file that ends within its pixels still says what it says."""
-    path = tmp_path / "a.jpg"
-    buffer = io.BytesIO()
-    Image.effect_noise((256, 128), 50).save(buffer, "JPEG", exif=exif(ZURICH))
-    path.write_bytes(buffer.getvalue()[:2000])
+    noise = np.random.default_rng(0).integers(0, 256, (128, 256, 3), np.uint8)
+    path = write_still(tmp_path / "a.jpg", noise)
+    path.write_bytes(path.read_bytes()[:2000])
     assert read_exif(path).time == TAKEN
+
+
+@pytest.mark.parametrize(
+    ("changes", "wanted"),
+    [
+        ({}, STOPS),
+        ({BASE.ExposureTime: Fraction(1, 125)}, STOPS + 1),
+        ({BASE.ISOSpeedRatings: 400}, STOPS + 1),
+        ({BASE.ISOSpeedRatings: (400, 100)}, STOPS + 1),
+        ({BASE.FNumber: Fraction(42, 10)}, STOPS - 2),
+        ({BASE.FNumber: None}, STOPS + 2 * math.log2(2.1)),
+        ({BASE.FNumber: None, BASE.ApertureValue: Fraction(2)}, STOPS + 2 * math.log2(2.1) - 2),
+        ({BASE.ExposureTime: None, BASE.ShutterSpeedValue: Fraction(10)}, STOPS + math.log2(250) - 10),
+        ({BASE.ISOSpeedRatings: 65_535, BASE.RecommendedExposureIndex: 102_400}, STOPS + 9),
+        ({BASE.ExposureBiasValue: Fraction(2)}, STOPS),
+        ({BASE.ExposureTime: None}, None),
+        ({BASE.ISOSpeedRatings: None}, None),
+        ({BASE.ISOSpeedRatings: 0}, None),
+        ({BASE.ISOSpeedRatings: "many"}, None),
+        ({BASE.ExposureTime: Fraction(0)}, None),
+        ({BASE.ExposureTime: Fraction(10**9)}, None),
+    ],
+)
+def test_exposure_in_stops(tmp_path: Path, changes: dict[int, object], wanted: float | None) -> None:
+    camera = {tag: value for tag, value in {**CAMERA, **changes}.items() if value is not None}
+    found = read_exif(write_still(tmp_path / "a.jpg", BLACK, camera=camera)).exposure_stops
+    assert found == (None if wanted is None else pytest.approx(wanted))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"FullPanoWidthPixels": -32},
+        {"CroppedAreaImageWidthPixels": 32},  # beyond the right edge
+        {"CroppedAreaTopPixels": 15},
+        {"CroppedAreaTopPixels": "nan"},
+        {"FullPanoHeightPixels": 2**40},
+        {"CroppedAreaImageHeightPixels": 0},
+        {"CroppedAreaImageHeightPixels": 7.5},
+    ],
+)
+def test_a_crop_that_cannot_be_is_none(tmp_path: Path, changes: dict[str, float | str]) -> None:
+    path = write_still(tmp_path / "a.jpg", BLACK, panorama={**CROP, **changes})
+    assert read_exif(path).crop is None

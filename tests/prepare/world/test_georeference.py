@@ -1,5 +1,8 @@
 """Gravity and GPS: known similarities come back, and insufficient data is not used."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
@@ -39,11 +42,12 @@ class World:
         self.sfm_rotations = self.rotations @ self.truth.rotation
         self.sfm_centers = (centers - self.truth.translation) @ self.truth.rotation / self.truth.scale
 
-    @property
-    def attitudes(self) -> list[Attitude | None]:
-        return [Attitude(None, float(pitch), float(roll)) for pitch, roll in self.angles]
+    def attitudes(self, headings: Sequence[float | None] | None = None) -> list[Attitude | None]:
+        """Those of the files, with headings where given."""
+        given = headings or [None] * len(self.angles)
+        return [Attitude(it, *angles) for it, angles in zip(given, self.angles.tolist(), strict=True)]
 
-    def fixes(self, noise: float = 0.0, vertical: float = 0.0, wrong: float = 0.0) -> list[GpsFix | None]:
+    def fixes(self, noise: float = 0.0, vertical: float = 0.0, wrong: float = 0.0) -> list[GpsFix]:
         """GPS with noise in metres along each axis; a fraction `wrong` of them is up to 300 m off."""
         shape = (len(self.centers), 2)
         enu = self.centers.copy()
@@ -55,8 +59,8 @@ class World:
 
     def solve(
         self,
-        found: list[GpsFix | None] | None = None,
-        attitudes: list[Attitude | None] | None = None,
+        found: Sequence[GpsFix | None] | None = None,
+        attitudes: Sequence[Attitude | None] | None = None,
         scale: float | None = None,
     ) -> Georeference:
         none = [None] * len(self.centers)
@@ -68,11 +72,8 @@ class World:
         """(K, 3) metres, of the cameras in east, north, up of the test's own origin."""
         assert found.gps is not None
         origin = found.gps.fixes.origin
-        back = np.asarray(
-            transform().enu_to_ellipsoid(
-                found.similarity.points(self.sfm_centers), origin.latitude, origin.longitude, origin.altitude
-            )
-        )
+        place = (origin.latitude, origin.longitude, origin.altitude)
+        back = np.asarray(transform().enu_to_ellipsoid(found.similarity.points(self.sfm_centers), *place))
         enu: Array = np.asarray(transform().ellipsoid_to_enu(back, *ORIGIN))
         off: Array = enu - self.centers
         return off
@@ -82,9 +83,9 @@ def transform() -> pycolmap.GPSTransform:
     return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
 
 
-def fixes(enu: Array) -> list[GpsFix | None]:
-    """Fixes of positions (K, 3) around ORIGIN."""
-    return [GpsFix(*map(float, row)) for row in np.asarray(transform().enu_to_ellipsoid(enu, *ORIGIN))]
+def fixes(enu: Array, origin: tuple[float, float, float] = ORIGIN) -> list[GpsFix]:
+    """Fixes of positions (K, 3) around a place."""
+    return [GpsFix(*map(float, row)) for row in np.asarray(transform().enu_to_ellipsoid(enu, *origin))]
 
 
 def walk(count: int = 60, length: float = 200.0) -> Array:
@@ -116,27 +117,10 @@ def up_error(world: World, found: Georeference) -> float:
     return float(np.rad2deg(np.arctan2(np.hypot(up[0], up[1]), up[2])))  # exact near 0, as arccos is not
 
 
-def test_a_similarity_keeps_what_cameras_see() -> None:
-    world = World(walk(), tilt=20)
-    points = world.random.normal(0, 100, (50, 3))
-    before = (
-        np.einsum("kij,nj->kni", world.sfm_rotations, points)
-        - np.einsum("kij,kj->ki", world.sfm_rotations, world.sfm_centers)[:, None]
-    )
-    translations = -np.einsum("kij,kj->ki", world.sfm_rotations, world.sfm_centers)
-    rotations, translations = world.truth.poses(world.sfm_rotations, translations)
-    moved = world.truth.points(points)
-    after = np.einsum("kij,nj->kni", rotations, moved) + translations[:, None]
-    assert np.abs(after - world.truth.scale * before).max() < 1e-9 * np.abs(after).max()
-    centers = -np.einsum("kji,kj->ki", rotations, translations)
-    assert np.abs(centers - world.centers).max() < 1e-9
-    assert np.abs(rotations - world.rotations).max() < 1e-12
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_any_similarity_comes_back_without_noise(seed: int) -> None:
     world = World(centred(walk()), tilt=15, seed=seed)
-    found = world.solve(world.fixes(), world.attitudes)
+    found = world.solve(world.fixes(), world.attitudes())
     assert (found.frame, found.metric, found.notes) == ("enu", True, ())
     assert np.abs(world.errors(found)).max() < 1e-6
     assert found.similarity.scale == pytest.approx(world.truth.scale, rel=1e-8)
@@ -147,7 +131,7 @@ def test_any_similarity_comes_back_without_noise(seed: int) -> None:
     assert found.gps.vertical is not None
     assert found.gps.vertical < 1e-6
     assert np.abs(found.similarity.points(world.sfm_centers)).max() < 200  # small coordinates
-    again = world.solve(world.fixes(), world.attitudes)
+    again = world.solve(world.fixes(), world.attitudes())
     assert again.similarity.rotation.tobytes() == found.similarity.rotation.tobytes()
 
 
@@ -155,7 +139,7 @@ def test_any_similarity_comes_back_without_noise(seed: int) -> None:
 def test_noise_and_outliers(seed: int) -> None:
     """3 m of noise along each axis, 6 m in heights, a fifth of the fixes wrong, over 200 m of way."""
     world = World(walk(), tilt=8, seed=seed)
-    found = world.solve(world.fixes(noise=3, vertical=6, wrong=0.2), world.attitudes)
+    found = world.solve(world.fixes(noise=3, vertical=6, wrong=0.2), world.attitudes())
     assert found.frame == "enu"
     assert "do not fit and are left out" in found.notes[0]
     errors = world.errors(found)
@@ -173,7 +157,7 @@ def test_noise_and_outliers(seed: int) -> None:
 def test_a_straight_way_stays_level() -> None:
     """Heights that are 10 m off would turn it about itself, were up not known from the cameras."""
     world = World(line(), tilt=5)
-    found = world.solve(world.fixes(noise=2, vertical=10), world.attitudes)
+    found = world.solve(world.fixes(noise=2, vertical=10), world.attitudes())
     assert found.frame == "enu"
     assert up_error(world, found) < 0.1
     assert np.linalg.norm(world.errors(found)[:, :2], axis=1).max() < 3
@@ -194,7 +178,7 @@ def test_levelled_by_how_cameras_are_held(tilt: float) -> None:
 def test_levelled_by_attitudes_with_outliers() -> None:
     """Every fourth file is wrong, and every fourth has none."""
     world = World(walk(), tilt=20)
-    attitudes = world.attitudes
+    attitudes = world.attitudes()
     attitudes[::4] = [Attitude(None, 60.0, 90.0)] * 15
     attitudes[1::4] = [None] * 15
     found = world.solve(attitudes=attitudes)
@@ -205,8 +189,8 @@ def test_levelled_by_attitudes_with_outliers() -> None:
 def test_attitudes_that_contradict_the_poses() -> None:
     """Panoramas that were levelled later, their files not."""
     world = World(walk())
-    attitudes = [Attitude(None, float(p), float(r)) for p, r in world.random.uniform(-40, 40, (60, 2))]
-    found = world.solve(attitudes=list(attitudes))
+    world.angles = world.random.uniform(-40, 40, (60, 2))
+    found = world.solve(attitudes=world.attitudes())
     assert found.up.source == "cameras"
     assert up_error(world, found) < 1e-6
     assert "60 files differ from the poses by" in found.notes[0]
@@ -217,10 +201,7 @@ def test_north_is_where_the_headings_say(noise: float) -> None:
     world = World(walk(40), tilt=4, seed=5)
     compass = world.headings + world.random.normal(0, noise, 40)
     compass[::5] += 90  # next to iron
-    attitudes: list[Attitude | None] = [
-        Attitude(float(heading) % 360, float(pitch), float(roll))
-        for heading, (pitch, roll) in zip(compass, world.angles, strict=True)
-    ]
+    attitudes = world.attitudes((compass % 360).tolist())
     found = world.solve(attitudes=attitudes)
     assert found.frame == "upright"
     off = found.similarity.rotation @ world.truth.rotation.T
@@ -233,16 +214,13 @@ def test_north_is_where_the_headings_say(noise: float) -> None:
 @pytest.mark.parametrize("headings", ["same", "random", "few"])
 def test_headings_that_say_nothing_are_not_used(headings: str) -> None:
     world = World(walk(40), tilt=4, seed=6)
-    written = {
-        "same": np.zeros(40),
-        "random": world.random.uniform(0, 360, 40),
-        "few": np.where(np.arange(40) < 2, world.headings, np.nan),
+    written: Sequence[float | None] = {
+        "same": [0.0] * 40,
+        "random": world.random.uniform(0, 360, 40).tolist(),
+        "few": [*world.headings[:2].tolist(), *[None] * 38],
     }[headings]
-    attitudes: list[Attitude | None] = [
-        Attitude(None if np.isnan(heading) else float(heading), float(pitch), float(roll))
-        for heading, (pitch, roll) in zip(written, world.angles, strict=True)
-    ]
-    found, without = world.solve(attitudes=attitudes), world.solve(attitudes=world.attitudes)
+    found = world.solve(attitudes=world.attitudes(written))
+    without = world.solve(attitudes=world.attitudes())
     np.testing.assert_array_equal(found.similarity.rotation, without.similarity.rotation)
     assert not found.notes
 
@@ -307,9 +285,7 @@ def test_few_fixes_and_none_with_altitude() -> None:
     world = World(walk())
     sparse: list[GpsFix | None] = [None] * 60
     for row in range(0, 60, 12):
-        fix = world.fixes()[row]
-        assert fix is not None
-        sparse[row] = GpsFix(fix.latitude, fix.longitude, None)
+        sparse[row] = replace(fixes(world.centers)[row], altitude=None)
     found = world.solve(sparse)
     assert found.frame == "enu"
     assert found.gps is not None
@@ -325,10 +301,7 @@ def test_few_fixes_and_none_with_altitude() -> None:
 
 def test_across_the_date_line() -> None:
     world = World(walk())
-    at = (-16.8, 179.9999, 10.0)
-    found = world.solve(
-        [GpsFix(*map(float, row)) for row in transform().enu_to_ellipsoid(world.centers, *at)]
-    )
+    found = world.solve(fixes(world.centers, (-16.8, 179.9999, 10.0)))
     assert found.frame == "enu"
     assert found.gps is not None
     assert found.gps.residual < 1e-3

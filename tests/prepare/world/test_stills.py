@@ -2,7 +2,6 @@
 
 import math
 import os
-from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -16,8 +15,7 @@ from panolog.prepare.world.cropped import complete_panoramas
 from panolog.prepare.world.exif import Attitude, Crop, read_exif
 from panolog.scene.errors import InputError
 from panolog.scene.image_files import decode_with_alpha
-from panolog.scene.write import NewScene, PosedImage, write_scene
-from tests.prepare.world.stills import BASE, CAMERA, SUFFIXES, crop, exiftool, write_still
+from tests.prepare.world.stills import SUFFIXES, crop, exiftool, write_still
 
 STOPS = math.log2(1 / 250 * 200 / 100 / 2.1**2)
 FULL, PART = (128, 64), (96, 40)  # a panorama, and what of it is there from (16, 8) on
@@ -32,61 +30,6 @@ def noise(size: tuple[int, int], seed: int = 0) -> NDArray[np.uint8]:
 def completed(path: Path, folder: Path) -> Path:
     (found,) = complete_panoramas([PanoramaFile(path.parent, path.name, path)], folder)
     return found.path
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_all_that_a_still_says(tmp_path: Path, suffix: str) -> None:
-    path = write_still(tmp_path / f"a{suffix}", noise(PART), panorama={**POSE, **CROP}, orientation=6)
-    found = read_exif(path)
-    assert found.exposure_stops == pytest.approx(STOPS)
-    assert found.attitude == Attitude(225.5, 3, -2)
-    assert found.crop == Crop(FULL, 16, 8, PART)
-    assert found.orientation == 6
-    assert found.fix is not None and found.fix.altitude == 408.5
-
-
-@pytest.mark.parametrize(
-    ("changes", "wanted"),
-    [
-        ({}, STOPS),
-        ({BASE.ExposureTime: Fraction(1, 125)}, STOPS + 1),
-        ({BASE.ISOSpeedRatings: 400}, STOPS + 1),
-        ({BASE.ISOSpeedRatings: (400, 100)}, STOPS + 1),
-        ({BASE.FNumber: Fraction(42, 10)}, STOPS - 2),
-        ({BASE.FNumber: None}, STOPS + 2 * math.log2(2.1)),
-        ({BASE.FNumber: None, BASE.ApertureValue: Fraction(2)}, STOPS + 2 * math.log2(2.1) - 2),
-        ({BASE.ExposureTime: None, BASE.ShutterSpeedValue: Fraction(10)}, STOPS + math.log2(250) - 10),
-        ({BASE.ISOSpeedRatings: 65_535, BASE.RecommendedExposureIndex: 102_400}, STOPS + 9),
-        ({BASE.ExposureBiasValue: Fraction(2)}, STOPS),
-        ({BASE.ExposureTime: None}, None),
-        ({BASE.ISOSpeedRatings: None}, None),
-        ({BASE.ISOSpeedRatings: 0}, None),
-        ({BASE.ISOSpeedRatings: "many"}, None),
-        ({BASE.ExposureTime: Fraction(0)}, None),
-        ({BASE.ExposureTime: Fraction(10**9)}, None),
-    ],
-)
-def test_exposure_in_stops(tmp_path: Path, changes: dict[int, object], wanted: float | None) -> None:
-    camera = {tag: value for tag, value in {**CAMERA, **changes}.items() if value is not None}
-    found = read_exif(write_still(tmp_path / "a.jpg", noise((8, 4)), camera=camera)).exposure_stops
-    assert found == (None if wanted is None else pytest.approx(wanted))
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"FullPanoWidthPixels": -128},
-        {"CroppedAreaImageWidthPixels": 128},  # beyond the right edge
-        {"CroppedAreaTopPixels": 60},
-        {"CroppedAreaTopPixels": "nan"},
-        {"FullPanoHeightPixels": 2**40},
-        {"CroppedAreaImageHeightPixels": 0},
-        {"CroppedAreaImageHeightPixels": 39.5},
-    ],
-)
-def test_a_crop_that_cannot_be_is_none(tmp_path: Path, changes: dict[str, float | str]) -> None:
-    path = write_still(tmp_path / "a.jpg", noise(PART), panorama={**CROP, **changes})
-    assert read_exif(path).crop is None
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -185,20 +128,7 @@ def test_sfm_reads_the_metadata_first(tmp_path: Path) -> None:
         make_scene(tmp_path / "place", tmp_path / "scene", SfmSettings(), lambda *_: None)
 
 
-def test_exposure_survives_into_the_scene(tmp_path: Path) -> None:
-    images = []
-    for index in range(3):
-        camera = {**CAMERA, BASE.ISOSpeedRatings: 100 * 2**index}
-        file = write_still(tmp_path / f"{index}.jpg", noise(FULL, index), camera=camera)
-        images.append(PosedImage(file.name, file, np.eye(3), np.array([0.5 * index, 0, 0])))
-    points = np.random.default_rng(0).normal(size=(20, 3))
-    colors = np.full((20, 3), 90, np.uint8)
-    write_scene(tmp_path / "scene", NewScene(images, FULL, points, colors), link=False)
-    stops = [read_exif(tmp_path / "scene" / "images" / f"{i}.jpg").exposure_stops for i in range(3)]
-    assert stops == pytest.approx([STOPS - 1, STOPS, STOPS + 1])
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_what_exiftool_writes(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     cv2.imwrite(str(path), noise(PART))
