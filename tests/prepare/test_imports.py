@@ -1,16 +1,37 @@
-"""OpenCV is there before pycolmap: in the other order it cannot write a PNG."""
+"""What importing a module loads and changes, each in a process of its own."""
 
 import subprocess
 import sys
 
 import pytest
 
-
-@pytest.mark.parametrize("module", ["world.gps", "sfm.triangulate"])
-def test_opencv_comes_first(module: str) -> None:
-    code = f"""
+PROGRAMS = {
+    **{
+        f"{module} loads OpenCV before pycolmap: in the other order it cannot write a PNG": f"""
 import sys, panolog.prepare.{module}, cv2, numpy
 assert list(sys.modules).index("cv2") < list(sys.modules).index("pycolmap")
 cv2.imencode(".png", numpy.zeros((8, 8, 3), numpy.uint8))
 """
-    subprocess.run([sys.executable, "-c", code], check=True)
+        for module in ("world.gps", "sfm.triangulate")
+    },
+    "pycolmap does not take the signal by which a run is stopped": """
+import os, signal
+seen = []
+signal.signal(signal.SIGTERM, lambda *_: seen.append("handled"))
+import panolog.prepare.check.bundle
+import panolog.prepare.sfm.pipeline
+os.kill(os.getpid(), signal.SIGTERM)
+assert seen
+""",
+    "training loads no onnxruntime": """
+import sys, panolog.workers.training.trainer
+import panolog.prepare.networks.depth_maps, panolog.prepare.networks.masks
+assert "onnxruntime" not in sys.modules
+""",
+}
+
+
+@pytest.mark.parametrize("code", PROGRAMS.values(), ids=PROGRAMS)
+def test_imports(code: str) -> None:
+    ended = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")
