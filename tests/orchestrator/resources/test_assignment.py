@@ -18,11 +18,6 @@ def unequal(tasks: int, slots: int, seed: int) -> tuple[NDArray[np.float64], NDA
     return seconds, random.uniform(0, 4, slots)
 
 
-def test_tasks_are_exchanged_where_longest_first_is_not_best() -> None:
-    seconds = np.repeat([[3.0], [3.0], [2.0], [2.0], [2.0]], 2, axis=1)
-    assert end_of(seconds, np.zeros(2), assign_lpt(seconds, np.zeros(2))) == 6
-
-
 def test_the_last_end_is_hardly_later_than_the_best_of_all() -> None:
     excess = []
     for seed in range(20):
@@ -40,11 +35,6 @@ def test_no_task_lands_where_it_cannot_run() -> None:
     slot_of = assign_lpt(seconds, free_in)
     assert np.isfinite(seconds[np.arange(30), slot_of]).all()
     assert (slot_of[::2] == 0).all()
-
-
-def test_of_equal_slots_the_first_is_taken() -> None:
-    assert assign_lpt(np.ones((1, 3)), np.zeros(3)).tolist() == [0]
-    assert assign_lpt(np.ones((2, 3)), np.array([1.0, 0.0, 0.0])).tolist() == [1, 2]
 
 
 def test_nothing_to_deal() -> None:

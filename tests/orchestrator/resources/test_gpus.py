@@ -7,6 +7,7 @@ from panolog.orchestrator.resources import gpus
 from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.nodes import Gpu, Node
 from tests.nvidia_smi import print_gpus
+from tests.orchestrator.fakes import SetClock
 
 MIB = 2**20
 LARGE = Gpu("NVIDIA RTX 4090", 24_000 * MIB, "GPU-aa11")
@@ -66,18 +67,15 @@ def test_gpus_are_unequal_by_name_or_by_a_gibibyte() -> None:
     assert not unequal(LARGE, Gpu(LARGE.name, LARGE.memory - MIB))
 
 
-def test_memory_that_dying_workers_still_hold_counts_as_free(monkeypatch: pytest.MonkeyPatch) -> None:
-    free = iter([2_000, 9_000, 24_000])
-    monkeypatch.setattr(gpus, "_SETTLE_S", 0.0)
+@pytest.mark.parametrize(
+    ("measured", "memory"), [([2_000, 9_000, 24_000], 24_000), ([9_000, 9_000], 9_000)], ids=["dying", "kept"]
+)
+def test_memory_that_dying_workers_still_hold_counts_as_free_and_what_others_keep_does_not(
+    monkeypatch: pytest.MonkeyPatch, measured: list[int], memory: int
+) -> None:
+    free = iter(measured)
+    monkeypatch.setattr(gpus, "time", SetClock())
     row = ["0", "GPU-aa11", "NVIDIA RTX 4090"]
     monkeypatch.setattr(gpus, "nvidia_smi", lambda _: [[*row, str(next(free)), "24564"]])
-    assert describe_gpus(1) == (LARGE,)
+    assert describe_gpus(1) == (replace(LARGE, memory=memory * MIB),)
     assert not list(free)
-
-
-def test_memory_that_others_keep_is_not_free(monkeypatch: pytest.MonkeyPatch) -> None:
-    free = iter([9_000, 9_000])
-    monkeypatch.setattr(gpus, "_SETTLE_S", 0.0)
-    row = ["0", "GPU-aa11", "NVIDIA RTX 4090"]
-    monkeypatch.setattr(gpus, "nvidia_smi", lambda _: [[*row, str(next(free)), "24564"]])
-    assert describe_gpus(1) == (replace(LARGE, memory=9_000 * MIB),)

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -39,11 +40,6 @@ def detected() -> Provider:
     provider = detect()
     assert provider is not None
     return provider
-
-
-def kind_of(provider: Provider) -> Leaving | None:
-    notice = provider.notice()
-    return notice.kind if notice else None
 
 
 amazon, google, azure = (
@@ -93,7 +89,8 @@ def test_amazon_announces_an_interruption_with_its_time(served: Metadata) -> Non
     assert notice.kind == Leaving.PREEMPTION
     assert notice.seconds == pytest.approx(120, abs=5)
     served.expired = True
-    assert kind_of(provider) == Leaving.PREEMPTION
+    again = provider.notice()
+    assert again is not None and again.kind == Leaving.PREEMPTION
     assert served.tokens == 2
     assert not provider.withdraws(Leaving.PREEMPTION)
 
@@ -173,54 +170,50 @@ def test_an_address_that_is_none_is_named(monkeypatch: pytest.MonkeyPatch, url: 
         detect()
 
 
-def wait_for(watch: Watch, seen: Leaving | None) -> LeaveNotice | None:
-    return watch.wait(seen, 60)
+@pytest.fixture
+def watch(served: Metadata) -> Iterator[Watch]:
+    with closing(Watch(look_s=0.01)) as watch:
+        yield watch
+
+
+def looks(served: Metadata, times: int) -> None:
+    """Waits until the service has been requested so often."""
+    last = len(served.requests) + times
+    while len(served.requests) < last:
+        served.looked.clear()
+        assert served.looked.wait(60)
 
 
 @azure
-def test_a_watch_reports_a_notice_and_that_it_is_withdrawn(served: Metadata) -> None:
-    watch = Watch(look_s=0.01)
-    try:
-        served.event("Preempt")
-        assert wait_for(watch, None) == LeaveNotice(Leaving.PREEMPTION, None)
-        served.event("Preempt", resources=())
-        assert wait_for(watch, Leaving.PREEMPTION) is None
-    finally:
-        watch.close()
+def test_a_watch_reports_a_notice_and_that_it_is_withdrawn(served: Metadata, watch: Watch) -> None:
+    served.event("Preempt")
+    assert watch.wait(None, 60) == LeaveNotice(Leaving.PREEMPTION, None)
+    served.event("Preempt", resources=())
+    assert watch.wait(Leaving.PREEMPTION, 60) is None
 
 
 @amazon
-def test_a_service_that_fails_withdraws_nothing(served: Metadata, monkeypatch: pytest.MonkeyPatch) -> None:
-    watch = Watch(look_s=0.01)
-    try:
-        served.values[REBALANCE] = "{}"
-        assert wait_for(watch, None) == LeaveNotice(Leaving.REBALANCE, None)
-        served.status = 503
-        served.looked.clear()
-        assert served.looked.wait(60)
-        before = len(served.requests)
-        while len(served.requests) < before + 5:
-            served.looked.clear()
-            assert served.looked.wait(60)
-        assert watch.notice() == LeaveNotice(Leaving.REBALANCE, None)
-        served.status = 0
-        del served.values[REBALANCE]
-        assert wait_for(watch, Leaving.REBALANCE) is None
-        served.spot(60)
-        found = wait_for(watch, None)
-        assert found is not None and found.kind == Leaving.PREEMPTION
-        served.values.clear()  # Amazon never withdraws that
-        before = len(served.requests)
-        while len(served.requests) < before + 5:
-            served.looked.clear()
-            assert served.looked.wait(60)
-        later = watch.notice()
-        assert later is not None and later.seconds is not None and found.seconds is not None
-        assert later.seconds < found.seconds
-        monkeypatch.setattr("panolog.orchestrator.resources.watch._SURVIVED_S", -1000.0)
-        assert wait_for(watch, Leaving.PREEMPTION) is None  # the machine was hibernated, and works again
-    finally:
-        watch.close()
+def test_a_service_that_fails_withdraws_nothing(
+    served: Metadata, watch: Watch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served.values[REBALANCE] = "{}"
+    assert watch.wait(None, 60) == LeaveNotice(Leaving.REBALANCE, None)
+    served.status = 503
+    looks(served, 6)
+    assert watch.notice() == LeaveNotice(Leaving.REBALANCE, None)
+    served.status = 0
+    del served.values[REBALANCE]
+    assert watch.wait(Leaving.REBALANCE, 60) is None
+    served.spot(60)
+    found = watch.wait(None, 60)
+    assert found is not None and found.kind == Leaving.PREEMPTION
+    served.values.clear()  # Amazon never withdraws that
+    looks(served, 5)
+    later = watch.notice()
+    assert later is not None and later.seconds is not None and found.seconds is not None
+    assert later.seconds < found.seconds
+    monkeypatch.setattr("panolog.orchestrator.resources.watch._SURVIVED_S", -1000.0)
+    assert watch.wait(Leaving.PREEMPTION, 60) is None  # the machine was hibernated, and works again
 
 
 def test_where_there_is_no_provider_the_thread_ends() -> None:

@@ -70,25 +70,22 @@ def test_a_free_gpu_is_used_whatever_the_others_do() -> None:
     assert where([block("one")], nodes, on_gpu("a", 0), on_gpu("b", 0)) == {"one": ("a", 1)}
 
 
-def test_the_longest_gets_the_fastest() -> None:
-    blocks = [block("short", 2, slowness=2), block("long", 3, slowness=2)]
-    assert where(blocks, [node("a", SLOW, FAST)]) == {"long": ("a", 1), "short": ("a", 0)}
-
-
-def test_a_slow_gpu_stays_free_where_a_busy_one_will_be_done_sooner() -> None:
+def test_the_longest_gets_the_fastest_and_a_slow_gpu_stays_free_where_a_busy_one_will_be_done_sooner() -> (
+    None
+):
     nodes = [node("a", SLOW, FAST)]
+    blocks = [block("short", 2, slowness=2), block("long", 3, slowness=2)]
+    assert where(blocks, nodes) == {"long": ("a", 1), "short": ("a", 0)}
     last = [block("last", 10, slowness=5)]
     assert where(last, nodes, on_gpu("a", 1, left=20)) == {}
     assert where(last, nodes, on_gpu("a", 1, left=45)) == {"last": ("a", 0)}
     assert where(last, nodes) == {"last": ("a", 1)}
 
 
-def test_a_block_goes_where_it_fits() -> None:
+def test_a_block_goes_where_it_fits_or_where_memory_is_unknown() -> None:
     blocks = [block("large", 1, gib=20), block("small", 9, gib=10)]
-    assert where(blocks, [node("a", SLOW, SLOW), node("b", FAST)]) == {
-        "large": ("b", 0),
-        "small": ("a", 0),
-    }
+    assert where(blocks, [node("a", SLOW, SLOW), node("b", FAST)]) == {"large": ("b", 0), "small": ("a", 0)}
+    assert where(blocks, [node("a", Gpu(), Gpu())]) == {"small": ("a", 0), "large": ("a", 1)}
 
 
 def test_small_blocks_share_a_gpu_once_each_gpu_has_one() -> None:
@@ -98,24 +95,14 @@ def test_small_blocks_share_a_gpu_once_each_gpu_has_one() -> None:
         (str(i), i % 2, 0.25, 6 * GIB, 1.0) for i in range(8)
     ]
     assert {p.kind for _, p in placed} == {"1/4 fast"}
-
-
-def test_nobody_shares_a_gpu_with_more_than_three_others() -> None:
     tiny = [block(str(i), gib=0.5) for i in range(9)]
-    assert len(place(tiny, [node("a", FAST)], [], cuda=True)) == 4
+    assert len(place(tiny, [node("a", FAST)], [], cuda=True)) == 4  # no more share one
 
 
 def test_a_gpu_that_has_room_for_one_more_takes_one_more() -> None:
     half = on_gpu("a", 0, gpus=0.5)
     assert where([block("x", gib=10), block("y", gib=10)], [node("a", FAST)], half) == {"x": ("a", 0)}
     assert where([block("x", gib=13)], [node("a", FAST)], half) == {}
-
-
-def test_the_memory_of_a_gpu_may_be_unknown() -> None:
-    assert where([block("x", gib=10), block("y")], [node("a", Gpu(), Gpu())]) == {
-        "x": ("a", 0),
-        "y": ("a", 1),
-    }
 
 
 @pytest.mark.parametrize("cuda", [True, False])
@@ -191,7 +178,7 @@ def test_what_runs_keeps_its_cores_and_memory() -> None:
     assert cores([block("x", gib=5), block("y", gib=1)], nodes, on_cpu("a", 2, gib=7)) == {"y": ("a", 2)}
 
 
-def test_who_ran_out_of_memory_gets_a_node_to_itself() -> None:
+def test_a_node_is_given_to_one_alone_that_ran_out_of_memory() -> None:
     nodes = [node("a", cpus=4), node("b", cpus=4)]
     hungry = block("hungry", gib=1, alone=True)
     assert cores([hungry, block("x", gib=1)], nodes) == {"hungry": ("a", 4), "x": ("b", 4)}
@@ -201,18 +188,11 @@ def test_who_ran_out_of_memory_gets_a_node_to_itself() -> None:
 # Nodes on which a task has failed
 
 
-def test_a_task_avoids_the_node_on_which_it_has_failed() -> None:
+def test_a_task_avoids_the_node_on_which_it_has_failed_and_waits_a_little_for_another() -> None:
     nodes = [node("a", SLOW), node("b", SLOW)]
-    assert where([block("one", avoid={"a": 1})], nodes) == {"one": ("b", 0)}
-    assert where([block("one", 9, avoid={"a": 1}), block("two")], nodes) == {
-        "one": ("b", 0),
-        "two": ("a", 0),
-    }
-
-
-def test_a_task_waits_a_little_for_another_node() -> None:
-    nodes = [node("a", SLOW), node("b", SLOW)]
-    one = block("one", avoid={"a": 1})
+    one = block("one", 9, avoid={"a": 1})
+    assert where([one, block("two")], nodes) == {"one": ("b", 0), "two": ("a", 0)}
+    assert where([block("one", alone=True, avoid={"a": 1})], nodes) == {"one": ("b", 0)}
     assert where([one], nodes, on_gpu("b", 0, left=500)) == {}
     assert where([one], nodes, on_gpu("b", 0, left=5_000)) == {"one": ("a", 0)}
     assert where([one], nodes[:1]) == {"one": ("a", 0)}
@@ -226,11 +206,6 @@ def test_where_it_has_failed_everywhere_a_task_starts_where_it_did_so_least() ->
     assert where([one], gpus) == {"one": ("b", 0)}
     assert cores([one], cpus) == {"one": ("b", 2)}
     assert cores([one], cpus, on_cpu("b", 2)) == {}
-
-
-def test_a_task_that_must_be_alone_avoids_a_node_too() -> None:
-    nodes = [node("a", FAST), node("b", SLOW)]
-    assert where([block("one", alone=True, avoid={"a": 1})], nodes) == {"one": ("b", 0)}
 
 
 def test_on_cpus_a_task_avoids_a_node_too() -> None:

@@ -1,6 +1,7 @@
 """How many machines a stage gets, from which group, and which of those requested still count."""
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 
 import pytest
 
@@ -63,32 +64,29 @@ def test_the_starts_of_machines_cost_a_tenth_of_the_work_at_most(hours: float, c
     assert count == 1 or count * (STARTUP_S + IDLE_S) <= 0.1 * hours * HOUR
 
 
-def test_those_that_are_there_or_joining_count() -> None:
-    there = [node("a"), node("b")]
-    members = {"a": "small", "b": "small"}
-    busy = [on(machine, HOUR) for machine in there]
-    assert scaling(members=members).wanted(work(2, HOUR), busy, there) == {"small": 2}
-    assert scaling(members=members).wanted(work(2, HOUR), (), there) == {}
-    assert scaling(members=members, joining=2).wanted(work(2, HOUR), busy, there) == {}
-
-
-def test_a_machine_that_is_free_soon_is_sooner_than_a_new_one() -> None:
-    there = [node("a")]
-    assert scaling().wanted(work(1, HOUR), [on(there[0], 60)], there) == {}
-    assert scaling().wanted(work(1, HOUR), [on(there[0], HOUR)], there) == {"small": 1}
-
-
-def test_no_more_than_the_group_has() -> None:
-    there = [node(str(i)) for i in range(7)]
-    members = {machine.id: "small" for machine in there}
-    busy = [on(machine, HOUR) for machine in there]
-    assert scaling(members=members).wanted(work(8, HOUR), busy, there) == {"small": 1}
+@pytest.mark.parametrize(
+    ("there", "left", "joining", "tasks", "wanted"),
+    [
+        (2, HOUR, 0, 2, {"small": 2}),
+        (2, 0, 0, 2, {}),  # they are free
+        (2, HOUR, 2, 2, {}),
+        (1, 60, 0, 1, {}),  # it is free sooner than a new one would be
+        (7, HOUR, 0, 8, {"small": 1}),  # the group has no more
+    ],
+)
+def test_those_that_are_there_or_joining_count(
+    there: int, left: float, joining: int, tasks: int, wanted: dict[str, int]
+) -> None:
+    nodes = [node(str(i)) for i in range(there)]
+    members, busy = {machine.id: "small" for machine in nodes}, [on(m, left) for m in nodes if left]
+    assert scaling(members=members, joining=joining).wanted(work(tasks, HOUR), busy, nodes) == wanted
 
 
 def test_a_task_that_fits_on_nothing_there_gets_a_larger_machine() -> None:
     there = [node("a")]
     assert scaling([SMALL, LARGE]).wanted(work(1, 60, memory=40), (), there) == {"large": 1}
     assert scaling([SMALL, LARGE]).wanted(work(1, 60, memory=12), (), there) == {}
+    assert scaling([LARGE, SMALL]).wanted(work(1, HOUR), (), ()) == {"small": 1}  # no price: the smallest
 
 
 def test_the_cheapest_group_that_fits_is_taken_and_then_the_next() -> None:
@@ -99,10 +97,6 @@ def test_the_cheapest_group_that_fits_is_taken_and_then_the_next() -> None:
     later = scaling([demand, spot], spot=0.4, demand=1.2)
     assert later.wanted(work(4, HOUR), (), (), without={"spot"}) == {"demand": 4}
     assert later.wanted(work(4, HOUR), (), (), without={"spot", "demand"}) == found
-
-
-def test_without_a_price_the_smallest_that_fits_is_taken() -> None:
-    assert scaling([LARGE, SMALL]).wanted(work(1, HOUR), (), ()) == {"small": 1}
 
 
 def test_groups_without_what_tasks_need_are_none() -> None:
@@ -155,7 +149,7 @@ def test_how_long_machines_take_is_learnt() -> None:
     assert not expected.since
 
 
-def test_a_group_that_gives_none_is_replaced_by_the_next() -> None:
+def test_a_group_that_gives_none_is_replaced_by_the_next_until_it_gives_one_or_for_half_an_hour() -> None:
     clock = SetClock()
     expected, growth = Expected(clock), Growth((SMALL, LARGE))
     assert decide(expected, growth, work(1, HOUR)).wanted == {"small": 1}
@@ -163,23 +157,9 @@ def test_a_group_that_gives_none_is_replaced_by_the_next() -> None:
     assert decide(expected, growth, work(1, HOUR)).wanted == {"large": 1}
     clock.now += 10
     assert decide(expected, growth, work(1, HOUR)).wanted == {"large": 1}
+    again = deepcopy(expected), Growth((SMALL, LARGE), {"a": "small"})  # it gives one again
+    assert decide(*again, work(4, HOUR)).wanted == {"small": 4}
     clock.now += 1800
     assert decide(expected, growth, work(1, HOUR)).wanted == {"small": 1}
-
-
-def test_a_group_that_gives_a_machine_again_is_taken_again() -> None:
-    clock = SetClock()
-    expected, growth = Expected(clock), Growth((SMALL, LARGE))
-    decide(expected, growth, work(1, HOUR))
-    clock.now += 601
-    decide(expected, growth, work(1, HOUR))
-    came = Growth((SMALL, LARGE), {"a": "small"})
-    busy = decide(expected, came, work(4, HOUR), [])
-    assert busy.wanted == {"small": 4}
-
-
-def test_requests_end_with_the_tasks() -> None:
-    expected = Expected(SetClock())
-    decide(expected, Growth((SMALL,)), work(2, HOUR))
-    assert decide(expected, Growth((SMALL,)), Work((), ())).wanted == {}
+    assert decide(expected, growth, Work((), ())).wanted == {}
     assert not expected.since

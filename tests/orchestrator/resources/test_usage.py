@@ -22,6 +22,7 @@ from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.run_view import view_run
 from panolog.workers.events import Event
 from panolog.workers.specs import TaskSpec
+from tests.nvidia_smi import print_gpus
 from tests.orchestrator.fakes import Harness, well
 
 MIB = 2**20
@@ -31,17 +32,14 @@ LISTING = "NVIDIA H100, 87, 40000, 81559\nNVIDIA H100 MIG, [N/A], [N/A], 9856\n"
 
 
 def test_this_machine_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program = tmp_path / "nvidia-smi"
-    program.write_text(f"#!/bin/sh\necho '{LISTING}'\n")
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path))
+    listing = print_gpus(tmp_path, monkeypatch, LISTING)
     usage = measure()
     assert usage.node == socket.gethostname()
     assert 0 <= usage.cpu <= 1
     assert 0 < usage.memory_used < usage.memory_total
     assert 0 < usage.disk_used < usage.disk_total
     assert usage.gpus == (GPU, GpuUsage("NVIDIA H100 MIG", None, None, 9856 * MIB))
-    program.unlink()
+    listing.unlink()  # the program fails
     assert measure().gpus == ()
 
 

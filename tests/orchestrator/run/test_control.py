@@ -4,12 +4,10 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
-from panolog.orchestrator.driver.policy import outcome, ready
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.control import Action, ControlRequest, answer, refusal
 from panolog.orchestrator.run.folder import RunFolder
@@ -17,7 +15,6 @@ from panolog.orchestrator.run.records import (
     BlockPlan,
     Failure,
     Merged,
-    ModelSaved,
     NodeQuarantined,
     NodeReleased,
     Noticed,
@@ -26,15 +23,12 @@ from panolog.orchestrator.run.records import (
     PlanSaved,
     Record,
     RetryRequested,
-    RunBegan,
     ScoresSaved,
-    Stored,
     TaskFailed,
-    TaskStarted,
     TaskYielded,
     UnpauseRequested,
 )
-from panolog.orchestrator.run.state import RunState, Status, replay
+from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.views.summary import summarize
 from panolog.scene.errors import InputError
 from panolog.workers.events import Checkpoint, Event, Progress
@@ -42,6 +36,7 @@ from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
 from tests.orchestrator.fakes import DIED, CrashError, Harness, well
+from tests.orchestrator.history import AGAIN, after, model, started
 
 ZERO, ONE = TaskId.block(0), TaskId.block(1)
 
@@ -71,23 +66,9 @@ def test_requests_are_taken_once_and_in_order(folder: RunFolder) -> None:
     assert list(folder.control.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("action", "block"),
-    [
-        ("explode", None),
-        (None, 1),
-        (Action.PAUSE, None),
-        (Action.PAUSE, -1),
-        (Action.RETRY, "1"),
-        (Action.RETRY, True),
-        (Action.STOP, 1),
-        (Action.RELEASE, None),
-        (Action.RELEASE, 1),
-    ],
-)
-def test_what_says_nothing_cannot_be_asked(folder: RunFolder, action: Any, block: Any) -> None:
-    with pytest.raises(InputError):
-        control.send(folder, action, block)
+def test_what_says_nothing_is_not_sent(folder: RunFolder) -> None:
+    with pytest.raises(InputError, match="needs the number of a block"):
+        control.send(folder, Action.PAUSE)
     assert control.take(folder) == []
 
 
@@ -98,10 +79,17 @@ def test_what_says_nothing_cannot_be_asked(folder: RunFolder, action: Any, block
         b"{",
         b"[]",
         b"\xff\xfe",
+        b'{"block": 1}',
         b'{"action": "pause"}',
         b'{"action": "stop", "path": "/etc"}',
+        b'{"action": "stop", "block": 1}',
         b'{"action": "\\ud800", "block": 1}',
         b'{"action": "pause", "block": 1.0}',
+        b'{"action": "pause", "block": -1}',
+        b'{"action": "retry", "block": "1"}',
+        b'{"action": "retry", "block": true}',
+        b'{"action": "release"}',
+        b'{"action": "release", "block": 1}',
         b'{"action": "release", "node": 7}',
         b'{"action": "release", "node": "a/../b"}',
         b'{"action": "release", "node": "\\ud800"}',
@@ -160,20 +148,16 @@ def test_who_may_ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 BLOCKS = tuple(BlockPlan(b, cameras=4, gaussians=100 + b, train=b != 2) for b in range(3))
 PLANNED: list[Record] = [
-    ModelSaved(COARSE, "model.ply", 1, 1, 1, 1.0),
+    model(COARSE),
     ScoresSaved(TaskId.shard(0), "a", 1),
     PlanSaved("plan.json", BLOCKS),
 ]
-STARTED = TaskStarted(ZERO, 1, 0, "node", 7, "cpu", 1)
+STARTED = started(ZERO)
 FAILED_FOR_GOOD = TaskFailed(ZERO, 3, "NaN", final=True)
 
 
-def model(task: TaskId) -> ModelSaved:
-    return ModelSaved(task, "model.ply", 1, 1, 1, 1.0)
-
-
 def planned(*records: Record) -> RunState:
-    return replay(Stored(i, float(i), record) for i, record in enumerate([*PLANNED, *records]))
+    return after(*PLANNED, *records)
 
 
 def status(*records: Record) -> str:
@@ -189,28 +173,16 @@ def test_a_paused_block_waits_until_it_is_let_go() -> None:
     assert status(STARTED, PauseRequested(ZERO), UnpauseRequested(ZERO), TaskYielded(ZERO)) == Status.WAITING
     lost = TaskFailed(ZERO, 1, "gone", final=False, kind=Failure.LOST)
     assert status(STARTED, PauseRequested(ZERO), lost) == Status.PAUSED
+    done = planned(STARTED, PauseRequested(ZERO), model(ZERO))  # before it has heard of it
+    assert (done.status(ZERO), done.held_blocks()) == (Status.DONE, ())
 
 
 def test_a_pause_survives_the_driver() -> None:
-    again = RunBegan("host", 2, resumed=True)
-    assert status(PauseRequested(ZERO), again) == Status.PAUSED
-    assert status(STARTED, PauseRequested(ZERO), again) == Status.PAUSED
-    shown = summarize(planned(STARTED, PauseRequested(ZERO)), running=False).model_dump(mode="json")
-    assert shown["paused"] == [0]
-    assert {task["name"]: task["status"] for task in shown["tasks"]}[str(ZERO)] == Status.PAUSED
-
-
-def test_a_block_that_ends_before_it_hears_of_its_pause_is_done() -> None:
-    state = planned(STARTED, PauseRequested(ZERO), model(ZERO))
-    assert (state.status(ZERO), state.held_blocks()) == (Status.DONE, ())
-
-
-def test_a_run_goes_on_with_the_rest_and_waits_for_paused_blocks() -> None:
-    state = planned(PauseRequested(ZERO))
-    assert ready(state, shards=1, refine=True) == (ONE,)
-    state = planned(PauseRequested(ZERO), model(ONE))
-    assert ready(state, shards=1, refine=True) == ()
-    assert outcome(state, shards=1, refine=True) is None
+    assert status(PauseRequested(ZERO), AGAIN) == Status.PAUSED
+    assert status(STARTED, PauseRequested(ZERO), AGAIN) == Status.PAUSED
+    shown = summarize(planned(STARTED, PauseRequested(ZERO)), running=False)
+    assert shown.paused == (0,)
+    assert {task.name: task.status for task in shown.tasks}[str(ZERO)] == Status.PAUSED
 
 
 def test_a_retry_gives_all_attempts_again() -> None:
@@ -242,13 +214,6 @@ def test_what_makes_no_sense_is_refused_with_a_reason() -> None:
     assert no(ControlRequest(Action.RETRY, 0), TaskFailed(ZERO, 1, "NaN", final=False)) is None
     merged = Merged("point_cloud.ply", 1, 0, 1, 1.0)
     assert "resume the run after its end" in str(no(ControlRequest(Action.RETRY, 0), FAILED_FOR_GOOD, merged))
-
-
-def test_an_answer_is_the_record_or_a_notice() -> None:
-    assert answer(planned(), ControlRequest(Action.PAUSE, 1)) == [PauseRequested(ONE)]
-    assert answer(planned(), ControlRequest(Action.UNPAUSE, 1)) == [
-        Noticed(Part.CONTROL, "unpause block 1: it is not paused")
-    ]
 
 
 def test_a_machine_in_quarantine_is_released_by_its_host_or_the_begin_of_its_id() -> None:
@@ -304,21 +269,26 @@ def when_others_are_done(harness: Listening, action: str, block: int) -> None:
     harness.pool.when_waiting(once)
 
 
-def test_a_block_is_paused_and_unpaused(listening: Listening) -> None:
+@pytest.mark.parametrize("dies", [False, True])
+def test_a_block_is_paused_and_unpaused(listening: Listening, dies: bool) -> None:
+    """If it dies meanwhile, its failure counts, but it is not started again until a user requests it."""
+
     def script(spec: TaskSpec) -> Iterator[Event]:
         if spec.task == ONE and listening.tasks.count(ONE) == 1:
             listening.send(Action.PAUSE, 1)
             when_others_are_done(listening, Action.UNPAUSE, 1)
+            yield Progress(spec.task, 1, 2, 1.0)
+            if dies:
+                raise CrashError(DIED)
         yield from listening.trains(spec)
 
     assert listening.drive(script).outcome == "done"
-    assert listening.yielded == [ONE]
+    assert listening.yielded == ([] if dies else [ONE])
     assert listening.tasks[-2:] == [ONE, EVAL]
-    first, second = listening.trainings(ONE)
-    assert first.checkpoint is None
-    assert second.checkpoint == CheckpointFile(listening.folder.checkpoint(ONE))
+    checkpoint = CheckpointFile(listening.folder.checkpoint(ONE))
+    assert [spec.checkpoint for spec in listening.trainings(ONE)] == [None, None if dies else checkpoint]
     task = listening.state.task(ONE)
-    assert (task.retries, task.reasons, task.held) == (0, (), False)
+    assert (task.retries, task.reasons, task.held) == (dies, (DIED.reason,) * dies, False)
 
 
 def test_a_failed_block_is_retried_while_another_trains(listening: Listening) -> None:
@@ -338,8 +308,11 @@ def test_a_failed_block_is_retried_while_another_trains(listening: Listening) ->
     assert listening.records(RetryRequested) == [RetryRequested(ONE)]
 
 
-def test_stop_is_a_remote_ctrl_c(listening: Listening) -> None:
+def test_stop_is_a_remote_ctrl_c_and_what_cannot_be_done_is_said(listening: Listening) -> None:
     def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == COARSE:
+            listening.send(Action.RETRY, 0)
+            put(listening.folder, "2.json", json.dumps({"action": "rm"}).encode())
         if spec.task == ONE:
             listening.send(Action.STOP)
         yield from listening.trains(spec)
@@ -348,39 +321,12 @@ def test_stop_is_a_remote_ctrl_c(listening: Listening) -> None:
         listening.drive(script)
     assert sorted(listening.yielded) == [ZERO, ONE]
     state = listening.state
-    assert (state.outcome, state.status(ZERO), state.status(ONE)) == (
+    assert [state.outcome, state.status(ZERO), state.status(ONE)] == [
         "interrupted",
-        Status.WAITING,
-        Status.WAITING,
-    )
-    assert listening.drive(listening.trains, resumed=True).outcome == "done"
-
-
-def test_what_cannot_be_done_is_said_and_the_run_goes_on(listening: Listening) -> None:
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == COARSE:
-            listening.send(Action.RETRY, 0)
-            put(listening.folder, "2.json", json.dumps({"action": "rm"}).encode())
-        yield from listening.trains(spec, 3)
-
-    assert listening.drive(script).outcome == "done"
-    assert [notice.message for notice in listening.state.notices if notice.task == Part.CONTROL] == [
+        *[Status.WAITING] * 2,
+    ]
+    assert [notice.message for notice in state.notices if notice.task == Part.CONTROL] == [
         "retry block 0: there are no blocks yet",
         "control/'2.json' is not a request: 'rm' is none of stop, pause, unpause, retry, release",
     ]
-
-
-def test_a_failing_block_that_is_paused_does_not_fail_the_run(listening: Listening) -> None:
-    """Its failure counts, but it is not started again until a user requests it."""
-
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == ONE and listening.tasks.count(ONE) == 1:
-            listening.send(Action.PAUSE, 1)
-            when_others_are_done(listening, Action.UNPAUSE, 1)
-            yield Progress(spec.task, 1, 2, 1.0)
-            raise CrashError(DIED)
-        yield from listening.trains(spec)
-
-    assert listening.drive(script).outcome == "done"
-    assert listening.state.task(ONE).retries == 1
-    assert listening.tasks[-2:] == [ONE, EVAL]
+    assert listening.drive(listening.trains, resumed=True).outcome == "done"

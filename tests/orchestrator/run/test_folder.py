@@ -10,7 +10,6 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef, check_output, make_info, read_info, write_info
 from panolog.scene.errors import InputError
-from panolog.workers.tasks import COARSE, TaskId
 
 SCENE = SceneRef(path="/scene", fingerprint="f")
 
@@ -41,13 +40,6 @@ def test_a_run_needs_no_version_of_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(info, "version", version)
     versions = make_info(SCENE, RunConfig()).versions
     assert versions["torch"] == "1.0" and "ray" not in versions
-
-
-def test_every_task_has_its_place(folder: RunFolder) -> None:
-    assert folder.relative(folder.checkpoint(COARSE)) == "coarse/checkpoint.safetensors"
-    assert folder.relative(folder.model(TaskId.block(7))) == "blocks/007/model.ply"
-    assert folder.relative(folder.shard(TaskId.shard(3))) == "partition/scores/003.npz"
-    assert folder.relative(folder.shard(TaskId.measure(3))) == "eval/shards/003.json"
 
 
 def test_a_new_or_empty_folder_will_do(tmp_path: Path) -> None:

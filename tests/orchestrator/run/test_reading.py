@@ -18,6 +18,7 @@ from panolog.orchestrator.run.records import Noticed
 from panolog.orchestrator.run.store import Database, read_records
 from panolog.scene.errors import InputError
 from panolog.workers.tasks import COARSE
+from tests.orchestrator.fakes import SetClock
 
 # A writer that is killed between the first changed page and its commit.
 _KILLED = """
@@ -71,10 +72,12 @@ def test_a_reader_rolls_it_back_in_place(dead: Path, monkeypatch: pytest.MonkeyP
 def test_a_reader_leaves_it_to_a_driver_that_starts(dead: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reading, "copyfile", refused)
 
-    def start(_: float) -> None:
-        Database(dead).close()
+    class Starting(SetClock):
+        def sleep(self, seconds: float) -> None:
+            super().sleep(seconds)
+            Database(dead).close()
 
-    monkeypatch.setattr("panolog.orchestrator.run.reading.time.sleep", start)
+    monkeypatch.setattr(reading, "time", Starting())
     with lock.hold(dead.with_name("lock")):
         assert messages(dead) == MESSAGES
 

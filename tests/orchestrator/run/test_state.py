@@ -9,7 +9,6 @@ from panolog.orchestrator.run.records import (
     Leaving,
     MeasuresSaved,
     Merged,
-    ModelSaved,
     NodeLeaving,
     NodeLeft,
     NodeQuarantined,
@@ -26,38 +25,21 @@ from panolog.orchestrator.run.records import (
     Progressed,
     Record,
     RetryRequested,
-    RunBegan,
     RunEnded,
     ScoresSaved,
     SeamEvaluated,
     Stored,
     TaskFailed,
-    TaskStarted,
     TaskYielded,
     UnpauseRequested,
     ViewEvaluated,
 )
-from panolog.orchestrator.run.state import RunState, Status, replay
+from panolog.orchestrator.run.state import Status, replay
 from panolog.orchestrator.run.store import from_json, to_json
 from panolog.orchestrator.views.summary import stage_of, summarize
 from panolog.scene.errors import InputError
-from panolog.workers.tasks import COARSE, EVAL, MERGE, TaskId
-
-BEGAN = RunBegan("host", 1, resumed=False)
-AGAIN = RunBegan("host", 2, resumed=True)
-
-
-def started(task: TaskId, attempt: int = 1) -> TaskStarted:
-    return TaskStarted(task, attempt, 0, "node", 7, "cpu", 1)
-
-
-def model(task: TaskId) -> ModelSaved:
-    return ModelSaved(task, f"{task}/model.ply", 10, 100, 30, 1.5)
-
-
-def after(*records: Record) -> RunState:
-    return replay(Stored(i, float(i), record) for i, record in enumerate(records, 1))
-
+from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.history import AGAIN, BEGAN, after, model, started
 
 EVERY_RECORD: list[Record] = [
     BEGAN,
@@ -95,17 +77,14 @@ def test_records_survive_json(record: Record) -> None:
     assert from_json(type(record).__name__, to_json(record)) == record
 
 
-def test_a_task_goes_from_waiting_to_running_to_done() -> None:
-    assert after(BEGAN).status(COARSE) == Status.WAITING
-    assert after(BEGAN, started(COARSE)).status(COARSE) == Status.RUNNING
-    done = after(BEGAN, started(COARSE), CheckpointSaved(COARSE, 20, "p", 1), model(COARSE)).task(COARSE)
+def test_a_task_waits_and_runs_until_it_is_done_or_a_failure_is_final() -> None:
+    begun = [BEGAN, started(COARSE)]
+    assert (after(BEGAN).status(COARSE), after(*begun).status(COARSE)) == (Status.WAITING, Status.RUNNING)
+    done = after(*begun, CheckpointSaved(COARSE, 20, "p", 1), model(COARSE)).task(COARSE)
     assert (done.status, done.checkpoint, done.seconds) == (Status.DONE, 20, 1.5)
-
-
-def test_a_failed_attempt_waits_again_until_it_is_final() -> None:
-    once = after(started(COARSE), TaskFailed(COARSE, 1, "worker died", final=False)).task(COARSE)
+    once = after(*begun, TaskFailed(COARSE, 1, "worker died", final=False)).task(COARSE)
     assert (once.status, once.retries, once.reasons) == (Status.WAITING, 1, ("worker died",))
-    twice = after(started(COARSE, 2), TaskFailed(COARSE, 2, "again", final=True)).task(COARSE)
+    twice = after(started(COARSE, attempt=2), TaskFailed(COARSE, 2, "again", final=True)).task(COARSE)
     assert (twice.status, twice.attempts) == (Status.FAILED, 2)
 
 
@@ -124,18 +103,10 @@ def test_another_driver_takes_over_what_ran_and_retries_what_failed() -> None:
     assert (state.outcome, state.reason) == (None, "")
 
 
-def test_a_new_model_outdates_merge_and_metrics() -> None:
-    merged = Merged("point_cloud.ply", 10, 2, 100, 0.1)
-    state = after(merged, EvaluationSaved("eval/metrics.json", {"psnr": 20.0}), model(TaskId.block(1)))
-    assert (state.status(MERGE), state.status(EVAL)) == (Status.WAITING, Status.WAITING)
-    assert (state.merged, state.metrics) == (None, None)
-
-
-def test_repeated_notices_are_kept_once() -> None:
+def test_notices_are_kept_once_and_ten_thousand_are_not_compared_with_each_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert len(after(*[Noticed(COARSE, "a")] * 2, Noticed(COARSE, "b")).notices) == 2
-
-
-def test_ten_thousand_notices_are_compared_with_none_of_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     compared = 0
 
     def equal(one: Noticed, other: object) -> bool:
@@ -171,41 +142,26 @@ def test_only_the_last_progress_of_each_task_matters(history: list[tuple[int, Ta
 def test_summary_names_stage_status_and_time_left() -> None:
     expected = PreflightSaved("preflight.json", {"coarse": 30.0})
     state = after(BEGAN, expected, started(COARSE), Progressed(COARSE, 25, 100, 5.0, loss=0.1))
-    shown = summarize(state, running=True, now=11.0).model_dump(mode="json")
-    assert (shown["status"], shown["stage"], shown["eta"], shown["seconds"]) == (
-        "running",
-        "coarse",
-        15.0,
-        10.0,
-    )
-    assert shown["tasks"][0]["status"] == Status.RUNNING
-    killed = summarize(state, running=False, now=11.0).model_dump(mode="json")
-    assert (killed["status"], killed["stage"], killed["eta"], killed["seconds"]) == (
+    shown = summarize(state, running=True, now=11.0)
+    assert (shown.status, shown.label, shown.stage, shown.eta) == ("running", "running", "coarse", 15.0)
+    assert (shown.seconds, shown.tasks[0].status) == (10.0, Status.RUNNING)
+    killed = summarize(state, running=False, now=11.0)
+    assert (killed.status, killed.label, killed.stage, killed.eta) == (
         "stopped",
+        "driver lost",
         "coarse",
         None,
-        3,
     )
-    assert (killed["tasks"][0]["status"], killed["tasks"][0]["eta"]) == (Status.WAITING, None)
+    assert (killed.seconds, killed.tasks[0].status, killed.tasks[0].eta) == (3, Status.WAITING, None)
     assert stage_of(after(model(COARSE), started(TaskId.shard(0)))) == "score"
     assert stage_of(after(model(COARSE), RunEnded(Outcome.DONE))) == "done"
-
-
-@pytest.mark.parametrize(
-    ("records", "running", "status", "label"),
-    [
-        ([BEGAN], True, "running", "running"),
-        ([BEGAN], False, "stopped", "driver lost"),
-        ([BEGAN, RunEnded(Outcome.INTERRUPTED)], False, "interrupted", "stopped"),
-        ([BEGAN, RunEnded(Outcome.FAILED, "no")], False, "failed", "failed"),
-        ([BEGAN, RunEnded(Outcome.DONE)], False, "done", "done"),
-    ],
-)
-def test_a_status_has_a_label_for_people(
-    records: list[Record], running: bool, status: str, label: str
-) -> None:
-    shown = summarize(after(*records), running=running)
-    assert (shown.status, shown.label) == (status, label)
+    for outcome, label in (
+        (Outcome.INTERRUPTED, "stopped"),
+        (Outcome.FAILED, "failed"),
+        (Outcome.DONE, "done"),
+    ):
+        ended = summarize(after(BEGAN, RunEnded(outcome)), running=False)
+        assert (ended.status, ended.label) == (outcome, label)
 
 
 def test_gaussians_in_training_and_gaussians_that_are_kept_are_different_numbers() -> None:

@@ -1,19 +1,8 @@
 from itertools import pairwise
 
-from panolog.orchestrator.run.thinning import DENSE, PREVIEWS, interval, most_stored, surplus
+from panolog.orchestrator.run.thinning import PREVIEWS, surplus
 
 DAY = 86_400.0
-
-
-def test_three_days_of_progress_are_some_hundred_records() -> None:
-    assert most_stored(60) < 2 * DENSE
-    assert most_stored(3 * DAY) < 600
-    stored, last, now = 0, 0.0, 0.0
-    while now < 3 * DAY:
-        if now - last >= interval(stored):
-            stored, last = stored + 1, now
-        now += 1.0
-    assert 400 < stored <= most_stored(3 * DAY)
 
 
 def test_previews_are_the_first_the_latest_and_some_evenly_between() -> None:
