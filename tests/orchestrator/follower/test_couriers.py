@@ -15,7 +15,6 @@ from panolog.orchestrator.follower.sending import Refusal
 from panolog.orchestrator.follower.targets import Target
 from panolog.scene.files import write_bytes
 from tests.orchestrator.fakes import SetClock
-from tests.ray_head import wait_until
 
 TARGET = Target("webhook", "label", "http://127.0.0.1:1/")
 LATER, NEVER = Refusal("HTTP 503", final=False), Refusal("HTTP 404", final=True)
@@ -71,7 +70,7 @@ def test_what_is_refused_for_good_is_given_up_and_said(tmp_path: Path) -> None:
     assert again.tried == []
 
 
-def test_the_end_of_the_run_ends_a_pause(tmp_path: Path) -> None:
+def test_news_of_a_live_run_are_sent_at_once_and_its_end_ends_a_pause(tmp_path: Path) -> None:
     """A target that wants an hour's rest is tried again at once: little time is left."""
     board, post = Board(), Post([replace(LATER, after=3600.0)])
     board.publish(News("run", 0, (notice(1),)))
@@ -160,19 +159,3 @@ def test_what_could_not_be_noted_on_a_full_disk_is_noted_with_the_next(
     assert post.taken == ["r-preempted-1", "r-preempted-2"]
     deliver(tmp_path, post := Post(), notice(1), notice(2))
     assert post.tried == []
-
-
-def test_news_of_a_live_run_are_delivered_as_they_come(tmp_path: Path) -> None:
-    board, post = Board(), Post()
-    courier = Courier(TARGET, board, tmp_path / "ledger.json", post)
-    courier.start()
-    first, second, third = (notice(number) for number in (1, 2, 3))
-    try:
-        board.publish(News("run", 0, (first,)))
-        wait_until(lambda: post.taken == [first.id], "the first")
-        board.publish(News("run", 0, (first, second)))
-        wait_until(lambda: post.taken == [first.id, second.id], "the second")
-    finally:
-        board.publish(News("run", 0, (first, second, third), ended=True), WHOLE_RUN)
-        courier.join(120)
-    assert post.taken == [first.id, second.id, third.id]

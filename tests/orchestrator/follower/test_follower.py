@@ -196,15 +196,19 @@ def test_a_target_that_hangs_neither_holds_up_the_others_nor_the_run_for_ever(
         assert problems.result(240) == []
 
 
-def test_a_follower_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("does", "code"), [("sleep 1000", -9), ("false", 1)])
+def test_a_follower_that_does_not_end_or_cannot_work_is_said_and_ends_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, does: str, code: int
+) -> None:
     program, said = tmp_path / "python", list[str]()
-    program.write_text("#!/bin/sh\nexec sleep 1000\n")
+    program.write_text(f"#!/bin/sh\nexec {does}\n")
     program.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(program))
-    monkeypatch.setattr("panolog.orchestrator.commands.companion._FOLLOWER_S", 0.1)
+    if code < 0:
+        monkeypatch.setattr("panolog.orchestrator.commands.companion._FOLLOWER_S", 0.1)
     with receiver() as server, companion_follower(tmp_path / "run", plan_of(server), said.append):
         pass
-    assert said == ["the follower has ended early (code -9): not all may be delivered"]
+    assert said == [f"the follower has ended early (code {code}): not all may be delivered"]
 
 
 def test_what_was_not_delivered_is_said_without_a_secret(tmp_path: Path) -> None:
@@ -212,21 +216,6 @@ def test_what_was_not_delivered_is_said_without_a_secret(tmp_path: Path) -> None
     with receiver([404]) as server, companion_follower(tmp_path / "run", plan_of(server), said.append):
         histories.write(tmp_path / "run")
     assert said == ["notify hook: the server answers HTTP 404; not delivered: done"]
-
-
-def test_a_plan_without_anything_starts_no_process(tmp_path: Path) -> None:
-    with companion_follower(tmp_path, Plan(), print):
-        assert living(FOLLOWER) == []
-
-
-def test_a_follower_that_cannot_work_is_said_and_ends_no_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "executable", "/bin/false")
-    said: list[str] = []
-    with receiver() as server, companion_follower(tmp_path / "run", plan_of(server), said.append):
-        pass
-    assert said == ["the follower has ended early (code 1): not all may be delivered"]
 
 
 def test_an_error_that_nothing_foresees_ends_one_thread_alone(

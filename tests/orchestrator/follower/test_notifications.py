@@ -103,9 +103,18 @@ def test_a_driver_that_was_killed_is_a_failure_and_each_kill_one_of_its_own(run:
     assert first.id != second.id
 
 
-def test_a_run_that_its_user_stops_notifies_of_nothing(run: Run) -> None:
-    run.add(BEGAN, STARTED, RunEnded(Outcome.INTERRUPTED))
-    assert run.kinds(left=True) == []
+@pytest.mark.parametrize(
+    "records",
+    [
+        [BEGAN, STARTED, RunEnded(Outcome.INTERRUPTED)],  # by its user
+        [BEGAN, STARTED, PauseRequested(COARSE), TaskYielded(COARSE)],  # all that could happen is paused
+        [BEGAN],  # in its preflight
+    ],
+)
+def test_these_notify_of_nothing(run: Run, records: list[Record]) -> None:
+    run.add(*records)
+    interrupted = isinstance(records[-1], RunEnded)
+    assert run.kinds(left=interrupted, stalled=1e9 if interrupted else 0.0) == []
 
 
 def test_a_machine_that_leaves_is_one_notification_with_all_its_tasks(run: Run) -> None:
@@ -154,18 +163,6 @@ def test_a_run_that_waits_for_its_disk_says_so(run: Run, monkeypatch: pytest.Mon
     Presence(run.folder.presence).say("disk full, waiting: free 3 GiB")
     (stalled,) = run.news().notifications
     assert stalled.text.endswith(": disk full, waiting: free 3 GiB")
-
-
-def test_a_run_whose_blocks_a_user_has_paused_is_not_stalled(run: Run) -> None:
-    block = TaskId.block(0)
-    run.add(BEGAN, TaskStarted(block, 1, 0, "gpu1", 3, "cpu", 2), PauseRequested(block), TaskYielded(block))
-    assert run.kinds(stalled=0.0) == []
-
-
-def test_a_run_in_its_preflight_is_not_followed_yet(run: Run) -> None:
-    run.add(BEGAN)
-    assert run.news(stalled=0.0) == News()
-    assert run.news(left=True).run  # but its end is
 
 
 def test_a_folder_without_run_json_is_no_run(run: Run) -> None:

@@ -22,6 +22,7 @@ from panolog.orchestrator.follower.sinks.interface import Facts, Sink
 from panolog.orchestrator.follower.watcher import Watcher
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Outcome
+from panolog.orchestrator.run.state import ignore
 from tests.orchestrator.fakes import SetClock
 from tests.orchestrator.follower import histories
 from tests.orchestrator.follower.histories import Curves, expected
@@ -84,11 +85,15 @@ def follow(folder: RunFolder, make: Make, *, seconds: float = 1e6) -> Logger:
     return logger
 
 
-def each_driver(root: Path, make: Make) -> RunFolder:
-    """A run of three drivers, each with its follower."""
+def each_driver(root: Path, make: Make, again: Make | None = None) -> RunFolder:
+    """A run of three drivers, each with its follower, which is replaced where it is killed."""
     for number in range(3):
         folder = histories.write(root, number, number + 1)
-        follow(folder, make)
+        folder.report.write_text("report")
+        try:
+            follow(folder, make)
+        except Killed:
+            follow(folder, again or make)
     return folder
 
 
@@ -113,21 +118,9 @@ def test_a_follower_killed_or_refused_within_a_piece_adds_the_rest(
 ) -> None:
     sink = Memory()
     sink.fails = {call: error}
-    for number in range(3):
-        folder = histories.write(tmp_path / "run", number, number + 1)
-        try:
-            follow(folder, lambda: sink)
-        except Killed:
-            follow(folder, lambda: sink)
+    folder = each_driver(tmp_path / "run", lambda: sink)
     assert not sink.fails
     assert {key: sorted(curve) for key, curve in sink.curves.items()} == expected(folder)
-
-
-def test_a_follower_that_sees_only_the_end_has_the_same_curves(tmp_path: Path) -> None:
-    sink = Memory()
-    folder = histories.write(tmp_path / "run")
-    follow(folder, lambda: sink)
-    assert sink.curves == expected(folder)
 
 
 def test_a_piece_follows_the_settled_part_whatever_came_in_between(tmp_path: Path) -> None:
@@ -146,6 +139,24 @@ def test_a_sink_that_never_answers_leaves_the_time_limit(tmp_path: Path) -> None
     assert logger.problem == "not all was passed on: OSError"
 
 
+def dying(kind: Any, left: Callable[[Any], object] = ignore) -> Any:
+    """A kind of sink whose first one is killed in its third piece. Args: left, is called just before."""
+
+    class Dies(kind):  # type: ignore[misc]
+        died = False
+
+        def log(self, task: str, points: Sequence[Point]) -> None:
+            if Dies.died or task != "coarse" or points[0].iteration <= 20:
+                super().log(task, points)
+                return
+            Dies.died = True
+            super().log(task, points[: len(points) // 2])
+            left(self)
+            raise Killed
+
+    return Dies
+
+
 def of_32_bits(curves: Curves) -> Curves:
     return {key: [(step, float(np.float32(value))) for step, value in curve] for key, curve in curves.items()}
 
@@ -156,29 +167,17 @@ def test_tensorboard_reads_the_curves_of_the_database(tmp_path: Path) -> None:
 
     from panolog.orchestrator.follower.sinks.tensorboard_sink import TensorBoardSink  # noqa: PLC0415
 
-    class Fails(TensorBoardSink):
-        """Is killed in the middle of its third piece."""
-
-        def log(self, task: str, points: Sequence[Point]) -> None:
-            if not killed and task == "coarse" and points[0].iteration > 20:
-                killed.append(task)
-                super().log(task, points[: len(points) // 2])
-                self.finish(None, {}, None)  # only so that no thread of a writer is left
-                raise Killed
-            super().log(task, points)
-
-    killed: list[str] = []
     board = tmp_path / "board"
-    for number in range(3):
-        folder = histories.write(tmp_path / "run", number, number + 1)
-        try:
-            follow(folder, lambda: Fails(board))
-        except Killed:
-            for file in board.rglob("events.*"):  # and a record was cut off
-                with file.open("ab") as stream:
-                    stream.write(b"\x10\x00\x00")
-            follow(folder, lambda: TensorBoardSink(board))
-    assert killed
+
+    def left(sink: TensorBoardSink) -> None:
+        sink.finish(None, {}, None)  # only so that no thread of a writer is left
+        for file in board.rglob("events.*"):  # and a record was cut off
+            with file.open("ab") as stream:
+                stream.write(b"\x10\x00\x00")
+
+    killed = dying(TensorBoardSink, left)
+    folder = each_driver(tmp_path / "run", lambda: killed(board), lambda: TensorBoardSink(board))
+    assert killed.died
     reader = EventMultiplexer(size_guidance={"scalars": 0}).AddRunsFromDirectory(str(board)).Reload()
     found: Curves = {}
     for run, tags in reader.Runs().items():
@@ -257,23 +256,9 @@ def test_mlflow_has_the_curves_of_the_database(mlflow_server: str, tmp_path: Pat
 
     from panolog.orchestrator.follower.sinks.mlflow_sink import MlflowSink  # noqa: PLC0415
 
-    class Fails(MlflowSink):
-        def log(self, task: str, points: Sequence[Point]) -> None:
-            if not killed and task == "coarse" and points[0].iteration > 20:
-                killed.append(task)
-                super().log(task, points[: len(points) // 2])
-                raise Killed
-            super().log(task, points)
-
-    killed: list[str] = []
-    for number in range(3):
-        folder = histories.write(tmp_path / "run", number, number + 1)
-        folder.report.write_text("report")
-        try:
-            follow(folder, lambda: Fails(mlflow_server))
-        except Killed:
-            follow(folder, lambda: MlflowSink(mlflow_server))
-    assert killed
+    killed = dying(MlflowSink)
+    folder = each_driver(tmp_path / "run", lambda: killed(mlflow_server), lambda: MlflowSink(mlflow_server))
+    assert killed.died
     client = MlflowClient(tracking_uri=mlflow_server)
     experiment = client.get_experiment_by_name("panolog")
     assert experiment is not None
