@@ -17,7 +17,7 @@ from panolog.scene.ply import write_ply
 
 def photograph(index: int) -> NDArray[np.uint8]:
     """(256, 512, 3) BGR: patches of colour, other ones for each index."""
-    patches = np.random.default_rng(index).integers(0, 256, (16, 32, 3), np.uint8)
+    patches = np.random.default_rng(index).integers(0, 256, (8, 16, 3), np.uint8)
     return np.asarray(cv2.resize(patches, (512, 256), interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
@@ -47,14 +47,11 @@ def write_scene(root: Path, name: str) -> None:
 
 
 def cameras(count: int) -> NDArray[np.float64]:
-    """(count, 3) centres in turn along a street and a lane that cross, in metres."""
-    along = np.linspace(-60, 60, count)
-    street, lane = (
-        np.column_stack(way) for way in ((along, 0 * along - 14), (0 * along + 24, along * 2 / 3))
-    )
-    places = np.where(np.arange(count)[:, None] % 2 == 0, street, lane)
-    random = np.random.default_rng(1)
-    return np.column_stack([places + random.normal(0, 0.8, (count, 2)), random.normal(1.7, 0.1, count)])
+    """(count, 3) centres in turn along two streets and a lane across, in metres."""
+    along, way = np.linspace(-60, 60, count), np.arange(count) % 3
+    y = np.where(way == 2, along * 2 / 3, np.where(way == 1, 16, -14))
+    places = np.column_stack([np.where(way == 2, 24, along), y, np.full(count, 1.7)])
+    return places + np.random.default_rng(1).normal(0, [0.8, 0.8, 0.1], (count, 3))
 
 
 def points(count: int = 12_000) -> NDArray[np.float64]:
