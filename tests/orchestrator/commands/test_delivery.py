@@ -42,12 +42,6 @@ def test_files_for_viewers(tmp_path: Path) -> None:
     assert state.task(DELIVER).status == "done"
 
 
-def test_none_where_none_are_wanted(tmp_path: Path) -> None:
-    harness = Harness(tmp_path, deliver=False)
-    assert harness.drive().outcome == "done"
-    assert not harness.folder.web.exists() and not harness.folder.sky.exists()
-
-
 def test_a_resumed_run_has_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

@@ -1,7 +1,6 @@
 """A run exists from its first second, and one that is refused leaves nothing."""
 
 import errno
-import json
 import os
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -13,9 +12,7 @@ from shutil import copytree
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import preparing, session
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.run import folder as run_folder
@@ -31,6 +28,7 @@ from panolog.workers.calibration import CalibrateSpec
 from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import TaskSpec
 from tests.orchestrator.calibrated import says
+from tests.orchestrator.cli.program import call, shown
 from tests.orchestrator.fakes import DIED, MACHINE, CrashError, FakePool, well
 from tests.scenes import write_scene
 
@@ -63,24 +61,8 @@ def resume(root: Path, action: Callable[[], object] = ignore) -> None:
     session.resume(root, None, ignore, CalibratingPool(action))
 
 
-def test_status_reads_run_json_once(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    start(scene, tmp_path / "run")
-    reads, read_json = list[RunFolder](), run_folder.read_json
-
-    def counted(folder: RunFolder) -> dict[str, Any]:
-        reads.append(folder)
-        return read_json(folder)
-
-    monkeypatch.setattr(run_folder, "read_json", counted)
-    status(tmp_path / "run")
-    assert len(reads) == 1
-
-
-def status(root: Path) -> dict[str, Any]:
-    answer = CliRunner().invoke(app.app, ["status", str(root), "--json"])
-    assert answer.exit_code == 0, answer.output
-    shown: dict[str, Any] = json.loads(answer.stdout)
-    return shown
+def status(root: Path) -> Any:
+    return shown("status", root)
 
 
 @pytest.fixture(scope="module")
@@ -88,20 +70,26 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_scene(tmp_path_factory.mktemp("scene"))
 
 
+@pytest.fixture(scope="module")
+def calm(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run; next to it is what a driver would have left that was killed in its preflight."""
+    root = tmp_path_factory.mktemp("runs") / "calm"
+    start(scene, root, lambda: copytree(root, root.with_name("killed")))
+    return root
+
+
 @pytest.fixture
-def killed(scene: Path, tmp_path: Path) -> Path:
+def killed(calm: Path, tmp_path: Path) -> Path:
     """What a driver leaves that is killed in its preflight."""
-    root, killed = tmp_path / "run", tmp_path / "my killed run"
-    start(scene, root, lambda: copytree(root, killed))
-    return killed
+    return copytree(calm.with_name("killed"), tmp_path / "my killed run")
 
 
 def test_status_shows_a_run_before_its_preflight_is_over(scene: Path, tmp_path: Path) -> None:
     root, seen = tmp_path / "run", list[dict[str, Any]]()
     start(scene, root, lambda: seen.append(status(root)))
-    (shown,) = seen
-    assert (shown["status"], shown["stage"], shown["step"]) == ("running", "calibrate", "calibrating")
-    assert (shown["width"], shown["progress"]) == (64, 0)
+    (found,) = seen
+    assert (found["status"], found["stage"], found["step"]) == ("running", "calibrate", "calibrating")
+    assert (found["width"], found["progress"]) == (64, 0)
     done = status(root)
     assert (done["status"], done["stage"], done["step"], done["resume"]) == ("done", "done", None, None)
     assert read_info(RunFolder(root)).config.device == "cpu"
@@ -109,16 +97,16 @@ def test_status_shows_a_run_before_its_preflight_is_over(scene: Path, tmp_path: 
     assert steps == ["measuring exposures", "calibrating", "starting workers"]
 
 
-def test_a_run_killed_in_its_preflight_resumes_to_the_same_bytes(killed: Path, tmp_path: Path) -> None:
-    shown = status(killed)
-    assert (shown["status"], shown["label"], shown["stage"]) == ("stopped", "driver lost", "calibrate")
-    assert "was killed or has crashed" in str(shown["reason"])
-    assert shown["resume"] == f"panolog resume '{killed}'"
+def test_a_run_killed_in_its_preflight_resumes_to_the_same_bytes(killed: Path, calm: Path) -> None:
+    found = status(killed)
+    assert (found["status"], found["label"], found["stage"]) == ("stopped", "driver lost", "calibrate")
+    assert "was killed or has crashed" in str(found["reason"])
+    assert found["resume"] == f"panolog resume '{killed}'"
     resume(killed)
-    calm, resumed = RunFolder(tmp_path / "run"), RunFolder(killed)
-    assert resumed.point_cloud.read_bytes() == calm.point_cloud.read_bytes()
+    whole, resumed = RunFolder(calm), RunFolder(killed)
+    assert resumed.point_cloud.read_bytes() == whole.point_cloud.read_bytes()
     assert resumed.preflight.exists()
-    assert read_info(resumed).config == read_info(calm).config
+    assert read_info(resumed).config == read_info(whole).config
 
 
 def test_a_new_run_may_take_the_place_of_one_killed_in_its_preflight(killed: Path, scene: Path) -> None:
@@ -189,29 +177,22 @@ def test_a_resume_waits_for_a_disk_that_is_full_when_run_db_is_opened(
 def test_a_resumed_run_that_is_refused_says_why(killed: Path) -> None:
     with pytest.raises(InputError):
         resume(killed, fails(InputError("a.jpg is truncated")))
-    shown = status(killed)
-    assert (shown["status"], shown["stage"], shown["reason"]) == ("failed", "calibrate", "a.jpg is truncated")
+    found = status(killed)
+    assert (found["status"], found["stage"], found["reason"]) == ("failed", "calibrate", "a.jpg is truncated")
     resume(killed)
     assert status(killed)["status"] == "done"
 
 
-def test_a_scene_far_from_its_origin_is_noticed(
+def test_a_scene_far_from_its_origin_and_a_gpu_that_torch_cannot_use_are_noticed(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     moved = replace(read_scene(scene), offset=(465_000.0, 5_250_000.0, 408.0))
     monkeypatch.setattr(preparing, "read_scene", lambda _: moved)
-    start(scene, tmp_path / "run")
-    messages = [notice["message"] for notice in status(tmp_path / "run")["notices"]]
-    assert any(str(moved.offset) in message for message in messages)
-
-
-def test_a_gpu_that_torch_cannot_use_is_noticed(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     monkeypatch.setattr("panolog.renderer.process.unused_gpu", lambda: "RTX 4090 is not used: its driver")
     start(scene, tmp_path / "run")
     messages = [notice["message"] for notice in status(tmp_path / "run")["notices"]]
+    assert any(str(moved.offset) in message for message in messages)
     assert "RTX 4090 is not used: its driver; the CPU is used" in messages
 
 
@@ -238,7 +219,7 @@ def test_an_unforeseen_error_is_one_line_and_recorded(
 ) -> None:
     monkeypatch.setattr(session, "_workers", lambda *_: nullcontext(CalibratingPool(fails(error))))
     monkeypatch.setattr(session, "_exported", lambda _, on_change: on_change)
-    answer = CliRunner().invoke(app.app, ["resume", str(killed), "--resumed-after", "killed by signal 9"])
+    answer = call("resume", killed, "--resumed-after", "killed by signal 9")
     assert (answer.exit_code, answer.stdout) == (1, "")
     assert "Traceback" not in answer.stderr
     assert answer.stderr.splitlines()[-1].startswith(f"panolog: {line}")

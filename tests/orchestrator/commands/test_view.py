@@ -8,18 +8,18 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from threading import Thread
 
 import httpx
 import pytest
-from typer.testing import CliRunner, Result
 
-from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands.view import Site, SiteServer, site_of
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.views.site.build import Wanted, site_of_run, write_folder
 from panolog.workers.tasks import COARSE, TaskId
+from tests.orchestrator.cli.program import call
 from tests.orchestrator.dashboard.served import raw
 from tests.orchestrator.views.models import make_run, save_model, save_plan
 from tests.scenes import write_scene
@@ -59,17 +59,9 @@ def test_the_files_of_the_page_are_served_and_photographs_of_the_scene(folder: R
             cameras = client.get("/scene.json").json()["cameras"]
             photograph = client.get(f"/{cameras[1]['photograph']}")
             assert (photograph.status_code, photograph.content[:3]) == (200, b"\xff\xd8\xff")
-            assert client.head("/model.sog").headers["content-length"] == str(
-                len(client.get("/model.sog").content)
-            )
-            for path in (
-                "photos/000006.jpg",
-                "photos/1.jpg",
-                "none",
-                "model",
-                "photos",
-                "photos/../scene.json/",
-            ):
+            size = len(client.get("/model.sog").content)
+            assert client.head("/model.sog").headers["content-length"] == str(size)
+            for path in ("photos/000006.jpg", "photos/1.jpg", "none", "photos", "photos/../scene.json/"):
                 assert client.get(f"/{path}").status_code == 404
             (folder.root.parent / "scene" / "images" / "pano_2.jpg").write_text("no image")
             assert client.get("/photos/000002.jpg").status_code == 404
@@ -84,6 +76,12 @@ def test_nothing_is_served_to_other_sites_and_from_other_folders(folder: RunFold
         with serving(site) as server:
             url = server.url.rstrip("/")
             host = url.removeprefix("http://").encode()
+
+            def answer(line: bytes, host: bytes = host) -> tuple[bytes, bytes]:
+                """The status and all of an answer."""
+                said = raw(url, line + b" HTTP/1.1\r\nHost: " + host + b"\r\nConnection: close\r\n\r\n")
+                return said.split(b" ")[1], said
+
             for path in (
                 b"/../secret",
                 b"/%2e%2e/secret",
@@ -93,16 +91,12 @@ def test_nothing_is_served_to_other_sites_and_from_other_folders(folder: RunFold
                 b"/%00",
                 b"/.",
             ):
-                answer = raw(
-                    url, b"GET " + path + b" HTTP/1.1\r\nHost: " + host + b"\r\nConnection: close\r\n\r\n"
-                )
-                assert answer.split(b" ")[1] in (b"404", b"400"), path
-                assert b"secret" not in answer
+                status, said = answer(b"GET " + path)
+                assert status in (b"404", b"400"), path
+                assert b"secret" not in said
             for other in (b"evil.example", b"127.0.0.1.evil.example", b""):
-                answer = raw(url, b"GET / HTTP/1.1\r\nHost: " + other + b"\r\nConnection: close\r\n\r\n")
-                assert answer.split(b" ")[1] == b"403", other
-            answer = raw(url, b"POST / HTTP/1.1\r\nHost: " + host + b"\r\nConnection: close\r\n\r\n")
-            assert answer.split(b" ")[1] == b"501"
+                assert answer(b"GET /", other)[0] == b"403", other
+            assert answer(b"POST /")[0] == b"501"
 
 
 def test_what_a_run_has_written_is_served_as_it_is_until_the_model_is_newer(folder: RunFolder) -> None:
@@ -134,8 +128,7 @@ def browsed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return opened
 
 
-def view(*arguments: object) -> Result:
-    return CliRunner().invoke(app.app, ["view", *map(str, arguments)])
+view = partial(call, "view")
 
 
 def test_the_command_writes_one_file_or_a_folder(folder: RunFolder, browsed: list[str]) -> None:
