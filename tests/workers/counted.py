@@ -3,11 +3,8 @@
 Ops run as on a card, by `renderer.cuda.launches`, but no kernel does.
 """
 
-import sys
 import weakref
-from collections import Counter
 from collections.abc import Mapping
-from types import FrameType
 from typing import Any
 
 import torch
@@ -34,14 +31,11 @@ class CountedMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
         super().__init__()  # type: ignore[no-untyped-call]
         self.pairs, self.chosen = pairs, chosen
         self.live = self.peak = 0  # bytes
-        self.content: Counter[str] = Counter()  # live bytes by the function that has made them
-        self.at_peak: Counter[str] = Counter()
         self._known: set[int] = set()
 
     def restart(self) -> None:
         """The peak is now what is live."""
-        self.peak = 0
-        self._note()
+        self.peak = self.live
 
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
@@ -67,29 +61,21 @@ class CountedMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
             if isinstance(tensor, Tensor) and tensor.is_meta:
                 self._count(tensor.untyped_storage())
         if func is aten.sort.stable:
-            self._note(_sort_buffers(args[0]), "torch.sort")
+            self.peak = max(self.peak, self.live + _sort_buffers(args[0]))
         return found
 
     def _count(self, storage: torch.UntypedStorage) -> None:
         if storage._cdata in self._known:
             return
         self._known.add(storage._cdata)
-        size, origin = -(-storage.nbytes() // _BLOCK) * _BLOCK, _origin()
+        size = -(-storage.nbytes() // _BLOCK) * _BLOCK
         self.live += size
-        self.content[origin] += size
-        self._note()
-        weakref.finalize(storage, self._free, storage._cdata, size, origin)
+        self.peak = max(self.peak, self.live)
+        weakref.finalize(storage, self._free, storage._cdata, size)
 
-    def _free(self, storage: int, size: int, origin: str) -> None:
+    def _free(self, storage: int, size: int) -> None:
         self._known.remove(storage)
         self.live -= size
-        self.content[origin] -= size
-
-    def _note(self, more: int = 0, origin: str = "") -> None:
-        """A new peak, if it is one, with `more` bytes for a moment."""
-        if self.live + more > self.peak:
-            self.peak = self.live + more
-            self.at_peak = self.content + Counter({origin: more})
 
 
 def _to_host(kwargs: Mapping[str, Any]) -> bool:
@@ -103,13 +89,3 @@ def _sort_buffers(keys: Tensor) -> int:
     As in aten/src/ATen/native/cuda/Sort.cu: indices from 0, int64; and CUB's buffers of keys and of indices.
     """
     return len(keys) * (8 + keys.element_size() + 8)
-
-
-def _origin() -> str:
-    """The innermost function of PanoLOG that runs, and its line."""
-    frame: FrameType | None = sys._getframe(2)
-    while frame is not None and not str(frame.f_globals.get("__name__")).startswith("panolog."):
-        frame = frame.f_back
-    if frame is None:
-        return "the test"
-    return f"{frame.f_globals['__name__']}.{frame.f_code.co_name}:{frame.f_lineno}"

@@ -49,21 +49,27 @@ def _paint(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     return color
 
 
+def rays_of(width: int) -> NDArray[np.float64]:
+    """(H, W, 3) directions of the pixels of a panorama, in camera axes."""
+    azimuth = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
+    elevation = ((np.arange(width // 2) + 0.5) / width * 2 * np.pi - np.pi / 2)[:, None]
+    level = np.cos(elevation)
+    parts = level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth, level * np.cos(azimuth)
+    return np.stack(parts, axis=-1)
+
+
+def distance_along(rays: NDArray[np.float64], center: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(...) distances of the sphere from a center within it along rays (..., 3) in the axes of the world."""
+    along = rays @ center
+    distance: NDArray[np.float64] = -along + np.sqrt(along**2 + RADIUS**2 - center @ center)
+    return distance
+
+
 def _panorama(folder: Path, index: int, center: NDArray[np.float64], points: int, layers: bool) -> Panorama:
     """One camera with the world's axes; its files are written."""
-    azimuth = (np.arange(WIDTH) + 0.5) / WIDTH * 2 * np.pi - np.pi
-    elevation = (np.arange(HEIGHT) + 0.5)[:, None] / HEIGHT * np.pi - np.pi / 2
-    rays = np.stack(
-        [
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation) * np.ones_like(azimuth),
-            np.cos(elevation) * np.cos(azimuth),
-        ],
-        axis=-1,
-    )
-    along = rays @ center
-    distance = -along + np.sqrt(along**2 + RADIUS**2 - center @ center)
-    sky = np.broadcast_to(elevation < SKY_ELEVATION, distance.shape)
+    rays = rays_of(WIDTH)
+    distance = distance_along(rays, center)
+    sky = np.arcsin(rays[..., 1]) < SKY_ELEVATION
     prior = np.where(sky, 0, (1 / distance - AFFINE[1]) / AFFINE[0])
     color = _paint((center + distance[..., None] * rays) / RADIUS)
     paths = {kind: folder / f"{kind}_{index}.png" for kind in ("image", "mask", "sky", "depth")}

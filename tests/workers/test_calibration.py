@@ -8,6 +8,7 @@ from panolog.workers.events import Calibration
 from panolog.workers.specs import Value
 from panolog.workers.training.config import DensifyConfig, SkyConfig, TrainConfig
 from tests.workers.small import WIDTH, small_scene
+from tests.workers.trainings import threads
 
 
 def calibrated(
@@ -28,8 +29,11 @@ def calibrated(
     return found
 
 
-def test_two_models_are_measured(tmp_path: Path) -> None:
-    found = calibrated(tmp_path)
+@pytest.mark.parametrize("count", [1, 2])
+def test_two_models_are_measured_with_the_threads_that_there_are(tmp_path: Path, count: int) -> None:
+    with threads(count):
+        found = calibrated(tmp_path)
+        assert found.threads == count == ops.threads()
     assert found.initial.gaussians == 250
     assert found.grown.gaussians > 400
     assert 0 < found.share <= 1
@@ -39,7 +43,6 @@ def test_two_models_are_measured(tmp_path: Path) -> None:
         assert sample.device == 0
     assert min(found.begin, found.decode, found.single, found.look) > 0
     assert found.images == 4 * 9 * WIDTH * WIDTH // 2
-    assert found.threads == ops.threads()
 
 
 def test_the_second_model_is_no_larger_than_allowed(tmp_path: Path) -> None:
@@ -56,13 +59,3 @@ def test_without_time_each_model_still_has_an_iteration(tmp_path: Path) -> None:
     found = calibrated(tmp_path, seconds=0.0)
     assert found.initial.seconds > 0
     assert found.grown.seconds > 0
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_threads_are_left_as_they_were(tmp_path: Path, threads: int) -> None:
-    ops.use_threads(threads)
-    try:
-        assert calibrated(tmp_path).threads == threads
-        assert ops.threads() == threads
-    finally:
-        ops.use_threads(None)

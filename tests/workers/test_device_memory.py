@@ -17,24 +17,18 @@ from panolog.scene.images import PanoramaCache, View, packed_bytes, unpack
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
 from panolog.workers import device_memory
-from panolog.workers.specs import Value
-from panolog.workers.tasks import COARSE
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import densify
 from panolog.workers.training.optimizer import ModelState
 from panolog.workers.training.pipeline import AHEAD
-from panolog.workers.training.trainer import Trainer, TrainSpec
+from panolog.workers.training.trainer import Trainer
 from tests.renderer.cuda.stubbed import no_launch
 from tests.workers.counted import DEVICE, CountedMemory
-from tests.workers.small import WIDTH, small_scene
+from tests.workers.small import WIDTH
+from tests.workers.trainings import coarse_of
 
 ITERATION = 8_000  # of 30,000: all harmonics are in use, and screen gradients are collected
 SIZES = [(100_000, 1024), (100_000, 4096), (1_000_000, 2048), (10_000_000, 2048), (10_000_000, 4096)]
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return small_scene(tmp_path_factory.mktemp("scene"))
 
 
 def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -59,16 +53,7 @@ def view(width: int) -> View:
 @contextmanager
 def training(scene: Scene, count: int, width: int, chosen: float) -> Iterator[tuple[Trainer, CountedMemory]]:
     """A trainer of so many Gaussians, in counted memory."""
-    spec = TrainSpec(
-        task=COARSE,
-        scene=Value(scene),
-        views=scene.train,
-        width=width,
-        iterations=30_000,
-        config=TrainConfig(),
-        seed=1,
-        device=DEVICE,
-    )
+    spec = coarse_of(scene, TrainConfig(), width=width, iterations=30_000, device=DEVICE)
     memory = CountedMemory(device_memory.pairs(count, width * width // 2), chosen)
     on_card = mock.patch.object(ops, "launcher", return_value=no_launch)
     with PanoramaCache(scene, scene.train, WIDTH, 2**20) as cache, on_card, memory:
@@ -76,12 +61,6 @@ def training(scene: Scene, count: int, width: int, chosen: float) -> Iterator[tu
         trainer.state = ModelState.start(model(count))
         trainer.reset_statistics()
         yield trainer, memory
-
-
-def table(memory: CountedMemory, count: int) -> str:
-    """What was live at the peak: bytes for each Gaussian."""
-    rows = [f"{size / count:9.1f} {origin}" for origin, size in memory.at_peak.most_common() if size]
-    return "\n".join([f"{memory.peak / count:9.1f} in all", *rows])
 
 
 @pytest.mark.parametrize(("count", "width"), SIZES)
@@ -96,7 +75,7 @@ def test_an_iteration(scene: Scene, count: int, width: int, monkeypatch: pytest.
         for iteration in range(1, AHEAD + 2):
             trainer.step(ITERATION + iteration, view(width))
     need = device_memory.training(count, width * width // 2)
-    assert need == pytest.approx(memory.peak, rel=0.1), table(memory, count)
+    assert need == pytest.approx(memory.peak, rel=0.1)
 
 
 @pytest.mark.parametrize("count", [100_000, 1_000_000, 10_000_000])
@@ -111,7 +90,7 @@ def test_a_densification_takes_less_than_an_iteration_afterwards(
         densify(trainer.state, trainer.statistics, trainer.spec.config.densify, 1.0, random)
     grown = len(trainer.state.gaussians)
     assert grown == pytest.approx(count * growth, rel=0.02)
-    assert memory.peak < device_memory.training(grown, 0), table(memory, count)
+    assert memory.peak < device_memory.training(grown, 0)
 
 
 def test_a_checkpoint_takes_none(scene: Scene) -> None:
@@ -123,27 +102,24 @@ def test_a_checkpoint_takes_none(scene: Scene) -> None:
     assert all(tensor.is_cpu for tensor in checkpoint.tensors.values())
 
 
+@pytest.mark.parametrize("scored", [False, True])
 @pytest.mark.parametrize(("count", "width"), SIZES)
-def test_a_panorama_that_is_only_rendered(scene: Scene, count: int, width: int) -> None:
-    panorama, pixels = scene.panoramas[0], width * width // 2
-    with CountedMemory(device_memory.pairs(count, pixels)) as memory:
-        gaussians, _ = model(count), view(width)
-        memory.restart()
-        render_panorama(gaussians, panorama.rotation, panorama.translation, width, 0.1)
-    assert device_memory.rendering(count, pixels) == pytest.approx(memory.peak, rel=0.1), table(memory, count)
-
-
-@pytest.mark.parametrize(("count", "width"), SIZES)
-def test_a_camera_that_is_scored(scene: Scene, count: int, width: int) -> None:
+def test_a_panorama_that_is_only_rendered_or_scored(
+    scene: Scene, count: int, width: int, scored: bool
+) -> None:
     panorama, pixels = scene.panoramas[0], width * width // 2
     with CountedMemory(device_memory.pairs(count, pixels)) as memory:
         gaussians, seen = model(count), view(width)
-        gaussians.means.requires_grad_()
+        gaussians.means.requires_grad_(scored)
         memory.restart()
-        camera = Camera.of(panorama.rotation, panorama.translation, width, width // 2)
-        loss = photometric_loss(render(gaussians, camera).color, seen.image, seen.mask)
-        torch.autograd.grad(loss.loss, gaussians.means)
-    assert device_memory.scoring(count, pixels) == pytest.approx(memory.peak, rel=0.1), table(memory, count)
+        if scored:
+            camera = Camera.of(panorama.rotation, panorama.translation, width, width // 2)
+            loss = photometric_loss(render(gaussians, camera).color, seen.image, seen.mask)
+            torch.autograd.grad(loss.loss, gaussians.means)
+        else:
+            render_panorama(gaussians, panorama.rotation, panorama.translation, width, 0.1)
+    need = (device_memory.scoring if scored else device_memory.rendering)(count, pixels)
+    assert need == pytest.approx(memory.peak, rel=0.1)
 
 
 def test_ten_million_gaussians_fit_a_gpu_of_24_gigabytes() -> None:

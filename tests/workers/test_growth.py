@@ -38,19 +38,15 @@ def test_periods_last_as_long_as_the_task() -> None:
     assert periods[1] == (25, 1050)
 
 
-def test_nothing_grows_without_densification() -> None:
-    still = Schedule(TrainConfig(densify=DensifyConfig(until=0)), 1500, extent=1.0, refine=False)
+def test_growth_has_bounds() -> None:
+    still, capped = (
+        replace(SCHEDULE, config=TrainConfig(densify=DensifyConfig.model_validate(densify)))
+        for densify in ({"until": 0}, {"max_gaussians": 1100})
+    )
     assert population(1000, 50.0, PIXELS, still) == [(1500, 1000)]
-
-
-def test_a_cap_holds_and_takes_nothing_away() -> None:
-    capped = Schedule(TrainConfig(densify=DensifyConfig(max_gaussians=1100)), 1500, extent=1.0, refine=False)
     assert population(1000, 50.0, PIXELS, capped)[-1][1] == 1100
-    assert population(1200, 50.0, PIXELS, capped)[-1][1] == 1200
-
-
-def test_few_gaussians_cannot_become_many_at_once() -> None:
-    assert population(100, 1e6, PIXELS, SCHEDULE)[1] == (25, 150)
+    assert population(1200, 50.0, PIXELS, capped)[-1][1] == 1200  # takes nothing away
+    assert population(100, 1e6, PIXELS, SCHEDULE)[1] == (25, 150)  # few do not become many at once
 
 
 def test_blocks_grow_faster_than_stage_one() -> None:

@@ -12,20 +12,16 @@ import numpy as np
 import pytest
 import torch
 
-from panolog.scene.depth_alignment import Alignment, align_depth
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.images import load_layers, load_view
 from panolog.scene.model import Scene
-from panolog.workers.evaluation import EvaluateSpec, evaluate
+from panolog.workers.evaluation import evaluate
 from panolog.workers.events import Evaluated, Scored
-from panolog.workers.scoring import ScoreSpec, score
-from panolog.workers.specs import Value
-from panolog.workers.tasks import TaskId
-from panolog.workers.training.config import SkyConfig, TrainConfig
-from panolog.workers.training.initialise import scene_gaussians, sky_gaussians
+from panolog.workers.scoring import score
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.initialise import scene_gaussians
 from tests.workers import trainings
-from tests.workers.small import WIDTH, small_scene
-from tests.workers.trainings import coarse_of, same
+from tests.workers.small import small_scene
+from tests.workers.trainings import coarse_of, evaluation_of, same, score_of
 
 IGNORED, SSIM_REACH = 12, 5  # rows
 CONFIG = TrainConfig.model_validate({"sky": {"count": 40}, "depth": {"w0": 0.5, "wT": 0.4}})
@@ -71,75 +67,20 @@ def without_masks(scene: Scene) -> Scene:
     return replace(scene, panoramas=tuple(replace(panorama, mask=None) for panorama in scene.panoramas))
 
 
-def transparent(scene: Scene) -> Scene:
-    """The scene with its masks as the alpha channels of its panoramas, which are black there."""
-    panoramas = []
-    for panorama in scene.panoramas:
-        mask = cv2.imread(str(panorama.mask), cv2.IMREAD_GRAYSCALE)
-        image = cv2.imread(str(panorama.image))
-        assert mask is not None and image is not None
-        assert mask.shape == image.shape[:2]
-        alpha = np.where(mask > 0, 255, 0).astype(np.uint8)
-        path = panorama.image.with_name(f"transparent_{panorama.image.name}")
-        cv2.imwrite(str(path), np.dstack([image * (alpha > 0)[..., None], alpha]))
-        panoramas.append(replace(panorama, image=path, mask=None, transparent=True))
-    return replace(scene, panoramas=tuple(panoramas))
-
-
 def metrics(scene: Scene, model: Gaussians) -> dict[str, float | None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("panolog.workers.evaluation.load_lpips", lambda _: (None, None))
-        spec = EvaluateSpec(scene=Value(scene), views=(4,), width=WIDTH, model=Value(model), near=0.01)
-        return next(event.metrics for event in evaluate(spec) if isinstance(event, Evaluated))
+    events = evaluate(evaluation_of(scene, model))
+    return next(event.metrics for event in events if isinstance(event, Evaluated))
 
 
-def test_what_is_transparent_is_as_if_it_were_masked(clean: Scene) -> None:
-    other = transparent(clean)
-    view, same_view = (load_layers(it.panoramas[1], 1, WIDTH) for it in (clean, other))
-    assert view.mask is not None and same_view.mask is not None and torch.equal(view.mask, same_view.mask)
-    assert align_depth(clean, view, 0) == align_depth(other, same_view, 0)
-    assert same(trained(clean), trained(other))
-    model = scene_gaussians(clean)
-    assert metrics(clean, model) == metrics(other, model)
-
-
-def test_alignment(clean: Scene, spoilt: Scene) -> None:
-    def aligned(scene: Scene) -> Alignment:
-        return align_depth(scene, load_layers(scene.panoramas[1], 1, WIDTH), 0)
-
-    assert aligned(clean) == aligned(spoilt)
-    assert aligned(clean).points < aligned(without_masks(clean)).points  # those under the mask are not used
-
-
-def test_the_colour_of_the_sky(clean: Scene, spoilt: Scene) -> None:
-    def sky(scene: Scene) -> Gaussians:
-        views = {row: load_view(scene.panoramas[row], row, WIDTH) for row in scene.train}
-        return sky_gaussians(scene, SkyConfig(), 60, scene.train, views.__getitem__)
-
-    assert same(sky(clean), sky(spoilt))
-
-
-def test_both_losses_of_training(clean: Scene, spoilt: Scene) -> None:
+def test_training(clean: Scene, spoilt: Scene) -> None:
+    """Both losses, the alignment of depth images and the colours of the sky."""
     assert same(trained(clean), trained(spoilt))
     assert not same(trained(without_masks(clean)), trained(without_masks(spoilt)))
 
 
 def test_scores(clean: Scene, spoilt: Scene) -> None:
     def scores(scene: Scene) -> torch.Tensor:
-        gaussians = scene_gaussians(scene)
-        labels = (gaussians.means[:, 0] > 0).long().numpy()
-        *_, last = score(
-            ScoreSpec(
-                task=TaskId.shard(0),
-                scene=Value(scene),
-                views=(0, 1),
-                width=WIDTH,
-                model=Value(gaussians),
-                labels=Value(labels),
-                blocks=2,
-                config=TrainConfig(),
-            )
-        )
+        *_, last = score(score_of(scene, scene_gaussians(scene), (0, 1)))
         assert isinstance(last, Scored)
         return last.scores
 

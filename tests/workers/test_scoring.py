@@ -1,4 +1,3 @@
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,30 +8,20 @@ import torch
 
 from panolog.partition.bounds import baseline
 from panolog.renderer.camera import Camera
-from panolog.renderer.losses import PhotometricLoss, photometric_loss
+from panolog.renderer.losses import photometric_loss
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.workers.events import Progress, Scored
-from panolog.workers.meter import Meter
-from panolog.workers.scoring import ScoreSpec, _gradient, _Scores, in_shards, score
+from panolog.workers.scoring import ScoreSpec, _gradient, in_shards, score
 from panolog.workers.specs import Value
-from panolog.workers.tasks import TaskId
-from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
 from tests.renderer.cuda.stubbed import stubbed, without_pairs
 from tests.renderer.cuda.waits import counted
 from tests.workers.small import WIDTH, small_scene
-
-
-@pytest.fixture(name="threads", params=[1, 2])
-def _threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
+from tests.workers.trainings import score_of, threads
 
 
 def with_sky(scene: Scene) -> Gaussians:
@@ -42,19 +31,9 @@ def with_sky(scene: Scene) -> Gaussians:
     return concatenate(gaussians, replace(sky, means=3 * sky.means, sky=10))
 
 
-def spec_of(scene: Scene, views: tuple[int, ...] = (0, 1, 3), blocks: int = 3) -> ScoreSpec:
-    gaussians = with_sky(scene)
-    labels = np.where(gaussians.means[gaussians.scene, 0].numpy() > 0, 2, 0)  # block 1 is empty
-    return ScoreSpec(
-        task=TaskId.shard(0),
-        scene=Value(scene),
-        views=views,
-        width=WIDTH,
-        model=Value(gaussians),
-        labels=Value(labels),
-        blocks=blocks,
-        config=TrainConfig(),
-    )
+def spec_of(scene: Scene, views: tuple[int, ...] = (0, 1, 3)) -> ScoreSpec:
+    spec = score_of(scene, with_sky(scene), views)
+    return replace(spec, labels=Value(2 * spec.labels.load()), blocks=3)  # block 1 is empty
 
 
 def by_definition(spec: ScoreSpec, row: int) -> list[float]:
@@ -77,7 +56,10 @@ def by_definition(spec: ScoreSpec, row: int) -> list[float]:
 
 def test_scores_are_those_of_the_definition(tmp_path: Path) -> None:
     spec = spec_of(small_scene(tmp_path))
+    means = spec.model.load().means
+    before = means.clone()
     *progress, scored = score(spec)
+    assert torch.equal(means, before) and not means.requires_grad
     assert isinstance(scored, Scored)
     assert scored.cameras == (0, 1, 3)
     assert scored.scores.dtype == torch.float64
@@ -98,23 +80,14 @@ def test_of_merged_gaussians_the_number_that_they_stand_for_counts(tmp_path: Pat
     torch.testing.assert_close(merged.scores * torch.tensor([2.0, 1.0, 4.0]), alone.scores)
 
 
-def test_shards_score_as_the_whole_does_whatever_the_threads(tmp_path: Path, threads: int) -> None:
-    scene = small_scene(tmp_path)
-    *_, whole = score(spec_of(scene))
-    torch.set_num_threads(1)
-    *_, part = score(spec_of(scene, views=(1,)))
-    assert isinstance(whole, Scored)
-    assert isinstance(part, Scored)
-    assert torch.equal(part.scores[0], whole.scores[1])
-
-
-def test_the_model_given_is_not_touched(tmp_path: Path) -> None:
-    spec = spec_of(small_scene(tmp_path))
-    means = spec.model.load().means
-    before = means.clone()
-    list(score(spec))
-    assert torch.equal(means, before)
-    assert not means.requires_grad
+def test_shards_score_as_the_whole_does_whatever_the_threads(tmp_path: Path) -> None:
+    scene, found = small_scene(tmp_path), []
+    for count, views, row in ((1, (0, 1, 3), 1), (2, (0, 1, 3), 1), (1, (1,), 0)):
+        with threads(count):
+            *_, scored = score(spec_of(scene, views))
+        assert isinstance(scored, Scored)
+        found.append(scored.scores[row])
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
 
 
 def test_a_view_that_is_masked_altogether_scores_zero(tmp_path: Path) -> None:
@@ -155,21 +128,6 @@ def test_shards_hold_every_camera_once_in_order(count: int, most: int, shards: i
     assert sum(parts, ()) == cameras
     assert len(parts) == shards and all(0 < len(part) <= most for part in parts)
     assert not parts or max(map(len, parts)) - min(map(len, parts)) <= 1
-
-
-def test_sums_by_block_are_those_of_numpy_to_the_byte(tmp_path: Path) -> None:
-    """As they were before they were taken on the device."""
-    spec = spec_of(small_scene(tmp_path))
-    generator = torch.Generator().manual_seed(0)
-    labels = spec.labels.load()
-    gradient = torch.randn(len(labels), 3, generator=generator)
-    scores = _Scores(spec, spec.scene.load(), labels, Meter(spec.task, 3, "cpu"))
-    zero = torch.zeros((), dtype=torch.float64)
-    scores.add(1, PhotometricLoss(zero, zero, zero, zero), gradient)
-    magnitude = np.abs(gradient.numpy().astype(np.float64)).sum(axis=1)
-    sizes = np.maximum(np.bincount(labels, minlength=3), 1)
-    expected = np.bincount(labels, weights=magnitude, minlength=3) / sizes
-    assert scores.values[1].numpy().tobytes() == expected.tobytes()
 
 
 def test_on_a_card_nothing_waits_but_the_rasterizer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,12 +57,3 @@ def test_other_texts_are_refused(text: str) -> None:
 def test_a_number_belongs_to_shards_and_blocks(stage: Stage, index: int | None) -> None:
     with pytest.raises(ValueError, match="has no task with the number"):
         TaskId(stage, index)
-
-
-def test_only_stage_one_and_blocks_train() -> None:
-    assert [str(task) for task in IN_ORDER.values() if task.stage.trains] == [
-        "coarse",
-        "block/003",
-        "block/999",
-        "block/1000",
-    ]

@@ -1,6 +1,7 @@
 """Trainings of the small scene, and what they end with."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -8,13 +9,17 @@ import torch
 
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
+from panolog.renderer import ops
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
+from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Checkpoint, Event, Notice, Progress, Trained
+from panolog.workers.scoring import ScoreSpec
+from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.trainer import TrainSpec, train
+from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.workers.small import WIDTH
 
 # Of 24 iterations it densifies after each 4th one until the 12th, resets after the 9th, saves after each 5th.
@@ -25,6 +30,10 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "sh": {"every": 6000},
     "checkpoint": {"every": 5, "share": 1},
     "preview": {"every": 8},
+}
+RELOCATED: dict[str, Any] = {  # of "densify": growth to a budget
+    **{"method": "relocate", "until": 25_000, "growth": 0.3, "weight": "gradient", "long_axis": True},
+    **{"measure": "angle", "views": "contribution", "max_gaussians": 0},
 }
 
 
@@ -38,7 +47,7 @@ def settings(**groups: Any) -> TrainConfig:
 
 
 def coarse_of(scene: Scene, config: TrainConfig | None = None, **fields: Any) -> TrainSpec:
-    """Stage I on all views for training. Args: fields of the spec that are others."""
+    """Stage I on all views for training. Args: other fields of the spec."""
     spec = TrainSpec(
         task=COARSE,
         scene=Value(scene),
@@ -51,11 +60,58 @@ def coarse_of(scene: Scene, config: TrainConfig | None = None, **fields: Any) ->
     return replace(spec, **fields)
 
 
+def score_of(scene: Scene, model: Gaussians, views: tuple[int, ...], **fields: Any) -> ScoreSpec:
+    """The scores of some views for two blocks, which meet at x = 0. Args: other fields of the spec."""
+    labels = (model.means[model.scene, 0] > 0).long().numpy()
+    spec = ScoreSpec(
+        task=TaskId.shard(0),
+        scene=Value(scene),
+        views=views,
+        width=WIDTH,
+        model=Value(model),
+        labels=Value(labels),
+        blocks=2,
+        config=TrainConfig(),
+    )
+    return replace(spec, **fields)
+
+
+def evaluation_of(
+    scene: Scene, model: Gaussians, views: tuple[int, ...] = (4,), **fields: Any
+) -> EvaluateSpec:
+    """The measurement of some views. Args: fields of the spec that are others."""
+    spec = EvaluateSpec(scene=Value(scene), views=views, width=WIDTH, model=Value(model), near=0.01)
+    return replace(spec, **fields)
+
+
 def block_of(coarse: TrainSpec, initial: Gaussians, **groups: Any) -> TrainSpec:
     """The half of the scene at positive x, seen by the views 0 and 2. Args: groups of settings."""
     cell = Cell(aabb(coarse.scene.load().centers, 5.0), Grid((2, 1, 1)), 1)
     spec = replace(coarse, task=TaskId.block(1), views=(0, 2), initial=Value(initial), cell=cell)
     return replace(spec, config=settings(**groups)) if groups else spec
+
+
+@contextmanager
+def begun(spec: TrainSpec) -> Iterator[Trainer]:
+    """A trainer before its first iteration."""
+    scene = spec.scene.load()
+    with open_cache(spec, scene, spec.views, 2**30) as cache, closing(Trainer(spec, scene, cache)) as trainer:
+        trainer.begin()
+        list(trainer.surround(lambda: False))
+        yield trainer
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Within it, torch and our ops use so many threads."""
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(count)
+        ops.use_threads(count)
+        yield
+    finally:
+        torch.set_num_threads(before)
+        ops.use_threads(None)
 
 
 def trained(found: TrainSpec | list[Event]) -> Gaussians:

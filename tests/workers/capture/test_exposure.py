@@ -15,7 +15,7 @@ from panolog.scene.model import Scene
 from panolog.workers.capture.captured import Captured, joined
 from panolog.workers.capture.config import ExposureConfig
 from panolog.workers.capture.exposure import Exposures
-from tests.workers.small import WIDTH, small_scene
+from tests.workers.small import WIDTH
 
 VIEWS = (3, 5, 8)
 GAINS = torch.tensor([[0.4, 0.3, 0.5], [-0.2, -0.1, -0.3], [-0.2, -0.2, -0.2]], dtype=torch.float64)
@@ -76,26 +76,9 @@ def test_an_iteration_that_did_not_take_place_teaches_nothing() -> None:
     assert not found.learnt().any()
     found.step(5, sums.fill_(float("nan")), torch.zeros(1, dtype=torch.int32))
     assert not found.learnt().any()
-
-
-def test_a_view_without_a_pixel_teaches_nothing() -> None:
-    found = exposures(offset=True)
-    found.step(5, torch.zeros(3, 5, dtype=torch.float64), None)
-    assert not found.learnt().any()
-
-
-def test_a_resumed_task_goes_on_as_if_nothing_had_been() -> None:
-    truth = torch.stack([GAINS, torch.zeros_like(GAINS)], 1)
-    whole, first, second = exposures(), exposures(), exposures()
-    learnt(first, truth, 3)
-    second.restore({name: tensor.clone() for name, tensor in first.tensors().items()})
-    assert torch.equal(learnt(second, truth, 3), learnt(first, truth, 3))
-    assert not np.array_equal(whole.learnt(), first.learnt())
-
-
-@pytest.fixture
-def scene(tmp_path: Path) -> Scene:
-    return small_scene(tmp_path)
+    black = exposures(offset=True)  # a view without a pixel
+    black.step(5, torch.zeros(3, 5, dtype=torch.float64), None)
+    assert not black.learnt().any()
 
 
 def test_auto_learns_where_something_was_measured(scene: Scene) -> None:
@@ -107,21 +90,13 @@ def test_auto_learns_where_something_was_measured(scene: Scene) -> None:
     assert Exposures.of(scene, scene.train, ExposureConfig(learn=True), "cpu") is not None
 
 
-def test_a_view_has_its_exposure_and_lacks_its_movers(scene: Scene) -> None:
+def test_a_view_has_its_exposure(scene: Scene) -> None:
     exposure = np.stack([np.log([1.5, 1.0, 0.5]), [0.0, 0.1, 0.0]])
-    movers = np.zeros((4, 8), bool)
-    movers[2, 5] = True
-    panorama = replace(scene.panoramas[0], exposure=exposure, movers=movers)
-    view = load_layers(panorama, 0, WIDTH)
+    view = load_layers(replace(scene.panoramas[0], exposure=exposure), 0, WIDTH)
     factor = np.array([1.5, 1.0, 0.5]) ** (1 / 2.4)
-    assert view.exposure is not None and view.mask is not None
+    assert view.exposure is not None
     np.testing.assert_allclose(view.exposure[0], factor, rtol=1e-6)
     np.testing.assert_allclose(view.exposure[1], 0.055 * (factor - 1) + [0, 0.1, 0], atol=1e-7)
-    plain = load_layers(scene.panoramas[0], 0, WIDTH).mask
-    expected = torch.ones(WIDTH // 2, WIDTH, dtype=torch.bool) if plain is None else plain.clone()
-    cell = WIDTH // 8
-    expected[2 * cell : 3 * cell, 5 * cell : 6 * cell] = False
-    assert torch.equal(view.mask, expected)
 
 
 def test_what_is_captured_survives_its_file(tmp_path: Path, scene: Scene) -> None:
@@ -146,11 +121,30 @@ def test_what_is_captured_survives_its_file(tmp_path: Path, scene: Scene) -> Non
 
 
 def test_districts_are_joined_to_one() -> None:
-    one = Captured(rows=np.array([0, 1]), exposure=np.full((2, 2, 3), 1.0))
-    two = Captured(rows=np.array([1, 4]), exposure=np.full((2, 2, 3), 2.0))
+    """Of a panorama in both the mean, and what either says of movers and bounds."""
+    pose, seen = np.eye(3, 4), np.zeros((2, 4, 8), bool)
+    seen[1, 2, 5] = True
+    one, two = (
+        Captured(
+            rows=np.array(rows),
+            exposure=np.full((2, 2, 3), gain),
+            poses=np.stack([pose + shift * np.eye(3, 4, 3), pose]),
+            movers=movers,
+            at_bound=bound,
+        )
+        for rows, gain, shift, movers, bound in (
+            ([0, 1], 1.0, 0.0, seen, np.array([False, True])),
+            ([1, 4], 2.0, 1.0, ~seen[::-1], np.zeros(2, bool)),
+        )
+    )
     both = joined([one, two])
-    assert both.rows.tolist() == [0, 1, 4] and both.exposure is not None and both.movers is None
-    assert both.exposure[:, 0, 0].tolist() == [1.0, 1.5, 2.0]
+    assert both.rows.tolist() == [0, 1, 4]
+    assert both.exposure is not None and both.exposure[:, 0, 0].tolist() == [1.0, 1.5, 2.0]
+    assert both.poses is not None and both.poses[1] == pytest.approx(pose + 0.5 * np.eye(3, 4, 3))
+    assert both.movers is not None and both.movers.dtype == np.bool_
+    assert both.movers.sum(axis=(1, 2)).tolist() == [0, 32, 32] and both.movers[1, 2, 5]
+    assert both.at_bound is not None and both.at_bound.tolist() == [False, True, False]
+    assert joined([one, replace(two, movers=None)]).movers is None
 
 
 def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:

@@ -1,21 +1,22 @@
 """Cameras in a painted hollow sphere: what is drawn into one picture is found, and nothing else."""
 
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from panolog.scene.images import View
+from panolog.scene.images import View, exposed
 from panolog.scene.model import Panorama, Scene
 from panolog.workers.capture import movers as module
 from panolog.workers.capture.config import MoversConfig
 from panolog.workers.capture.movers import Movers, Visit, state_bytes
+from tests.workers.small import RADIUS, distance_along, rays_of
+from tests.workers.trainings import threads
 
 WIDTH, HEIGHT = 256, 128
-RADIUS = 4.0
 CENTERS = np.array([[0, 0, 0], [1.2, 0, 0.3], [-1.1, 0.2, 0], [0, 0, 1.3], [0.3, -0.2, -1.2], [1.0, 0, 1.1]])
 ON = MoversConfig(weigh=True)
 LATE = 96  # an iteration at which views are judged, with the factor as configured
@@ -23,31 +24,17 @@ TASK = 100
 CELL = WIDTH // (WIDTH // 4)
 
 
-def rays() -> np.ndarray:
-    azimuth = ((np.arange(WIDTH) + 0.5) / WIDTH - 0.5) * 2 * np.pi
-    elevation = (((np.arange(HEIGHT) + 0.5) / HEIGHT - 0.5) * np.pi)[:, None]
-    flat = np.cos(elevation)
-    parts = flat * np.sin(azimuth), np.sin(elevation) + 0 * azimuth, flat * np.cos(azimuth)
-    return np.stack(parts, axis=-1)
-
-
 def turned(index: int) -> np.ndarray:
     """A rotation, another for each camera."""
-    angle = 0.7 * index
-    c, s = math.cos(angle), math.sin(angle)
-    yaw = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-    pitch = [[1, 0, 0], [0, math.cos(0.1), -math.sin(0.1)], [0, math.sin(0.1), math.cos(0.1)]]
-    rotation: np.ndarray = yaw @ np.array(pitch)
+    rotation: np.ndarray = Rotation.from_euler("yx", [0.7 * index, 0.1]).as_matrix()
     return rotation
 
 
 def surface(index: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (H, W, 3) on the sphere that a camera sees, and their distances (H, W)."""
-    directions = rays() @ turned(index)
-    center = CENTERS[index]
-    along = directions @ center
-    distance = -along + np.sqrt(along**2 + RADIUS**2 - center @ center)
-    return center + distance[..., None] * directions, distance
+    directions = rays_of(WIDTH) @ turned(index)
+    distance = distance_along(directions, CENTERS[index])
+    return CENTERS[index] + distance[..., None] * directions, distance
 
 
 def painted(index: int) -> Tensor:
@@ -60,17 +47,8 @@ def scene(count: int = len(CENTERS)) -> Scene:
         Panorama(f"{i}.jpg", Path(f"{i}.jpg"), turned(i), -turned(i) @ CENTERS[i], np.zeros(0, np.int64))
         for i in range(count)
     )
-    return Scene(
-        root=Path(),
-        width=WIDTH,
-        height=HEIGHT,
-        panoramas=panoramas,
-        points=np.zeros((0, 3)),
-        colors=np.zeros((0, 3), np.uint8),
-        train=tuple(range(count)),
-        test=(),
-        fingerprint="",
-    )
+    points, colors, rows = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), tuple(range(count))
+    return Scene(Path(), WIDTH, HEIGHT, panoramas, points, colors, rows, (), "")
 
 
 def made(count: int = len(CENTERS), config: MoversConfig = ON) -> Movers:
@@ -88,7 +66,7 @@ def visit(
     status: Tensor | None = None,
     affine: Tensor | None = None,
 ) -> None:
-    """Each view once; the last visit is at `iteration`."""
+    """Each view once; the last visit is at `iteration`. Args: affine, exposure of all photographs."""
     count = len(movers.learnt())
     for index in range(count):
         image = (photographs or {}).get(index, painted(index))
@@ -98,7 +76,7 @@ def visit(
             Visit(
                 row=index,
                 iteration=iteration - count + 1 + index,
-                image=image,
+                image=exposed(image, affine),
                 color=color,
                 affine=affine,
                 inverse_depth=inverse,
@@ -122,10 +100,11 @@ def cells(columns: range, rim: int = 0, rows: range = range(50, 80)) -> np.ndarr
     return inside
 
 
+@pytest.mark.parametrize("affine", [None, torch.tensor([[0.6] * 3, [0.1] * 3])], ids=["as it is", "exposed"])
 @pytest.mark.parametrize("columns", [range(100, 116), range(-8, 8)], ids=["middle", "seam"])
-def test_a_figure_in_one_view_is_found_there_and_nowhere_else(columns: range) -> None:
+def test_a_figure_in_one_view_is_found_there_and_nowhere_else(columns: range, affine: Tensor | None) -> None:
     movers = made()
-    visit(movers, {2: figure(2, columns)})
+    visit(movers, {2: figure(2, columns)}, affine=affine)
     found = movers.learnt()
     assert found[2][cells(columns)].mean() > 0.9
     assert not found[2][~cells(columns, rim=3 * CELL)].any()
@@ -184,10 +163,7 @@ def test_what_was_a_mover_stays_one_below_the_factor() -> None:
     columns = range(100, 116)
     black, grey = figure(2, columns), painted(2)
     grey[50:80, 100:116] = grey[50:80, 100:116] // 2 + 12
-    fresh, known = (
-        made(config=MoversConfig(weigh=True, factor=10)),
-        made(config=MoversConfig(weigh=True, factor=10)),
-    )
+    fresh, known = (made(config=MoversConfig(weigh=True, factor=10)) for _ in range(2))
     visit(fresh, {2: grey})
     assert not fresh.learnt().any()
     visit(known, {2: black})
@@ -260,35 +236,15 @@ def test_an_iteration_that_did_not_take_place_says_nothing() -> None:
     assert movers.learnt()[2].any()
 
 
-def test_it_goes_on_from_a_checkpoint() -> None:
-    """Also between two judgements: the views since the last one are known."""
-    whole, first, second = made(), made(), made()
-    photographs = {2: figure(2, range(100, 116)), 4: figure(4, range(20, 40))}
-    visit(whole, photographs, iteration=LATE - 2)
-    visit(first, photographs, iteration=LATE - 2)
-    second.restore({name: tensor.clone() for name, tensor in first.tensors().items()})
-    for movers in (whole, second):
-        assert not movers.learnt().any()
-        visit(movers, photographs, iteration=LATE + 1)
-    assert whole.learnt()[4].any()
-    for name, tensor in whole.tensors().items():
-        assert torch.equal(tensor, second.tensors()[name]), name
-
-
 def test_no_number_of_threads_changes_a_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
-    results = []
-    threads = torch.get_num_threads()
-    generator = torch.Generator().manual_seed(0)
+    results, generator = [], torch.Generator().manual_seed(0)
     noise = {i: (torch.rand((HEIGHT, WIDTH, 3), generator=generator) * 255).byte() for i in range(6)}
     monkeypatch.setattr(module, "_MOST", 1.0)
-    try:
-        for count in (1, 2, 5):
-            torch.set_num_threads(count)
+    for count in (1, 2, 5):
+        with threads(count):
             movers = made(config=MoversConfig(weigh=True, factor=1))
             visit(movers, noise)
-            results.append({name: tensor.numpy().tobytes() for name, tensor in movers.tensors().items()})
-    finally:
-        torch.set_num_threads(threads)
+        results.append({name: tensor.numpy().tobytes() for name, tensor in movers.tensors().items()})
     assert results[0] == results[1] == results[2]
 
 

@@ -75,18 +75,6 @@ def test_what_goes_on_across_the_face_is_an_error_but_no_step() -> None:
     assert step == pytest.approx(0.0, abs=1e-12)
 
 
-def test_sums_of_strips_are_joined() -> None:
-    found, whole, joined = strip(), Errors(), Errors()
-    random = np.random.default_rng(1)
-    for _ in range(2):
-        color, truth = random.integers(0, 255, (2, len(found.pixels), 3)).astype(np.uint8)
-        part = Errors()
-        part.add(PLANE, found, color, truth, 1.0)
-        whole.add(PLANE, found, color, truth, 1.0)
-        joined.join(part)
-    assert joined == whole
-
-
 def test_nothing_seen_has_no_errors() -> None:
     assert Errors().means == (None, None)
     assert set(Difference().means.values()) == {None}
