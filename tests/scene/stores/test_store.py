@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from s3fs import S3FileSystem
 
 from panolog.scene.errors import ConfigError, StoreError, StoreLostError
 from panolog.scene.stores.cache import BOUND, FOLDER, Cache, Stored
@@ -23,9 +24,11 @@ def server() -> Iterator[ObjectStore]:
 
 @pytest.fixture(autouse=True)
 def credentials(server: ObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They lead to the server. What fails is tried again by our code alone, not by the provider's before."""
     server.faults.clear()
     server.down = False
-    for name, value in server.environment.items():
+    monkeypatch.setattr(S3FileSystem, "retries", 1)
+    for name, value in (server.environment | {"AWS_MAX_ATTEMPTS": "1"}).items():
         monkeypatch.setenv(name, value)
     monkeypatch.setenv(FOLDER, str(tmp_path / "cache"))
 
