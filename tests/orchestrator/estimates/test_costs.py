@@ -3,26 +3,16 @@ import pytest
 from panolog.orchestrator.estimates.costs import BlockTime, CostModel, block_times, fit, seconds_left
 from panolog.orchestrator.run.records import (
     BlockPlan,
-    ModelSaved,
     PlanSaved,
     Progressed,
-    Record,
-    Stored,
-    TaskStarted,
 )
-from panolog.orchestrator.run.state import RunState, TaskState, replay
+from panolog.orchestrator.run.state import TaskState
 from panolog.workers.tasks import TaskId
+from tests.orchestrator.history import after, model, started
 
 BLOCKS = [(c, g) for c in (5, 20, 80) for g in (1_000, 30_000)]
+ZERO, ONE = TaskId.block(0), TaskId.block(1)
 PLAN = PlanSaved("plan.json", (BlockPlan(0, 8, 100, train=True), BlockPlan(1, 4, 50, train=True)))
-
-
-def state(*records: Record) -> RunState:
-    return replay(Stored(i, float(i), record) for i, record in enumerate(records))
-
-
-def started(task: TaskId, iteration: int = 0) -> TaskStarted:
-    return TaskStarted(task, 1, iteration, "node", 1, "cuda", 1, "fast")
 
 
 def test_before_anything_is_measured_the_order_is_that_of_cameras_times_gaussians() -> None:
@@ -54,25 +44,21 @@ def test_slower_places_are_found_out() -> None:
 
 
 def test_a_resumed_block_is_measured_by_what_its_last_attempt_did() -> None:
-    done = state(
-        PLAN, started(TaskId.block(0), 75), ModelSaved(TaskId.block(0), "m", 1, 1, 100, seconds=10.0)
-    )
+    done = after(PLAN, started(ZERO, 75, place="fast"), model(ZERO, 100, seconds=10.0))
     assert block_times(done) == [BlockTime(8, 100, "fast", 40.0)]
-    resumed_at_its_end = state(
-        PLAN, started(TaskId.block(0), 100), ModelSaved(TaskId.block(0), "m", 1, 1, 100, 0.1)
-    )
+    resumed_at_its_end = after(PLAN, started(ZERO, 100, place="fast"), model(ZERO, 100, seconds=0.1))
     assert block_times(resumed_at_its_end) == []
 
 
 def test_a_running_block_counts_once_it_is_well_on_its_way() -> None:
-    early = state(PLAN, started(TaskId.block(1), 50), Progressed(TaskId.block(1), 53, 100, rate=2.0))
-    assert block_times(early) == []
-    later = state(PLAN, started(TaskId.block(1), 50), Progressed(TaskId.block(1), 55, 100, rate=2.0))
+    resumed = started(ONE, 50, place="fast")
+    assert block_times(after(PLAN, resumed, Progressed(ONE, 53, 100, rate=2.0))) == []
+    later = after(PLAN, resumed, Progressed(ONE, 55, 100, rate=2.0))
     assert block_times(later) == [BlockTime(4, 50, "fast", 50.0)]
 
 
 def test_what_a_running_task_still_needs() -> None:
-    task = TaskState(TaskId.block(0), begun=50, progress=Progressed(TaskId.block(0), 60, 100, rate=4.0))
+    task = TaskState(ZERO, begun=50, progress=Progressed(ZERO, 60, 100, rate=4.0))
     assert seconds_left(task, predicted=99, running=1) == 10
-    assert seconds_left(TaskState(TaskId.block(0)), predicted=30, running=10) == 20
-    assert seconds_left(TaskState(TaskId.block(0)), predicted=30, running=50) == 0
+    assert seconds_left(TaskState(ZERO), predicted=30, running=10) == 20
+    assert seconds_left(TaskState(ZERO), predicted=30, running=50) == 0

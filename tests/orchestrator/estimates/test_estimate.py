@@ -52,10 +52,11 @@ def test_memory_is_the_calibrations_and_what_more_gaussians_and_panoramas_take(t
     assert tight.host(12_000, 4) - alone == int(1e-5 * 2**30)
 
 
-def test_checkpoints_take_memory_too(tmp_path: Path) -> None:
-    saving, not_saving = estimator(tmp_path, checkpoint={"every": 100}), estimator(tmp_path)
-    more = saving.host(100_000, 0) - not_saving.host(100_000, 0)
-    assert more == 100_000 * 2 * CHECKPOINT
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_checkpoints_take_memory_of_the_host_and_none_of_a_gpu(tmp_path: Path, device: str) -> None:
+    saving, not_saving = (estimator(tmp_path, device=device, checkpoint={"every": n}) for n in (100, 1000))
+    assert saving.host(100_000, 0) - not_saving.host(100_000, 0) == 100_000 * 2 * CHECKPOINT
+    assert saving.device(10_000_000) == not_saving.device(10_000_000)
 
 
 def test_what_is_kept_of_movers_is_in_the_memory_of_stage_one(tmp_path: Path) -> None:
@@ -142,14 +143,6 @@ def test_a_block_with_a_baked_exterior_trains_what_its_cell_has(tmp_path: Path) 
     assert whole.block(50_000, 1_000, 4) == whole.block(50_000, 20_000, 4), "it trains with all of Stage I"
 
 
-def test_copies_for_a_checkpoint_are_not_in_the_memory_of_a_gpu(tmp_path: Path) -> None:
-    """They made 3,236 bytes of a Gaussian out of 1,788, and jobs that fit were refused."""
-    saving = estimator(tmp_path, device="cuda", checkpoint={"every": 100})
-    not_saving = estimator(tmp_path, device="cuda")
-    assert saving.device(10_000_000) == not_saving.device(10_000_000)
-    assert saving.host(10_000_000, 0) - not_saving.host(10_000_000, 0) == 10_000_000 * 2 * CHECKPOINT
-
-
 def test_what_was_not_measured_is_counted_on_a_gpu(tmp_path: Path) -> None:
     job = estimator(tmp_path, device="cuda")
     job = replace(job, basis=assumed(job.scene, job.config))
@@ -160,11 +153,14 @@ def test_what_was_not_measured_is_counted_on_a_gpu(tmp_path: Path) -> None:
     assert job.rendering(1_000_000, 0)[1] == rendering + views + CONTEXT
 
 
-def test_a_cap_on_gaussians_caps_the_estimate(tmp_path: Path) -> None:
-    free = estimator(tmp_path, sky={"count": 0}).estimate()
-    capped = estimator(tmp_path, sky={"count": 0}, densify={"max_gaussians": 250}).estimate()
-    assert stage(free, Stage.BLOCK).gaussians > 250
-    assert stage(capped, Stage.BLOCK).gaussians == 250
+def test_disk_is_taken_by_models_and_checkpoints_that_stay(tmp_path: Path) -> None:
+    sizes = [estimator(tmp_path, retention={"checkpoints": kept}).estimate().disk for kept in (1, 2, 4)]
+    assert sizes[2] - sizes[1] == 2 * (sizes[1] - sizes[0]) > 0
+    assert estimator(tmp_path, refine=False).estimate().disk < sizes[0]
+    free, capped = (
+        estimator(tmp_path, sky={"count": 0}, densify={"max_gaussians": most}).estimate() for most in (0, 250)
+    )
+    assert stage(free, Stage.BLOCK).gaussians > stage(capped, Stage.BLOCK).gaussians == 250
     assert capped.disk < free.disk
 
 
@@ -175,17 +171,6 @@ def test_progress_and_previews_of_every_task_take_disk(tmp_path: Path) -> None:
     previews = thinning.PREVIEWS * WIDTH * WIDTH * 0.3
     kept = 1_000 * (thinning.DENSE * thinning.ROW + previews)
     assert kept < estimated.disk < 5 * kept
-
-
-def test_each_checkpoint_that_stays_takes_disk(tmp_path: Path) -> None:
-    sizes = [estimator(tmp_path, retention={"checkpoints": kept}).estimate().disk for kept in (1, 2, 4)]
-    assert sizes[2] - sizes[1] == 2 * (sizes[1] - sizes[0]) > 0
-
-
-def test_without_refinement_there_are_no_blocks(tmp_path: Path) -> None:
-    whole = estimator(tmp_path, refine=False).estimate()
-    assert [stage.name for stage in whole.stages] == [Stage.COARSE, Stage.MERGE, Stage.EVAL, Stage.DELIVER]
-    assert whole.disk < estimator(tmp_path).estimate().disk
 
 
 def test_districts_have_a_part_of_the_cameras_and_of_the_points(tmp_path: Path) -> None:
@@ -210,13 +195,6 @@ def test_a_district_grows_as_a_place_with_its_points(tmp_path: Path) -> None:
     district = stage(job.estimate(), Stage.DISTRICT).gaussians
     assert district == stage(alone.estimate(), Stage.COARSE).gaussians
     assert stage(job.estimate(), Stage.COARSE).gaussians == pytest.approx(district / share, rel=0.02)
-
-
-def test_what_nobody_measured_has_no_time(tmp_path: Path) -> None:
-    job = estimator(tmp_path)
-    guess = replace(job, basis=assumed(job.scene, job.config)).estimate()
-    assert guess.seconds is None
-    assert stage(guess, Stage.COARSE).host > 0
 
 
 def test_a_run_remembers_what_it_was_estimated_on(tmp_path: Path) -> None:

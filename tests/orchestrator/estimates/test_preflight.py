@@ -18,14 +18,15 @@ from panolog.orchestrator.run.machines.config import DeadlinesConfig
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
-from panolog.workers.events import Event, IterationCost
+from panolog.workers.events import Calibration, IterationCost
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import CALIBRATE, Stage, TaskId
 from tests.orchestrator.calibrated import MEBI, calibrated, says
-from tests.orchestrator.fakes import CrashError, FakePool
+from tests.orchestrator.fakes import FakePool, fails
 from tests.workers.small import small_scene
 
 PLENTY = 2**50
+TIMES = 50  # as many points as the scene has
 
 
 @pytest.fixture
@@ -100,17 +101,22 @@ def test_a_value_that_is_proposed_fits_and_a_larger_one_would_not(
     assert not fits(float(found[1]) + more)
 
 
-def growing(scene: Scene, times: int = 500, **settings: Any) -> Preflight:
+def light(_: TaskSpec) -> Iterator[Calibration]:
+    """Workers that need 40 MiB besides Gaussians: of few, which are soon counted, tasks are large then."""
+    initial, grown = IterationCost(1_000, 0.011, 41 * MEBI, 0), IterationCost(11_000, 0.021, 60 * MEBI, 0)
+    yield calibrated(initial=initial, grown=grown)
+
+
+def growing(scene: Scene, **settings: Any) -> Preflight:
     """A job whose Stage I is expected to come to many Gaussians, on a machine with plenty of memory."""
-    cloud = replace(scene, points=scene.points.repeat(times, axis=0))
-    return examined(cloud, **settings)
+    cloud = replace(scene, points=scene.points.repeat(TIMES, axis=0))
+    return examined(cloud, script=light, **settings)
 
 
 @pytest.mark.parametrize(("recipe", "blocks"), [("paper", "2x1x1"), ("paper", "auto"), ("panolog", "2x1x1")])
 def test_a_task_grows_to_what_its_memory_takes(scene: Scene, recipe: str, blocks: str) -> None:
     """Where the place cannot be divided further."""
     whole: dict[str, Any] = {
-        "times": 100,
         "recipe": recipe,
         "blocks": blocks,
         "stage2": {"detail": 1.0},
@@ -129,7 +135,7 @@ def test_a_task_grows_to_what_its_memory_takes(scene: Scene, recipe: str, blocks
         assert max(stage.host for stage in found.estimate.stages) <= memory * 2**30
         caps.append(found.config.densify.max_gaussians)
         assert f"at most {caps[-1]:,} scene Gaussians" in found.summary()
-    assert 20_000 <= caps[0] < caps[1]
+    assert TIMES * len(scene.points) <= caps[0] < caps[1]
     assert growing(scene, **whole, memory=2 * need).config == free.config.model_copy(
         update={"memory": 2 * need}
     )
@@ -137,7 +143,7 @@ def test_a_task_grows_to_what_its_memory_takes(scene: Scene, recipe: str, blocks
 
 def seen_apart(scene: Scene) -> Scene:
     """The scene of `growing`, each of whose panoramas has seen points of its own."""
-    parts = np.array_split(np.arange(500 * len(scene.points)), len(scene.panoramas))
+    parts = np.array_split(np.arange(TIMES * len(scene.points)), len(scene.panoramas))
     seen = [replace(each, observed=rows) for each, rows in zip(scene.panoramas, parts, strict=True)]
     return replace(scene, panoramas=tuple(seen))
 
@@ -188,12 +194,12 @@ def test_an_evaluation_that_does_not_fit_caps_no_gaussians(scene: Scene) -> None
 
 
 def test_memory_that_takes_not_even_the_sparse_points_is_refused(scene: Scene) -> None:
-    with pytest.raises(InputError, match=r"needs about .* of memory, and 102 MiB are free"):
-        growing(scene, memory=0.1).require()
+    with pytest.raises(InputError, match=r"needs about .* of memory, and 10 MiB are free"):
+        growing(scene, memory=0.01).require()
 
 
 def test_a_cap_that_is_given_stays(scene: Scene) -> None:
-    found = growing(scene, memory=0.3, densify={"max_gaussians": 10**9})
+    found = growing(scene, memory=0.03, densify={"max_gaussians": 10**9})
     assert found.config.densify.max_gaussians == 10**9 and found.problem is not None
 
 
@@ -211,12 +217,12 @@ def test_nothing_is_proposed_where_nothing_helps(scene: Scene) -> None:
     assert "it fits with" not in message
 
 
-def test_a_calibration_that_fails_leaves_assumptions(scene: Scene) -> None:
-    def dies(spec: TaskSpec) -> Iterator[Event]:
-        raise CrashError(Failed("out of memory", Failure.MEMORY))
-        yield  # a generator
-
+def test_a_calibration_that_fails_leaves_assumptions_or_finds_the_input_wrong(scene: Scene) -> None:
+    dies = fails(CALIBRATE, Failed("out of memory", Failure.MEMORY), 1)
     assert examined(scene, script=dies).estimate.seconds is None
+    finds = fails(CALIBRATE, Failed("a.jpg: cannot be decoded", Failure.INPUT), 1)
+    with pytest.raises(InputError, match=r"a\.jpg: cannot be decoded"):
+        examined(scene, script=finds)
 
 
 class SilentPool(FakePool):
@@ -246,28 +252,15 @@ def test_a_calibration_that_hangs_is_ended(scene: Scene, messages: int, *, timed
     assert pool.cancelled == [CALIBRATE]
 
 
-def test_a_calibration_that_finds_the_input_wrong_says_so(scene: Scene) -> None:
-    def finds(spec: TaskSpec) -> Iterator[Event]:
-        raise CrashError(Failed("a.jpg: cannot be decoded", Failure.INPUT))
-        yield  # a generator
-
-    with pytest.raises(InputError, match=r"a\.jpg: cannot be decoded"):
-        examined(scene, script=finds)
-
-
-def test_auto_takes_as_few_blocks_as_memory_allows(scene: Scene) -> None:
+def test_auto_takes_as_few_blocks_as_memory_allows_and_as_keep_the_machines_busy(scene: Scene) -> None:
     assert examined(scene, blocks="auto").config.blocks == "1x1x1"
     for memory, one in ((PLENTY, True), (7 * 2**30, False)):
         job = large(scene, memory, cache={"memory": 64.0})
         job = replace(job, scene=replace(job.scene, train=(0, 1, 2, 3) * 100), nodes=(node(memory, cpus=1),))
         assert (choose_blocks(job) == 1) == one
-
-
-def test_auto_keeps_the_machines_busy_where_there_are_cameras_enough(scene: Scene) -> None:
     job = large(scene, PLENTY)
-    many = replace(job.scene, train=(0, 1, 2, 3) * 16)
-    busy = replace(job, scene=many, nodes=(node(PLENTY), node(PLENTY)))
-    assert choose_blocks(busy) > 1
+    many = replace(job.scene, train=(0, 1, 2, 3) * 16)  # cameras enough
+    assert choose_blocks(replace(job, scene=many, nodes=(node(PLENTY), node(PLENTY)))) > 1
 
 
 def test_a_number_of_blocks_is_balanced(scene: Scene) -> None:

@@ -9,12 +9,13 @@ import torch
 
 from panolog.orchestrator.driver import saving
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import CheckpointSaved, ModelSaved, Noticed, Record, Stored
-from panolog.orchestrator.run.state import RunState, replay
+from panolog.orchestrator.run.records import CheckpointSaved, Noticed
+from panolog.orchestrator.run.state import RunState
 from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, CheckpointWritten
 from panolog.workers.tasks import COARSE
 from panolog.workers.training import checkpoint
+from tests.orchestrator.history import after, model
 
 SCENE = cast(Scene, None)  # no part of a checkpoint
 
@@ -36,11 +37,7 @@ def kept(folder: RunFolder) -> list[int]:
 
 
 def state(*, done: bool = False) -> RunState:
-    records: list[Record] = [
-        CheckpointSaved(COARSE, 50, "", 1),
-        *([ModelSaved(COARSE, "", 1, 1, 60, 1.0)] if done else []),
-    ]
-    return replay(Stored(number, float(number), record) for number, record in enumerate(records, 1))
+    return after(CheckpointSaved(COARSE, 50, "", 1), *([model(COARSE)] if done else []))
 
 
 @pytest.mark.parametrize(
