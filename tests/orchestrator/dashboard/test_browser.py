@@ -213,18 +213,6 @@ def test_pictures_are_compared_and_looked_around_in(town: Page) -> None:
     assert pitch > 0
 
 
-def test_curves_say_what_they_are(town: Page) -> None:
-    titles = town.locator("#charts figcaption").all_inner_texts()
-    assert titles[1:5] == [
-        "PSNR of training views, dB",
-        "Gaussians in training",
-        "Speed, iterations per second",
-        "Memory, GiB",
-    ]
-    expect(town.locator("#charts .xtitle", has_text="iteration")).to_have_count(len(titles))
-    expect(town.locator("#charts .legendtext")).to_have_text(["position"])  # of learning rates
-
-
 def test_the_log_is_filtered(town: Page) -> None:
     events = town.locator("#events li")
     expect(events.first).to_be_visible()

@@ -6,11 +6,9 @@ from pathlib import Path
 
 import httpx
 import pytest
-from starlette.testclient import TestClient
 
 from panolog.orchestrator.commands.companion import companion_dashboard
 from panolog.orchestrator.dashboard import discovery, server
-from panolog.orchestrator.dashboard.guard import Access
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.records import Outcome, RunBegan, RunEnded
 from panolog.scene.errors import InputError
@@ -42,18 +40,6 @@ def test_a_search_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert len(found(tmp_path)) == 5
     monkeypatch.setattr(discovery, "_FOLDERS", 20)
     assert found(tmp_path) == set()
-
-
-def test_nothing_is_read_before_a_client_comes(tmp_path: Path) -> None:
-    """A dashboard of many runs shows their names first."""
-    for number in range(3):
-        write_run(tmp_path / str(number))
-    app = server.make_app(tmp_path, Access(None, 1))
-    registry = app.state.registry
-    registry._search()
-    assert {watch.snapshot.row.status for watch in registry._watches.values()} == {"unread"}
-    with TestClient(app):
-        pass  # its end removes its folder
 
 
 def test_a_port_that_is_taken_and_a_folder_that_is_none(tmp_path: Path) -> None:

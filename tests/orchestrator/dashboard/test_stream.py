@@ -14,7 +14,6 @@ import pytest
 
 from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.dashboard.watch import Watch
-from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import ModelSaved, Noticed, RunBegan
 from panolog.orchestrator.run.thinning import DENSE
@@ -46,27 +45,13 @@ def test_the_first_message_is_everything(tmp_path: Path) -> None:
     assert page == now
 
 
-def test_changes_arrive(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", [started(COARSE)])
-    with (
-        serving(tmp_path) as served,
-        lock.hold(folder.lock),
-        streaming(served, f"?run={served.id('run')}") as messages,
-    ):
-        assert until(messages, "run")["summary"]["status"] == "running"
-        for iteration in (10, 20):
-            append(folder, progressed(COARSE, iteration - 1), progressed(COARSE, iteration))
-            page, news = until(messages, "run"), until(messages, "events")
-            assert page["summary"]["tasks"][0]["iteration"] == iteration
-            assert [event["iteration"] for event in news["events"]] == [iteration]
-
-
 def test_small_changes_are_small(tmp_path: Path) -> None:
     folder = write_whole_run(tmp_path / "run")
     with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}&changes=1") as messages:
         whole = until(messages, "run")
-        append(folder, progressed(TaskId.block(0), 77))
-        changes = until(messages, "changes")
+        append(folder, progressed(TaskId.block(0), 76), progressed(TaskId.block(0), 77))
+        changes, news = until(messages, "changes"), until(messages, "events")
+        assert [event["iteration"] for event in news["events"]] == [77]  # of progress only the latest
         assert [task["name"] for task in changes["tasks"]] == ["block/000"]
         assert changes["tasks"][0]["iteration"] == 77
         assert "tasks" not in changes["summary"]

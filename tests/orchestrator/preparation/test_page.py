@@ -63,20 +63,14 @@ def served(folder: RunFolder) -> Iterator[Served]:
         yield server
 
 
-def test_the_preparation_is_shown_while_it_goes_on(folder: RunFolder, served: Served) -> None:
+def test_the_preparation_is_shown_while_it_is_at_work(folder: RunFolder, served: Served) -> None:
     path = f"/api/runs/{served.id('walk')}"
     with lock.hold(folder.lock):
         page = served.get(path)
-        assert (page["summary"]["status"], page["summary"]["label"]) == ("running", "preparing")
         assert page["summary"]["step"] == "depth 3 of 10"
-        assert [stage["name"] for stage in page["stages"]][:3] == ["prepare", "calibrate", "coarse"]
         assert page["stages"][0]["progress"] == pytest.approx(1.3 / 3)
         assert page["progress"] == pytest.approx(0.1 * 1.3 / 3)
-        view = page["preparation"]
-        assert (view["frames"], view["panoramas"], view["registered"]) == (900, 12, 10)
-        assert [step["status"] for step in view["steps"]] == ["done", "running", "waiting"]
-        note(folder, 7)
-        assert served.get(path)["summary"]["step"] == "depth 7 of 10"
+        assert [step["status"] for step in page["preparation"]["steps"]] == ["done", "running", "waiting"]
         (row,) = served.get("/api/runs")["runs"]
         assert (row["status"], row["label"], row["stage"]) == ("running", "preparing", "prepare")
     stopped = served.get(path)

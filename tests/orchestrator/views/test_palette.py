@@ -1,8 +1,6 @@
-"""The colours of blocks: apart from each other for all eyes and from states, visible on light and dark."""
+"""The colours of blocks: apart from each other for all eyes, and visible on light and dark."""
 
-import re
 from itertools import combinations, pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +8,6 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.views.palette import BLOCK_COLORS, block_color
 
-STYLE = Path(__file__).parents[3] / "orchestrator" / "dashboard" / "static" / "shared" / "base.css"
 # Linear RGB as seen with no red and with no green cones: Machado, Oliveira and Fernandes 2009, severity 1.
 EYES = {
     "all cones": np.eye(3),
@@ -60,13 +57,3 @@ def test_block_colours_stand_out_from_light_and_dark() -> None:
 def test_blocks_can_be_told_apart(eyes: str) -> None:
     seen = [lab(EYES[eyes] @ linear(color)) for color in BLOCK_COLORS]
     assert min(np.linalg.norm(a - b) for a, b in combinations(seen, 2)) > 19
-
-
-def test_no_block_has_the_colour_of_a_state() -> None:
-    states = re.findall(
-        r"--(?:cell-)?(?:done|paused|failed|running): light-dark\((#\w+), ", STYLE.read_text()
-    )
-    assert len(states) == 8
-    for block, color in enumerate(BLOCK_COLORS):
-        apart = [np.linalg.norm(lab(linear(color)) - lab(linear(state))) for state in states]
-        assert min(apart) > 15, block

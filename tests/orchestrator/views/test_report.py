@@ -130,7 +130,7 @@ def test_a_run_that_has_hardly_begun_has_a_report_too(tmp_path: Path) -> None:
     assert "Timeline" in write_report(folder).read_text()
     with closing(Database(folder.database)) as database:
         database.append([RunBegan("host", 1, resumed=False)])
-    assert "run driver lost" in text_of(write_report(folder).read_text())
+    assert "driver lost" in text_of(write_report(folder).read_text())
 
 
 def test_pictures_are_few_and_small_and_only_the_runs_own(tmp_path: Path) -> None:

@@ -189,6 +189,7 @@ def test_the_walk_plays_pauses_and_follows_its_slider(page: Page) -> None:
 def test_who_wants_no_movement_gets_none(page: Page) -> None:
     page.emulate_media(reduced_motion="reduce")
     page.evaluate("panolog.walk.go(panolog.walk.cameras[5], true)")
+    page.focus("#view")
     page.keyboard.press(".")
     assert page.evaluate("panolog.flight.travels") is False
     assert page.evaluate("panolog.flight.position[0]") == 0

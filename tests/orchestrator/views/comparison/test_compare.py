@@ -78,61 +78,37 @@ def test_settings_that_differ_also_from_an_older_version(tmp_path: Path) -> None
     assert len(settings["former"].values[1]) < 250
 
 
-def unfinished(name: str) -> Callable[[Path], RunFolder]:
-    begun: list[tuple[float, Record]] = [
-        (0.0, RunBegan("host", 1, resumed=False)),
-        (0.0, started(COARSE)),
-        (9.0, progressed(COARSE, 50, 9)),
-    ]
-    return lambda root: write(root / name, records=begun)
+BEGUN: list[tuple[float, Record]] = [
+    (0.0, RunBegan("host", 1, resumed=False)),
+    (0.0, started(COARSE)),
+    (9.0, progressed(COARSE, 50, 9)),
+]
+UNFAIR: dict[str, dict[str, Any]] = {  # line -> how the second run differs from the first
+    "not finished: b (driver lost, ": {"records": BEGUN},
+    "not measured yet, without metrics: b": {"measured": None},
+    "not of the same scene: a ffffffffffff, b eeeeeeeeeeee": {"fingerprint": "e" * 64},
+    "not measured at the same width: a 64 pixels, b 128 pixels": {"measured": metrics(width=128)},
+    "not measured with the same crop at the bottom: a 0, b 0.1": {"measured": metrics(crop_bottom=0.1)},
+    "not measured with the same levels of detail: a none, b of 2 pixels": {"measured": metrics(detail=2.0)},
+    "not measured on the same panoramas: a on 3, b on 2; differences are of the 1 that both have": {
+        "measured": metrics({"a.jpg": 1.0, "z.jpg": 2.0})
+    },
+    "b: its metrics are of a model with 650 Gaussians, and the run's has 700": {
+        "measured": metrics(gaussians=650)
+    },
+    "not on the same machines, so their minutes say little: a host (cpu), b other (cpu)": {
+        "records": finished("other")
+    },
+    "not finished: b (failed, ": {"records": [*finished()[:-1], (190, RunEnded(Outcome.FAILED, "x"))]},
+}
 
 
-@pytest.mark.parametrize(
-    ("second", "line"),
-    [
-        (unfinished("b"), "not finished: b (driver lost, "),
-        (unfinished("b"), "not measured yet, without metrics: b"),
-        (
-            lambda root: write(root / "b", fingerprint="e" * 64, measured=metrics()),
-            "not of the same scene: a ffffffffffff, b eeeeeeeeeeee",
-        ),
-        (
-            lambda root: write(root / "b", measured=metrics(width=128)),
-            "not measured at the same width: a 64 pixels, b 128 pixels",
-        ),
-        (
-            lambda root: write(root / "b", measured=metrics(crop_bottom=0.1)),
-            "not measured with the same crop at the bottom: a 0, b 0.1",
-        ),
-        (
-            lambda root: write(root / "b", measured=metrics(detail=2.0)),
-            "not measured with the same levels of detail: a none, b of 2 pixels",
-        ),
-        (
-            lambda root: write(root / "b", measured=metrics({"a.jpg": 1.0, "z.jpg": 2.0})),
-            "not measured on the same panoramas: a on 3, b on 2; differences are of the 1 that both have",
-        ),
-        (
-            lambda root: write(root / "b", measured=metrics(gaussians=650)),
-            "b: its metrics are of a model with 650 Gaussians, and the run's has 700",
-        ),
-        (
-            lambda root: write(root / "b", records=finished("other"), measured=metrics()),
-            "not on the same machines, so their minutes say little: a host (cpu), b other (cpu)",
-        ),
-        (
-            lambda root: write(
-                root / "b",
-                records=[*finished()[:-1], (190, RunEnded(Outcome.FAILED, "x"))],
-                measured=metrics(),
-            ),
-            "not finished: b (failed, ",
-        ),
-    ],
-)
-def test_what_is_not_fair_is_said(tmp_path: Path, second: Callable[[Path], RunFolder], line: str) -> None:
-    comparison = compared(write(tmp_path / "a", measured=metrics()), second(tmp_path))
-    assert [one for one in comparison.warnings if one.startswith(line)], comparison.warnings
+@pytest.mark.parametrize("line", UNFAIR)
+def test_what_is_not_fair_is_said(tmp_path: Path, line: str) -> None:
+    first = write(tmp_path / "a", measured=metrics())
+    second = write(tmp_path / "b", **{"measured": metrics(), **UNFAIR[line]})
+    warnings = compared(first, second).warnings
+    assert [one for one in warnings if one.startswith(line)], warnings
 
 
 def test_panoramas_are_not_counted_where_values_cannot_be_compared(tmp_path: Path) -> None:
