@@ -43,6 +43,14 @@ def url_of(served: Served, task: str | None = None, camera: str | None = None) -
     return str(answer.json()["url"])
 
 
+def url_of_both(served: Served) -> str:
+    """The address of a page that two clients have requested at once."""
+    with ThreadPoolExecutor(2) as clients:
+        first, second = clients.map(url_of, [served, served])
+    assert first == second
+    return first
+
+
 def refused(served: Served, task: str | None = None, camera: str | None = None, run: str = "run") -> str:
     """The line of a request that gets no page."""
     answer = request_page(served, task, camera, run)
@@ -80,7 +88,7 @@ def test_the_picture_of_a_page_that_can_reach_nothing_is_that_of_our_renderer(
     def policy(text: str) -> bool:
         return "Content Security Policy" in text
 
-    viewpoints, url = viewpoints_of(folder, "1.jpg"), served.url + url_of(served, camera="1.jpg")
+    viewpoints, url = viewpoints_of(folder, "1.jpg"), f"{served.url}{url_of_both(served)}#camera=1.jpg"
     with opened(browser, url, width=SIZE[0], height=SIZE[1], tolerate=policy) as page:
         picture = shown(page)
         assert page.title() == "model of run"
@@ -114,10 +122,7 @@ def test_only_the_page_itself_is_granted_and_only_to_origins_of_their_own(served
 
 @pytest.mark.system
 def test_a_page_is_made_once_for_all_cameras_and_clients(served: Served) -> None:
-    with ThreadPoolExecutor(2) as clients:
-        first, second = clients.map(url_of, [served, served])
-    assert first == second
-    assert url_of(served, camera="0.jpg") == f"{first}#camera=0.jpg"
+    assert url_of(served, camera="0.jpg") == f"{url_of_both(served)}#camera=0.jpg"
     for name in ("none.jpg", "../0.jpg", ""):
         assert refused(served, camera=name) == "the plan of this run has no such panorama"
 
