@@ -71,7 +71,7 @@ class BakedViews:
     """What some cameras see of an exterior: as many as there is room for stay, the others are in a file.
 
     Those that come first stay. An epoch uses each view once, so no other choice would read less. The file has
-    no name and ends with its process.
+    no name and ends with its process at the latest.
     """
 
     def __init__(self, room: int, device: torch.device) -> None:
@@ -113,6 +113,12 @@ class BakedViews:
             baked = self._read(row) if coming is None else coming.result()
             self._used = row, baked.to(self._device)
         return self._used[1]
+
+    def close(self) -> None:
+        """Ends the thread that reads, and the file."""
+        self._reader.shutdown(cancel_futures=True)
+        if self._filed:
+            self._file.close()
 
     def _write(self, baked: Baked) -> tuple[int, Baked]:
         if not self._filed:

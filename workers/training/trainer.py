@@ -7,6 +7,7 @@ iteration: a task that resumes from a checkpoint ends with the same bytes as one
 import logging
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from panolog.renderer import ops
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda.iteration import Problem
-from panolog.renderer.render import Render, encode_jpeg, render, to_bytes
+from panolog.renderer.render import encode_jpeg, render, to_bytes
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import PanoramaCache, View
@@ -97,8 +98,10 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
     started = time.monotonic()
     scene, config = spec.scene.load(), spec.config
     rooms = Rooms.of(config.cache, spec.device, scene.panoramas[spec.views[0]], spec.width, bakes=spec.bakes)
-    with open_cache(spec, scene, spec.views, rooms.host, rooms.device) as cache:
-        trainer = Trainer(spec, scene, cache, rooms.baked)
+    with (
+        open_cache(spec, scene, spec.views, rooms.host, rooms.device) as cache,
+        closing(Trainer(spec, scene, cache, rooms.baked)) as trainer,
+    ):
         trainer.begin() if spec.checkpoint is None else trainer.restore(spec.checkpoint.load())
         count, start = len(trainer.state.gaussians), trainer.iteration
         _LOG.info("%s: trains %d Gaussians from iteration %d of %d", spec.task, count, start, spec.iterations)
@@ -131,14 +134,9 @@ class Trainer:
         self.loss = Loss(scene, spec.config, spec.seed, self.schedule)
         self.meter = Meter(spec.task, spec.iterations, spec.device)
         self.saver = Saver(spec.config.checkpoint, spec.outbox, spec.device)
-        self.device = torch.device(spec.device)
-        launch = ops.launcher(self.device)
-        broken = lambda what, plan: self._not_finite(what, plan.iteration, plan.view)  # noqa: E731
-        self.pipeline = (
-            Direct(self.meter.count, broken)
-            if launch is None
-            else Pipeline(launch, self.device, self.meter.count, broken)
-        )
+        device = self.device = torch.device(spec.device)
+        launch, count, broken = ops.launcher(device), self.meter.count, self._not_finite
+        self.pipeline = Direct(count, broken) if launch is None else Pipeline(launch, device, count, broken)
         self.learning = Learning(
             scene,
             spec.views,
@@ -255,13 +253,18 @@ class Trainer:
         yield from self.saver.finished(wait=True)
 
     def result(self) -> Gaussians:
-        """The whole model (Stage I), or the block's retained set (eq. 12); drops what surrounds it."""
+        """The whole model (Stage I), or the block's retained set (eq. 12)."""
         self.settle()
-        self.exterior = None
         gaussians = self.state.gaussians.to("cpu")
         if self.spec.cell is None:
             return gaussians
         return retained(gaussians, self.spec.cell, self.spec.config.densify.prune_opacity)
+
+    def close(self) -> None:
+        """Drops what surrounds a block, with its thread and its file; iterations in flight hold theirs."""
+        if self.exterior is not None:
+            self.exterior.views.close()
+        self.exterior = None
 
     def _view(self, iteration: int) -> View:
         """The view of this iteration; the next ones start to decode."""
@@ -294,10 +297,6 @@ class Trainer:
         """What a camera sees of a baked exterior."""
         return None if self.exterior is None else self.exterior.of(row, self._camera(row))
 
-    def _render(self, gaussians: Gaussians, row: int, degree: int, screen: Tensor | None = None) -> Render:
-        camera, around = self._camera(row), self._around(row)
-        return render(gaussians, camera, sh_degree=degree, near=self.near, screen=screen, exterior=around)
-
     def step(self, iteration: int, view: View) -> None:
         """One iteration of eq. 6 on one view. On a card it has only begun, see `pipeline`.
 
@@ -309,8 +308,8 @@ class Trainer:
         """Waits for the iterations that have begun: all is then as after the last. Raises as `step`."""
         self.pipeline.settle()
 
-    def _not_finite(self, what: str, iteration: int, row: int) -> RunError:
-        where = f"iteration {iteration}, view {self.scene.panoramas[row].name}"
+    def _not_finite(self, what: str, plan: Plan) -> RunError:
+        where = f"iteration {plan.iteration}, view {self.scene.panoramas[plan.view].name}"
         return RunError(f"{self.spec.task}: the {what} is not finite at {where}")
 
     def _plan(self, iteration: int, view: View) -> Plan:
@@ -389,11 +388,12 @@ class Trainer:
     def _preview(self) -> Preview:
         """The first training view as rendered now; a darkened photograph where a block draws nothing."""
         self.settle()
-        view = self.views.first(self.spec.views)
+        view, degree = self.views.first(self.spec.views), self.schedule.sh_degree(self.iteration)
+        model, camera, around = self.state.gaussians, self._camera(view.row), self._around(view.row)
         with torch.no_grad():
-            rendered = self._render(self.state.gaussians, view.row, self.schedule.sh_degree(self.iteration))
+            rendered = render(model, camera, sh_degree=degree, near=self.near, exterior=around)
         photograph, picture = view.image.cpu().numpy(), to_bytes(rendered.color)
-        if (around := self._around(view.row)) is not None:
+        if around is not None:
             left_out = ~around.active(self.width, self.width // 2).cpu().numpy()
             picture[left_out] = photograph[left_out] // 4
         jpeg = encode_jpeg(np.concatenate([picture, photograph]), PREVIEW_WIDTH)

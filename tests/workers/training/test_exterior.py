@@ -1,7 +1,11 @@
 """What surrounds a block: frozen or baked, it is the same to the block."""
 
+import gc
+import tempfile
+import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,72 +22,38 @@ from panolog.scene.images import View, load_view, view_bytes
 from panolog.scene.model import Scene
 from panolog.workers.comparison import with_block
 from panolog.workers.events import Checkpoint, Preview
-from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
+from panolog.workers.training import direct
 from panolog.workers.training.config import CacheConfig, TrainConfig
 from panolog.workers.training.exterior import BAKED, Exterior, Rooms, exterior_last, inside
 from panolog.workers.training.loss import Loss, loss_of
 from panolog.workers.training.schedule import Schedule
-from panolog.workers.training.trainer import Trainer, TrainSpec, train
+from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
-from tests.workers.trainings import block_of, coarse_of, notices, same, trained
+from tests.workers.trainings import block_of, coarse_of, notices, same, settings, trained
+
+USUAL: dict[str, Any] = {
+    "projection": "exact",
+    "densify": {"method": "relocate", "until": 24_000, "every_floor": 5, "max_gaussians": 0},
+    "checkpoint": {"every": 7},
+    "preview": {"every": 12},
+}
 
 
-def settings(kind: str, **groups: dict[str, object]) -> TrainConfig:
+def block(scene: Scene, initial: Gaussians, kind: str = "baked", **groups: Any) -> TrainSpec:
     """With an exterior of that kind."""
-    usual: dict[str, object] = {
-        "projection": "exact",
-        "sky": {"count": 60},
-        "densify": {"method": "relocate", "until": 24_000, "every_floor": 5},
-        "stage2": {"exterior": kind},
-        "checkpoint": {"every": 7, "share": 1.0},
-        "preview": {"every": 12},
-    }
-    return TrainConfig.model_validate(usual | groups)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return small_scene(tmp_path_factory.mktemp("scene"))
+    return block_of(coarse_of(scene), initial, **USUAL | {"stage2": {"exterior": kind}} | groups)
 
 
 @pytest.fixture(scope="module")
 def initial(scene: Scene) -> Gaussians:
-    return trained(coarse_of(scene, settings("full")))
-
-
-def block(scene: Scene, initial: Gaussians, config: TrainConfig) -> TrainSpec:
-    return block_of(coarse_of(scene, config), initial)
-
-
-def after_one_step(spec: TrainSpec, scene: Scene) -> tuple[Gaussians, dict[str, Tensor]]:
-    """Gaussians and first moments."""
-    with open_cache(spec, scene, spec.views, 1 << 30, 0) as cache:
-        trainer = Trainer(spec, scene, cache)
-        trainer.begin()
-        list(trainer.surround(lambda: False))
-        list(trainer.run(lambda: True))
-        trainer.exterior = None  # or its thread waits for the garbage collector
-    return trainer.state.gaussians, trainer.state.exp_avg
-
-
-def test_a_step_is_that_with_a_frozen_exterior(scene: Scene, initial: Gaussians) -> None:
-    """With all pixels active; a window of SSIM that reaches over the rim would see something else."""
-    (frozen, expected), (own, found) = (
-        after_one_step(block(scene, initial, settings(kind)), scene) for kind in ("frozen", "baked")
-    )
-    count = frozen.scene.stop
-    assert len(own) == count and own.sky == 0
-    assert len(frozen) == len(initial)
-    for name, moment in found.items():
-        truth = expected[name][:count]
-        assert (moment - truth).norm() <= 0.02 * truth.norm(), name
+    return trained(coarse_of(scene, settings(**USUAL)))
 
 
 def test_a_block_ends_as_with_a_frozen_exterior(scene: Scene, initial: Gaussians) -> None:
     errors = {}
     for kind in ("frozen", "baked"):
-        spec = block(scene, initial, settings(kind))
+        spec = block(scene, initial, kind)
         part = trained(spec)
         assert spec.cell is not None and spec.cell.contains(part.means.numpy()).all() and part.sky == 0
         whole = with_block(initial, spec.cell, part)
@@ -112,14 +82,46 @@ def camera(scene: Scene, row: int) -> Camera:
 
 
 def test_a_stop_while_it_bakes_leaves_a_checkpoint(scene: Scene, initial: Gaussians) -> None:
-    task = block(scene, initial, settings("baked"))
+    task = block(scene, initial)
     *_, last = train(task, stop=lambda: True)
     assert isinstance(last, Checkpoint) and last.iteration == 1
     assert same(trained(replace(task, checkpoint=Value(last))), trained(task))
 
 
+@pytest.mark.parametrize("iterations", [1, 5])
+def test_a_block_that_ends_early_leaves_neither_its_thread_nor_its_file(
+    scene: Scene, initial: Gaussians, iterations: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Although the garbage collector does not run: stopped, or failed while its error is in use."""
+    files: list[Any] = []
+    make = tempfile.TemporaryFile
+
+    def made(**options: Any) -> Any:
+        files.append(make(**options))
+        return files[-1]
+
+    def readers() -> list[str]:
+        return [it.name for it in threading.enumerate() if it.name.startswith("baked")]
+
+    monkeypatch.setattr("panolog.workers.training.exterior.tempfile.TemporaryFile", made)
+    task, calls = block(scene, initial, cache={"memory": 1e-6}), iter(range(99))
+    gc.disable()
+    try:
+        list(train(task, stop=lambda: next(calls) == len(task.views) + iterations))
+        assert not readers() and [file.closed for file in files] == [True]
+        events = train(task)
+        while not readers():
+            next(events)
+        monkeypatch.setattr(direct, "render", lambda *_, **__: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            list(events)
+        assert not readers() and [file.closed for file in files] == [True, True]
+    finally:
+        gc.enable()
+
+
 def test_it_reports_what_was_baked_and_drops_the_model(scene: Scene, initial: Gaussians) -> None:
-    task = block(scene, initial, settings("baked"))
+    task = block(scene, initial)
     events = list(train(task))
     (notice,) = notices(events)
     assert notice.startswith("baked what surrounds the block for 2 panoramas")
@@ -135,7 +137,7 @@ def test_it_reports_what_was_baked_and_drops_the_model(scene: Scene, initial: Ga
 
 @pytest.mark.parametrize("room", [0, 100_000, 1 << 30])
 def test_what_has_no_room_is_read_back_from_a_file(scene: Scene, initial: Gaussians, room: int) -> None:
-    model = exterior_last(initial, block(scene, initial, settings("baked")).cell)
+    model = exterior_last(initial, block(scene, initial).cell)
     exterior, whole = around_of(model, room), around_of(model)
     for row in (0, 1, 2):
         exterior.of(row, camera(scene, row))
@@ -151,17 +153,10 @@ def test_what_has_no_room_is_read_back_from_a_file(scene: Scene, initial: Gaussi
     assert exterior.views.nbytes == sum(whole.of(row, camera(scene, row)).nbytes for row in (0, 1, 2))
 
 
-def test_a_block_ends_with_the_same_bytes_whatever_the_cache(scene: Scene, initial: Gaussians) -> None:
-    one, other = (
-        trained(block(scene, initial, settings("baked", cache={"memory": memory}))) for memory in (1e-6, 4.0)
-    )
-    assert same(one, other)
-
-
 def test_a_full_disk_says_what_to_do(
     scene: Scene, initial: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = exterior_last(initial, block(scene, initial, settings("baked")).cell)
+    model = exterior_last(initial, block(scene, initial).cell)
     full = lambda **_: Path("/dev/full").open("wb", buffering=0)  # noqa: E731, SIM115
     monkeypatch.setattr("panolog.workers.training.exterior.tempfile.TemporaryFile", full)
     with pytest.raises(RunError, match=r"No space left on device.*set TMPDIR"):
@@ -213,7 +208,7 @@ def gradients(
 def test_the_loss_of_active_pixels_has_the_gradient_of_all(tmp_path: Path, initial: Gaussians) -> None:
     """Of L1 and of depth: what is left out is constant. SSIM has windows that reach over the rim."""
     scene = small_scene(tmp_path)
-    spec = block(scene, initial, settings("baked", loss={"lambda_ssim": 0.0}))
+    spec = block(scene, initial, loss={"lambda_ssim": 0.0})
     view = load_view(scene.panoramas[0], 0, WIDTH)
     assert view.mask is not None and view.inverse_depth is not None
     around = around_of(exterior_last(initial, spec.cell)).of(0, camera(scene, 0))
@@ -226,18 +221,13 @@ def test_the_loss_of_active_pixels_has_the_gradient_of_all(tmp_path: Path, initi
         assert part.any()
         assert torch.allclose(part[active], expected[active], rtol=1e-4, atol=1e-9)
         assert not part[~active].any()
-
-
-def test_a_view_that_sees_nothing_of_the_block_changes_nothing(scene: Scene, initial: Gaussians) -> None:
-    spec = block(scene, initial, settings("baked"))
-    around = around_of(exterior_last(initial, spec.cell)).of(0, camera(scene, 0))
-    around.places[:] = -1
-    value, color, _ = gradients(scene, initial, load_view(scene.panoramas[0], 0, WIDTH), spec.config, around)
+    around.places[:] = -1  # a view that sees nothing of the block changes nothing
+    value, color, _ = gradients(scene, initial, view, spec.config, around)
     assert value == 0 and not color.any()
 
 
 def test_a_cell_without_gaussians_stays_empty(scene: Scene, initial: Gaussians) -> None:
-    spec = block(scene, initial, settings("baked"))
+    spec = block(scene, initial)
     within = torch.zeros(len(initial), dtype=torch.bool)
     within[initial.scene] = torch.from_numpy(inside(initial, spec.cell))
     assert len(trained(replace(spec, initial=Value(initial.select(~within))))) == 0
