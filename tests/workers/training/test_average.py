@@ -7,17 +7,17 @@ from typing import Any
 import pytest
 import torch
 
-from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.workers.specs import Value
 from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.initialise import scene_gaussians
 from panolog.workers.training.optimizer import Average
 from panolog.workers.training.schedule import AVERAGED, Schedule
 from panolog.workers.training.trainer import train
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.cuda.stubbed import stubbed
-from tests.workers.small import WIDTH, small_scene
-from tests.workers.trainings import block_of, checkpoints, coarse_of, same, settings, trained, unchanged
+from tests.workers.small import WIDTH
+from tests.workers.trainings import checkpoints, coarse_of, same, settings, trained, unchanged
 
 ITERATIONS = 24
 CALM = {"reset": {"quiet": 1.0}}
@@ -25,17 +25,6 @@ CALM = {"reset": {"quiet": 1.0}}
 
 def config(average: float, **groups: Any) -> TrainConfig:
     return settings(optimizer={"average": average}, checkpoint={"every": 1}, **groups)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return small_scene(tmp_path_factory.mktemp("scene"))
-
-
-@pytest.fixture(scope="module")
-def last(scene: Scene) -> Gaussians:
-    """The model without an average."""
-    return trained(coarse_of(scene, config(0.0)))
 
 
 @pytest.mark.parametrize("iterations", [10, 24, 500, 30_000])
@@ -47,17 +36,15 @@ def test_some_models_count_the_last_among_them(iterations: int, average: float) 
     assert 1 <= len(counted) <= 2 * AVERAGED
     assert len(counted) >= min(AVERAGED, int(iterations * average))
     assert len({b - a for a, b in pairwise(counted)}) <= 1
-
-
-def test_none_counts_in_a_run_without_an_average() -> None:
-    schedule = Schedule(config(0.0), ITERATIONS, 1.0, refine=False)
-    assert not any(schedule.averages(iteration) for iteration in range(1, ITERATIONS + 1))
+    without = Schedule(config(0.0), iterations, 1.0, refine=False)
+    assert not any(without.averages(it) for it in range(1, iterations + 1))
 
 
 def test_the_model_is_the_mean_of_the_last_ones(scene: Scene) -> None:
     events = list(train(coarse_of(scene, config(0.25, **CALM))))
     last = trained(coarse_of(scene, config(0.0, **CALM))).tensors()
     found = trained(events).tensors()
+    assert torch.equal(found["means"][-60:], last["means"][-60:])  # the sky stays where it is
     states = [*(event.tensors for event in checkpoints(events)), last][-6:]
     for name in ("means", "shN", "opacities"):
         expected = torch.stack([state[name].double() for state in states]).mean(0)
@@ -82,22 +69,6 @@ def test_only_models_with_the_same_rows_count(scene: Scene) -> None:
     assert same(long, short)
 
 
-def test_the_sky_stays_where_it_is(scene: Scene, last: Gaussians) -> None:
-    averaged = trained(coarse_of(scene, config(0.25)))
-    assert averaged.sky == last.sky == 60
-    assert torch.equal(averaged.means[-60:], last.means[-60:])
-
-
-def test_a_block_is_averaged_too(scene: Scene, last: Gaussians) -> None:
-    settings = {"stage2": {"exterior": "baked"}, "densify": {"until": 0}}
-    blocks = []
-    for part in (0.25, 0.0):
-        spec = coarse_of(scene, config(part, **settings))
-        blocks.append(trained(block_of(spec, last)))
-    assert abs(len(blocks[0]) - len(blocks[1])) < 5 and len(blocks[0])
-    assert not torch.equal(blocks[0].sh0[:5], blocks[1].sh0[:5])
-
-
 def test_it_is_averaged_on_a_card_as_on_the_cpu(scene: Scene) -> None:
     chosen = config(0.5, sky={"count": 10}, densify={"until": 0}, **CALM)
     spec = coarse_of(scene, chosen, width=WIDTH // 2, iterations=6)
@@ -108,8 +79,8 @@ def test_it_is_averaged_on_a_card_as_on_the_cpu(scene: Scene) -> None:
     assert torch.allclose(found.means, expected.means, atol=1e-3)
 
 
-def test_without_models_the_average_is_the_latest(last: Gaussians) -> None:
-    average = Average()
+def test_without_models_the_average_is_the_latest(scene: Scene) -> None:
+    average, last = Average(), scene_gaussians(scene)
     assert average.take(last) is last and not average.tensors()
     average.add(last)
     average.clear()

@@ -33,6 +33,22 @@ def test_a_truncated_file_is_refused(tmp_path: Path, checkpoint: Checkpoint, len
         load(path)
 
 
+def test_what_fails_half_way_leaves_the_file_before(
+    tmp_path: Path, checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_tensors: object, path: Path, _metadata: object) -> None:
+        path.write_bytes(before[:60])
+        raise OSError("No space left on device")
+
+    path = tmp_path / "a.safetensors"
+    save(path, checkpoint)
+    before = path.read_bytes()
+    monkeypatch.setattr("panolog.workers.training.checkpoint.save_file", full)
+    with pytest.raises(RunError, match=r"cannot write.*No space left"):
+        save(path, checkpoint)
+    assert path.read_bytes() == before and [*tmp_path.iterdir()] == [path]
+
+
 def test_a_missing_file_and_a_missing_folder_are_run_errors(tmp_path: Path, checkpoint: Checkpoint) -> None:
     with pytest.raises(RunError):
         load(tmp_path / "none.safetensors")

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import iteration
 from panolog.renderer.cuda.iteration import Found, Problem
 from panolog.renderer.render import render
-from panolog.scene.gaussians import Gaussians, logit
+from panolog.scene.gaussians import logit
 from panolog.workers.training.config import DensifyConfig
-from panolog.workers.training.densify import Statistics, camera_distances, densify, reset_opacities, rotate
+from panolog.workers.training.densify import Statistics, camera_distances, densify, reset_opacities
+from panolog.workers.training.initialise import isotropic
 from panolog.workers.training.optimizer import ModelState, finite_loss
 from tests.renderer.cuda.emulation import EmulatedLaunch
 
@@ -24,17 +26,11 @@ QUIET, LOUD = 0.0, 1.0  # screen gradients
 
 def state_of(scales: list[float], opacities: list[float], sky: int) -> ModelState:
     """Gaussians identified by their x; all moments are 7."""
-    count = len(scales)
-    gaussians = Gaussians(
-        means=torch.arange(count).float()[:, None] * torch.tensor([100.0, 0, 0]),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        scales=torch.tensor(scales).log()[:, None].repeat(1, 3),
-        opacities=torch.tensor([logit(opacity) for opacity in opacities]),
-        sh0=torch.rand(count, 1, 3, generator=torch.Generator().manual_seed(0)),
-        shN=torch.zeros(count, 15, 3),
-        sky=sky,
-    )
-    state = ModelState.start(gaussians)
+    means = np.arange(len(scales))[:, None] * np.array([100.0, 0, 0])
+    colors = np.random.default_rng(0).uniform(0.5, 0.8, means.shape)
+    gaussians = isotropic(means, np.array(scales), colors, 0.5)
+    gaussians.opacities[:] = torch.tensor([logit(opacity) for opacity in opacities])
+    state = ModelState.start(replace(gaussians, sky=sky))
     for moments in (state.exp_avg, state.exp_avg_sq):
         for moment in moments.values():
             moment.fill_(7)
@@ -170,28 +166,13 @@ def test_a_card_measures_the_same(measure: str, views: str) -> None:
     config = DensifyConfig.model_validate({"measure": measure, "views": views})
     ours, theirs = Statistics.zeros(count - 20, "cpu", config), Statistics.zeros(count - 20, "cpu", config)
     theirs.add(screen, state == ops.VISIBLE, means, camera)
-    problem = Problem(
-        model={"means": means},
-        camera=camera,
-        image=torch.zeros(0),
-        mask=None,
-        depth=None,
-        depth_weight=0,
-        lambda_ssim=0,
-        rows=None,
-        sh_degree=0,
-        near=0,
-    )
-    iteration.add_statistics(
-        EmulatedLaunch(),
-        Found({"screen": screen}, state, torch.zeros(0), torch.zeros(0), torch.zeros(0), None),
-        torch.zeros(1, dtype=torch.int32),
-        problem,
-        ours.gradient,
-        ours.views,
-        angle=measure == "angle",
-        contribution=views == "contribution",
-    )
+    zero = torch.zeros(0)
+    layers: dict[str, Any] = {"image": zero, "mask": None, "depth": None, "rows": None}
+    unused = layers | dict.fromkeys(("depth_weight", "lambda_ssim", "sh_degree", "near"), 0)
+    found = Found({"screen": screen}, state, zero, zero, zero, None)
+    problem = Problem(model={"means": means}, camera=camera, **unused)
+    given = EmulatedLaunch(), found, torch.zeros(1, dtype=torch.int32), problem, ours.gradient, ours.views
+    iteration.add_statistics(*given, angle=measure == "angle", contribution=views == "contribution")
     assert float(theirs.mean().sum()) > 0
     assert torch.allclose(ours.gradient, theirs.gradient, rtol=1e-4)
     assert torch.allclose(ours.views, theirs.views, rtol=1e-4)
@@ -213,24 +194,14 @@ def test_halves_along_the_longest_axis_keep_the_mass() -> None:
     assert halves[2].tolist() == pytest.approx([0.5 / math.sqrt(2)] * 2)
 
 
-def test_reset_spares_the_sky() -> None:
+@pytest.mark.parametrize("rows", [[True, True, True], [False, True, True]])
+def test_reset_spares_the_sky_and_what_it_is_not_for(rows: list[bool]) -> None:
     state = state_of([0.1] * 4, [0.5, 0.008, 0.9, 0.9], sky=1)
-    reset_opacities(state, 0.01, np.ones(3, np.bool_))
-    assert state.gaussians.opacities.sigmoid().tolist() == pytest.approx([0.01, 0.008, 0.01, 0.9])
-    assert state.exp_avg["opacities"].tolist() == state.exp_avg_sq["opacities"].tolist() == [0, 0, 0, 7]
+    reset_opacities(state, 0.01, np.array(rows))
+    first, moment = (0.01, 0) if rows[0] else (0.5, 7)
+    assert state.gaussians.opacities.sigmoid().tolist() == pytest.approx([first, 0.008, 0.01, 0.9])
+    assert state.exp_avg["opacities"].tolist() == state.exp_avg_sq["opacities"].tolist() == [moment, 0, 0, 7]
     assert (state.exp_avg["means"] == 7).all()
-
-
-def test_reset_of_some() -> None:
-    state = state_of([0.1] * 4, [0.5, 0.008, 0.9, 0.9], sky=1)
-    reset_opacities(state, 0.01, np.array([False, True, True]))
-    assert state.gaussians.opacities.sigmoid().tolist() == pytest.approx([0.5, 0.008, 0.01, 0.9])
-    assert state.exp_avg["opacities"].tolist() == state.exp_avg_sq["opacities"].tolist() == [7, 0, 0, 7]
-
-
-def test_rotation_by_a_quaternion_of_any_length() -> None:
-    turned = rotate(torch.tensor([[2.0, 0, 0, 2.0]]), torch.tensor([[1.0, 0, 0]]))
-    assert torch.allclose(turned, torch.tensor([[0.0, 1, 0]]), atol=1e-6)
 
 
 def test_broken_gaussians_are_counted_and_removed() -> None:

@@ -1,15 +1,15 @@
 """Where training starts: sizes from neighbours, the sky on its sphere in the colours of the panoramas."""
 
 import math
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from panolog.partition.bounds import Aabb
+from panolog.partition.cells import Cell, Grid
 from panolog.scene.images import View, exposed, exposure_affine, load_view
 from panolog.scene.model import Scene
 from panolog.workers.training.config import SkyConfig, TrainConfig
@@ -26,12 +26,7 @@ from panolog.workers.training.initialise import (
     sky_gaussians,
 )
 from tests.on_device import view_on_device
-from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH, small_scene
-
-
-@pytest.fixture
-def scene(tmp_path: Path) -> Scene:
-    return small_scene(tmp_path)
+from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH
 
 
 def test_one_gaussian_for_each_point(scene: Scene) -> None:
@@ -72,27 +67,22 @@ def test_sizes_do_not_depend_on_poses_that_are_held_out(scene: Scene) -> None:
     assert torch.equal(scene_gaussians(moved).scales, scene_gaussians(scene).scales)
 
 
-@dataclass(frozen=True)
-class Half:
-    """What lies at positive x."""
-
-    def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
-        return np.asarray(points)[:, 0] >= 0
+HALF = Cell(Aabb(np.full(3, -9.0), np.full(3, 9.0)), Grid((2, 1, 1)), 1)  # what lies at positive x
 
 
 def test_a_district_begins_coarser_where_it_keeps_nothing(scene: Scene) -> None:
     random = np.random.default_rng(2)
     cloud = replace(scene, points=random.uniform(-9, 9, (4000, 3)), colors=np.zeros((4000, 3), np.uint8))
     everything, kept = set(range(4000)), cloud.points[:, 0] >= 0
-    found = points_of(cloud, cloud.train, Half(), WIDTH)
+    found = points_of(cloud, cloud.train, HALF, WIDTH)
     assert set(np.flatnonzero(kept)) <= set(found) < everything
     others = cloud.points[[row for row in found if not kept[row]]]
     distance = np.linalg.norm(others[:, None] - cloud.centers[list(cloud.train)], axis=2).min(axis=1)
     apart, _ = cKDTree(others).query(others, k=2)
     span = OUTSIDE * 2 * math.pi / WIDTH * distance
     assert 0.3 * np.median(span) < np.median(apart[:, 1]) < 2 * np.median(span)
-    assert len(points_of(cloud, cloud.train, Half(), 8 * WIDTH)) > len(found)
-    assert len(scene_gaussians(cloud, cloud.train, Half(), WIDTH)) == len(found)
+    assert len(points_of(cloud, cloud.train, HALF, 8 * WIDTH)) > len(found)
+    assert len(scene_gaussians(cloud, cloud.train, HALF, WIDTH)) == len(found)
 
 
 def test_extent_is_that_of_the_views_trained_on(scene: Scene) -> None:

@@ -16,11 +16,6 @@ from tests.on_device import OnDevice, view_on_device
 from tests.workers.small import AFFINE, RADIUS, WIDTH, small_scene
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> Scene:
-    return small_scene(tmp_path)
-
-
 def view_of(scene: Scene, row: int = 1) -> View:
     return load_view(scene.panoramas[row], row, WIDTH)
 
@@ -62,13 +57,6 @@ def test_each_width_has_an_alignment_of_its_own(scene: Scene) -> None:
     assert ours.target(small) is not None
     found, expected = ours.target(full), theirs.target(full)
     assert found is not None and expected is not None and torch.equal(found[0], expected[0])
-
-
-def test_too_few_points_leave_an_image_out(scene: Scene) -> None:
-    panoramas = tuple(replace(panorama, observed=panorama.observed[:9]) for panorama in scene.panoramas)
-    targets = DepthTargets(replace(scene, panoramas=panoramas), DepthConfig(), 0)
-    assert targets.target(view_of(scene)) is None
-    assert "sparse points" in targets.notices[0]
 
 
 def test_target_is_inverse_depth_and_zero_in_the_sky(scene: Scene) -> None:

@@ -20,7 +20,7 @@ from panolog.workers.training.schedule import Schedule
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.cuda.stubbed import stubbed
 from tests.workers.small import WIDTH, small_scene
-from tests.workers.trainings import coarse_of, trained
+from tests.workers.trainings import RELOCATED, coarse_of, settings, threads, trained
 
 STILL = DensifyConfig(method="relocate", opacity_decay=0, noise=0)  # only what keeps the picture
 
@@ -168,16 +168,13 @@ def test_noise_moves_the_faint_within_their_own_shape() -> None:
 
 def test_threads_do_not_matter() -> None:
     found = []
-    threads = torch.get_num_threads()
+    config = DensifyConfig(method="relocate", weight="gradient", long_axis=True, scale_decay=0.01)
     for count in (1, 3):
-        torch.set_num_threads(count)
-        state = random_state(40_003)
-        config = DensifyConfig(method="relocate", weight="gradient", long_axis=True, scale_decay=0.01)
-        generator = torch.Generator().manual_seed(1)
+        state, generator = random_state(40_003), torch.Generator().manual_seed(1)
         statistics = Statistics(torch.rand(40_000, generator=generator), torch.ones(40_000), config)
-        relocate(state, statistics, config, everywhere(state, 70_000), np.random.default_rng(1))
+        with threads(count):
+            relocate(state, statistics, config, everywhere(state, 70_000), np.random.default_rng(1))
         found.append([t.numpy().tobytes() for t in state.tensors().values()])
-    torch.set_num_threads(threads)
     assert found[0] == found[1]
 
 
@@ -196,23 +193,10 @@ def test_the_budget_rises_evenly_and_ends_where_preflight_says() -> None:
     assert capped.budget(1500, 1000, 32_768) == 1200 and capped.budget(1500, 1300, 32_768) == 1300
 
 
-CONFIG = TrainConfig.model_validate(
-    {
-        "sky": {"count": 20},
-        "densify": {
-            **{"every_floor": 4, "start": 0, "until": 25_000, "growth": 0.3, "method": "relocate"},
-            **{"weight": "gradient", "long_axis": True, "measure": "angle", "views": "contribution"},
-        },
-        "reset": {"every_floor": 9, "opacity": 0.05, "quiet": 0.2},
-        "sh": {"every": 6000},
-        "checkpoint": {"every": 5, "share": 1},
-    }
-)
-
-
 def test_training_ends_with_the_budget(tmp_path: Path) -> None:
-    coarse = coarse_of(small_scene(tmp_path, points=60), CONFIG)
-    schedule = Schedule(CONFIG, 24, extent=1.0, refine=False)
+    config = settings(sky={"count": 20}, densify=RELOCATED)
+    coarse = coarse_of(small_scene(tmp_path, points=60), config)
+    schedule = Schedule(config, 24, extent=1.0, refine=False)
     assert len(trained(coarse)) == schedule.budget(24, 60, WIDTH * WIDTH // 2) + 20 > 100
     with stubbed(EmulatedLaunch()):
         on_card = trained(replace(coarse, width=WIDTH // 2, iterations=9))

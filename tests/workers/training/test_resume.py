@@ -6,23 +6,32 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-import torch
 
-from panolog.renderer import ops
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event
 from panolog.workers.specs import Value
 from panolog.workers.training.trainer import TrainSpec, train
-from tests.workers.small import small_scene
-from tests.workers.trainings import block_of, checkpoints, coarse_of, content, end, same, settings, trained
+from tests.workers.trainings import (
+    RELOCATED,
+    block_of,
+    checkpoints,
+    coarse_of,
+    content,
+    end,
+    same,
+    settings,
+    threads,
+    trained,
+)
 
 Groups = dict[str, Any]
-RELOCATED: Groups = {
-    **{"method": "relocate", "until": 25_000, "growth": 0.3, "weight": "gradient", "long_axis": True},
-    **{"measure": "angle", "views": "contribution", "max_gaussians": 0},
+CAPTURED: Groups = {
+    "densify": {"until": 0},
+    "poses": {"refine": True, "begin": 0.1, "visits": 0},
+    "exposure": {"learn": True, "begin": 0},
+    "movers": {"weigh": True, "factor": 1.2},
 }
-POSES = {"refine": True, "begin": 0.1, "visits": 0}
 COARSE: dict[str, Groups] = {
     "usual": {},
     "pyramid": {"pyramid": {"steps": (0.3, 0.7)}},  # with checkpoints at both sides of each step
@@ -30,7 +39,7 @@ COARSE: dict[str, Groups] = {
     "averaged": {"optimizer": {"average": 0.25}},
     "relocated": {"densify": RELOCATED},
     "relocated, exact": {"densify": RELOCATED, "projection": "exact"},
-    "poses": {"densify": {"until": 0}, "poses": POSES, "exposure": {"learn": True, "begin": 0}},
+    "captured": CAPTURED,
 }
 BLOCKS: dict[str, Groups] = {
     "full": {},
@@ -44,11 +53,6 @@ BLOCKS: dict[str, Groups] = {
         "projection": "exact",
     },
 }
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return small_scene(tmp_path_factory.mktemp("scene"))
 
 
 @pytest.fixture(scope="module")
@@ -87,15 +91,10 @@ def test_a_block(name: str, scene: Scene, initial: Gaussians) -> None:
     assert len(resumed(block_of(coarse_of(scene), initial, **BLOCKS[name])))
 
 
-@pytest.mark.parametrize("name", ["usual", "poses"])
+@pytest.mark.parametrize("name", ["usual", "captured"])
 def test_the_number_of_threads_does_not_matter(name: str, scene: Scene) -> None:
-    spec, before, found = coarse_of(scene, settings(**COARSE[name])), torch.get_num_threads(), []
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            ops.use_threads(count)
+    spec, found = coarse_of(scene, settings(**COARSE[name])), []
+    for count in (1, 3):
+        with threads(count):
             found.append(content(end(spec)))
-    finally:
-        torch.set_num_threads(before)
-        ops.use_threads(None)
     assert found[0] == found[1]

@@ -17,6 +17,7 @@ from panolog.workers.tasks import COARSE
 from panolog.workers.training import checkpoint, saving
 from panolog.workers.training.config import CheckpointConfig
 from panolog.workers.training.saving import Outbox, Saver, Staging
+from tests.on_device import needs_a_card
 
 ONE = {"means": torch.rand(7, 3), "views": torch.arange(7), "sky": torch.tensor(2), "none": torch.rand(0, 3)}
 OTHER = {name: tensor + 1 for name, tensor in ONE.items()}
@@ -154,8 +155,7 @@ def test_on_a_gpu_a_minute_is_between_two_checkpoints(monkeypatch: pytest.Monkey
     assert times(every, "cuda", monkeypatch) == tens
 
 
-@pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA card")
+@needs_a_card
 def test_on_a_card_a_checkpoint_has_the_values_of_its_moment(outbox: Outbox) -> None:
     saver = Saver(CheckpointConfig(), outbox, "cuda")
     there = {name: tensor.cuda() for name, tensor in ONE.items()}

@@ -23,9 +23,13 @@ def test_a_full_run_is_that_of_3dgs() -> None:
 
 
 @pytest.mark.parametrize("iterations", [1, 600, 601, 1_500, 30_000])
-def test_whether_opacities_are_ever_reset(iterations: int) -> None:
-    run = schedule(iterations)
-    assert run.ever_resets == any(run.resets(i) for i in range(1, iterations + 1))
+@pytest.mark.parametrize("calm", [{}, {"reset": "none"}])
+@pytest.mark.parametrize("refine", [False, True])
+def test_whether_opacities_are_ever_reset(iterations: int, calm: dict[str, str], refine: bool) -> None:
+    """A block may do without."""
+    run = schedule(iterations, refine=refine, stage2=calm)
+    resets = any(run.resets(i) for i in range(1, iterations + 1))
+    assert run.ever_resets == resets and not (resets and calm and refine)
 
 
 @pytest.mark.parametrize("iterations", [1, 10, 300, 1000, 7000])
@@ -41,6 +45,7 @@ def test_intervals_of_a_short_run_have_floors() -> None:
     assert [i for i in range(1, 1_501) if short.densifies(i)] == list(range(50, 750, 25))
     assert [i for i in range(1, 1_501) if short.resets(i)] == [300, 600]
     assert short.sh_degree(50) == 1
+    assert schedule(1_500, refine=True).sh_degree(1) == 3  # Stage II uses all harmonics at once
 
 
 def test_opacities_recover_from_a_reset_before_the_next_pruning() -> None:
@@ -57,10 +62,6 @@ def test_opacities_recover_from_a_reset_before_the_next_pruning() -> None:
 def test_no_reset_near_the_end(iterations: int) -> None:
     always = schedule(iterations, densify={"until": 30_000}, reset={"every_floor": 1})
     assert not any(always.resets(i) for i in range(1, iterations + 1) if i > 0.7 * iterations)
-
-
-def test_stage_two_uses_all_harmonics_at_once() -> None:
-    assert schedule(1_500, refine=True).sh_degree(1) == 3
 
 
 def test_a_pyramid_doubles_the_width_in_stage_one() -> None:
@@ -119,13 +120,6 @@ def test_a_block_may_have_a_budget_and_a_decay_of_its_own() -> None:
     assert plain.densify == coarse.densify and plain.budget(900, 1_000, 32_768) == coarse.budget(
         900, 1_000, 32_768
     )
-
-
-def test_a_block_may_do_without_resets() -> None:
-    calm = {"reset": "none"}
-    assert schedule(1_500, stage2=calm).ever_resets
-    assert not schedule(1_500, refine=True, stage2=calm).ever_resets
-    assert schedule(1_500, refine=True).ever_resets
 
 
 def test_a_short_run_has_larger_rates_where_they_follow_its_length() -> None:

@@ -15,18 +15,19 @@ from panolog.scene.gaussians import Gaussians, logit
 from panolog.scene.images import PanoramaCache
 from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event, Preview
-from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
 from panolog.workers.tasks import TaskId
 from panolog.workers.training import direct
 from panolog.workers.training.exterior import inside
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.on_device import ToDevice
-from tests.workers.small import WIDTH, small_scene
+from tests.workers.small import WIDTH
 from tests.workers.trainings import (
+    begun,
     block_of,
     checkpoints,
     coarse_of,
+    end,
     notices,
     progress_of,
     same,
@@ -34,11 +35,6 @@ from tests.workers.trainings import (
     trained,
     unchanged,
 )
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return small_scene(tmp_path_factory.mktemp("scene"))
 
 
 @pytest.fixture(scope="module")
@@ -75,28 +71,20 @@ def test_stage_one_reports_its_events(coarse: TrainSpec, events: list[Event]) ->
     widths = [cv2.imdecode(picture, cv2.IMREAD_COLOR).shape[1] for picture in pictures]  # type: ignore[union-attr]
     assert widths == [WIDTH // 2, WIDTH // 2, WIDTH]
     assert [event.iteration for event in checkpoints(events)] == [5, 10, 15, 20]
-    assert not notices(events)
+    assert not notices(events) and end(events).captured is None
 
 
-def test_a_checkpoint_does_not_change_while_training_continues(coarse: TrainSpec) -> None:
-    stream = train(coarse)
-    first = next(event for event in stream if isinstance(event, Checkpoint))
-    before = {name: tensor.clone() for name, tensor in first.tensors.items()}
-    list(stream)
-    assert unchanged(before, first.tensors)
-
-
-def test_the_seed_matters(coarse: TrainSpec, events: list[Event]) -> None:
-    assert not same(trained(events), trained(replace(coarse, seed=4)))
+def test_the_seed_and_depth_matter(coarse: TrainSpec, events: list[Event]) -> None:
+    for other in ({"seed": 4}, {"config": settings(depth={"w0": 0.0})}):
+        assert not same(trained(events), trained(replace(coarse, **other)))
 
 
 def test_sky_neither_moves_nor_multiplies_in_stage_one_but_learns(
     coarse: TrainSpec, events: list[Event]
 ) -> None:
-    start = trained(replace(coarse, iterations=1))
-    end = trained(events)
-    assert start.sky == end.sky == 60 and len(end) > 200
-    first, last = sky_of(start), sky_of(end)
+    start, found = trained(replace(coarse, iterations=1)), trained(events)
+    assert start.sky == found.sky == 60 and len(found) > 200
+    first, last = sky_of(start), sky_of(found)
     assert torch.equal(first["means"], last["means"]) and torch.equal(first["scales"], last["scales"])
     assert not torch.equal(first["sh0"], last["sh0"])
     assert (last["opacities"].sigmoid() > 0.2).all()  # no reset
@@ -141,19 +129,25 @@ def test_a_block_keeps_only_its_cell_and_leaves_the_sky_alone(
 
 @pytest.mark.parametrize(("reset", "inner", "outer"), [("all", 0, 0), ("cell", 0, 1), ("none", 1, 1)])
 def test_resets_may_spare_what_is_outside_of_a_block(
-    coarse: TrainSpec, events: list[Event], scene: Scene, reset: str, inner: bool, outer: bool
+    coarse: TrainSpec, events: list[Event], reset: str, inner: bool, outer: bool
 ) -> None:
     initial = trained(events)
     high = replace(initial, opacities=torch.full_like(initial.opacities, 3.0))
     task = block_of(coarse, high, stage2={"reset": reset}, densify={"until": 30_000, "gradient": 1e3})
-    with open_cache(task, scene, task.views, 1 << 30, 0) as cache:
-        trainer = Trainer(task, scene, cache)
-        trainer.begin()
+    with begun(task) as trainer:
         list(trainer.run(lambda: trainer.iteration == 9))
     gaussians = trainer.state.gaussians
     kept = (gaussians.opacities[gaussians.scene] > logit(0.05)).numpy()
     within = inside(gaussians, task.cell)
     assert kept[within].any() == inner and kept[~within].any() == outer
+
+
+def test_each_densification_draws_other_numbers(coarse: TrainSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[float] = []
+    name = "panolog.workers.training.trainer.grow"
+    monkeypatch.setattr(name, lambda *arguments: drawn.append(arguments[-1].random()))
+    list(train(coarse))
+    assert len(drawn) == len({*drawn}) > 1
 
 
 def test_what_is_not_finite_ends_the_run_with_a_name(
@@ -182,11 +176,6 @@ def test_images_left_out_of_the_depth_loss_are_named(coarse: TrainSpec) -> None:
     panoramas = tuple(replace(panorama, observed=panorama.observed[:5]) for panorama in scene.panoramas)
     events = train(replace(coarse, scene=Value(replace(scene, panoramas=panoramas)), iterations=8))
     assert sorted(notice.split(" ")[0] for notice in notices(events)) == [f"pano_{i}.png" for i in range(4)]
-
-
-def test_depth_supervision_changes_the_result(coarse: TrainSpec, events: list[Event]) -> None:
-    without = trained(replace(coarse, config=settings(depth={"w0": 0.0})))
-    assert not same(trained(events), without)
 
 
 def test_the_unit_of_length_does_not_matter(coarse: TrainSpec, scene: Scene) -> None:
