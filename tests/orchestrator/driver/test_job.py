@@ -9,43 +9,38 @@ import numpy as np
 import pytest
 
 from panolog.orchestrator.driver.job import Job, Specs
-from panolog.orchestrator.resources.pool import InProcess
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
 from panolog.partition.faces import Plane
-from panolog.scene.files import Locate, here
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.specs import ModelFile
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from panolog.workers.training.trainer import TrainSpec
+from tests.orchestrator.fakes import Noting
 from tests.workers.small import WIDTH, small_scene
 
 BLOCK = (1, 3)  # the cameras of block 0
 OTHERS = (2, 0)  # those that see it besides
 CELL = Cell(aabb(np.eye(3), 2.0), Grid((1, 1, 1)), 0)
+FACES = (Plane(0, 1, 0, 0.5, (0.5, 0.0, 0.0), (0.5, 1.0, 1.0)),)
 
 
-class Offer(InProcess):
-    """Takes the place of a pool, and notes which files tasks are given."""
+class Offer(Noting):
+    """The files and specs of a job whose Stage I and plan are done."""
 
     def __init__(self, folder: Path, **settings: Any) -> None:
+        super().__init__()
         (folder / "scene").mkdir()
-        self.job = Job(
-            RunFolder(folder / "run"), small_scene(folder / "scene"), RunConfig(width=WIDTH, **settings)
-        )
-        self.scene: set[Path] = set()
-        self.run: set[Path] = set()
+        config = RunConfig(width=WIDTH, device="cpu", recipe="paper", **settings)
+        self.job = Job(RunFolder(folder / "run"), small_scene(folder / "scene"), config)
+        self.coarse = self.job.folder.model(COARSE)
         self.specs = Specs(self.job, self)
         plan = SimpleNamespace(
             cameras=lambda _: BLOCK, cell=lambda _: CELL, compared=lambda _, n: (*BLOCK[:n], *OTHERS[:n])
         )
-        vars(self.specs).update(plan=plan, faces=(), _labels=())  # as if Stage I were done
-
-    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
-        self.scene, self.run = set(scene), set(run)
-        return here
+        vars(self.specs).update(plan=plan, faces=(), _labels=())
 
     def images(self, rows: Iterable[int]) -> set[Path]:
         return {file for row in rows for file in self.job.scene.panoramas[row].files}
@@ -53,51 +48,35 @@ class Offer(InProcess):
 
 @pytest.fixture
 def offer(tmp_path: Path) -> Offer:
-    return Offer(tmp_path, device="cpu", recipe="paper")
+    return Offer(tmp_path)
 
 
-def test_stage_one_gets_all_panoramas_to_train_on(offer: Offer) -> None:
-    offer.specs.of(COARSE)
-    assert offer.scene == offer.images(offer.job.scene.train)
-    assert offer.run == set()
-
-
-def test_a_block_gets_its_own_panoramas_and_the_coarse_model(offer: Offer) -> None:
-    spec = offer.specs.of(TaskId.block(0))
-    coarse = offer.job.folder.model(COARSE)
-    assert offer.scene == offer.images(BLOCK)
-    assert isinstance(spec, TrainSpec)
-    assert (spec.initial, offer.run) == (ModelFile(coarse), {coarse})
-    assert (spec.cell, spec.views, spec.compared) == (CELL, BLOCK, ())
-
-
-def test_a_block_also_gets_the_panoramas_that_it_is_compared_on(tmp_path: Path) -> None:
-    offer = Offer(tmp_path, device="cpu", stage2={"compare": 1})
-    spec = offer.specs.of(TaskId.block(0))
-    assert isinstance(spec, TrainSpec) and spec.compared == (1, 2)
-    assert offer.scene == offer.images((*BLOCK, 2))
-
-
-def test_a_shard_gets_its_own_panoramas_and_the_coarse_model(offer: Offer) -> None:
-    offer.specs.of(TaskId.shard(0))
-    assert offer.scene == offer.images(offer.job.shards[0])
-    assert offer.run == {offer.job.folder.model(COARSE)}
-
-
-def test_the_evaluation_gets_the_held_out_panoramas_and_the_merged_model(offer: Offer) -> None:
-    offer.specs.of(EVAL)
-    assert offer.scene == offer.images(offer.job.scene.test)
-    assert offer.run == {offer.job.folder.point_cloud}
-
-
-def test_an_evaluation_of_seams_also_gets_the_training_panoramas_and_the_coarse_model(offer: Offer) -> None:
-    faces = (Plane(0, 1, 0, 0.5, (0.5, 0.0, 0.0), (0.5, 1.0, 1.0)),)
-    vars(offer.specs).update(faces=faces)
+def test_each_task_gets_its_own_panoramas_and_the_model_that_it_needs(offer: Offer) -> None:
+    scene, merged = offer.job.scene, offer.job.folder.point_cloud
+    for task, rows, made in (
+        (COARSE, scene.train, set[Path]()),
+        (TaskId.shard(0), offer.job.shards[0], {offer.coarse}),
+        (TaskId.block(0), BLOCK, {offer.coarse}),
+        (EVAL, scene.test, {merged}),
+    ):
+        offer.specs.of(task)
+        assert (offer.scene, offer.run) == (offer.images(rows), made), task
+    vars(offer.specs).update(faces=FACES)
     spec = offer.specs.of(EVAL)
-    assert isinstance(spec, EvaluateSpec) and spec.seams is not None
-    assert spec.seams.faces == faces
-    assert offer.scene == offer.images((*offer.job.scene.test, *offer.job.scene.train))
-    assert offer.run == {offer.job.folder.point_cloud, offer.job.folder.model(COARSE)}
+    assert isinstance(spec, EvaluateSpec) and spec.seams is not None and spec.seams.faces == FACES
+    assert offer.scene == offer.images((*scene.test, *scene.train))
+    assert offer.run == {merged, offer.coarse}
+
+
+@pytest.mark.parametrize(("compare", "compared"), [(0, ()), (1, (1, 2))])
+def test_a_block_also_gets_the_panoramas_that_it_is_compared_on(
+    tmp_path: Path, compare: int, compared: tuple[int, ...]
+) -> None:
+    offer = Offer(tmp_path, stage2={"compare": compare})
+    spec = offer.specs.of(TaskId.block(0))
+    assert isinstance(spec, TrainSpec) and spec.initial == ModelFile(offer.coarse)
+    assert (spec.cell, spec.views, spec.compared) == (CELL, BLOCK, compared)
+    assert offer.scene == offer.images((*BLOCK, *compared))
 
 
 def test_an_evaluation_fits_poses_where_stage_one_has_refined_them(offer: Offer) -> None:

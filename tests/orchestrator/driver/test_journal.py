@@ -15,10 +15,7 @@ from panolog.orchestrator.driver.journal import Backlog, Journal
 from panolog.orchestrator.run.records import CheckpointSaved, ModelSaved, Noticed, Progressed, RunBegan
 from panolog.orchestrator.run.state import Status
 from panolog.orchestrator.run.store import Database, read_records
-from panolog.workers.events import Event
-from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, TaskId
-from tests.orchestrator.fakes import Harness, well
+from panolog.workers.tasks import COARSE
 
 # A reader that begins to read and does not end.
 _READER = """
@@ -101,17 +98,3 @@ def test_ctrl_c_ends_the_wait(path: Path) -> None:
     finally:
         signal.signal(signal.SIGALRM, before)
     assert read_records(path) == []
-
-
-@pytest.mark.usefixtures("path")
-def test_a_run_survives_a_reader_that_stays_for_long(tmp_path: Path) -> None:
-    harness = Harness(tmp_path)
-
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == TaskId.block(0):
-            with locked(harness.folder.database):
-                yield from list(well(spec))[:2]
-        yield from well(spec)
-
-    assert harness.drive(script).outcome == "done"
-    assert any("is locked by" in record.message for record in harness.records(Noticed))

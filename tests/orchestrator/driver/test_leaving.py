@@ -1,6 +1,7 @@
 """Nodes that announce that they leave: tasks there save a checkpoint and move, and nothing new is placed."""
 
 from collections.abc import Iterator, Set
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -19,13 +20,12 @@ from panolog.orchestrator.run.records import (
     NodeStaying,
     Noticed,
     Outcome,
-    RunBegan,
     Stored,
     TaskFailed,
     TaskStarted,
     TaskYielded,
 )
-from panolog.orchestrator.run.state import RunState, apply, replay
+from panolog.orchestrator.run.state import RunState, apply
 from panolog.scene.errors import RunError
 from panolog.workers.events import Calibration, Checkpoint, Event, Progress
 from panolog.workers.specs import TaskSpec
@@ -33,22 +33,19 @@ from panolog.workers.tasks import COARSE, Stage, TaskId
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator import fakes
 from tests.orchestrator.fakes import LOST_NODE, CrashError, FakePool, Harness, Script, well
+from tests.orchestrator.history import AGAIN, after
 
 A, B = Node("aaaa", "spot-a", 1, 2**40), Node("bbbb", "spot-b", 1, 2**40)
 SOON = LeaveNotice(Leaving.PREEMPTION, 120.0)
 
 
-def state_of(*records: NodeLeaving | NodeStaying | NodeLeft | RunBegan) -> RunState:
-    return replay([Stored(number, 100.0, record) for number, record in enumerate(records, 1)])
-
-
 def test_a_notice_is_recorded_once_and_so_are_its_withdrawal_and_the_end() -> None:
     leaves = [NodeLeaving("aaaa", "spot-a", Leaving.PREEMPTION, 120.0)]
     assert leaving.changes(RunState(), [A, B], {"aaaa": SOON}) == leaves
-    state = state_of(*leaves)
+    state = after(*leaves)
     (known,) = state.leaving()
     assert known.leave is not None
-    assert known.leave.until == 220.0
+    assert known.leave.until == 121.0
     assert leaving.changes(state, [A, B], {"aaaa": LeaveNotice(Leaving.PREEMPTION, 7.0)}) == []
     assert leaving.changes(state, [A, B], {}) == [NodeStaying("aaaa", "spot-a")]
     assert leaving.changes(state, [B], {}) == [NodeLeft("aaaa", "spot-a")]
@@ -56,12 +53,12 @@ def test_a_notice_is_recorded_once_and_so_are_its_withdrawal_and_the_end() -> No
     assert gone.leaving() == ()
     assert leaving.announced(gone, "aaaa")  # what was lost with it is known to be that
     assert leaving.changes(gone, [B], {}) == []
-    assert not leaving.announced(apply(gone, [Stored(3, 240.0, RunBegan("host", 2, True))]), "aaaa")
+    assert not leaving.announced(apply(gone, [Stored(3, 240.0, AGAIN)]), "aaaa")
     assert len(state.notices) == 1
 
 
 def test_what_may_never_come_counts_only_where_another_node_stays() -> None:
-    state = state_of(NodeLeaving("aaaa", "spot-a", Leaving.REBALANCE))
+    state = after(NodeLeaving("aaaa", "spot-a", Leaving.REBALANCE))
     assert leaving.staying(state, [A, B]) == [B]
     assert leaving.staying(state, [A]) == [A]
     both = apply(state, [Stored(2, 100.0, NodeLeaving("bbbb", "spot-b", Leaving.PREEMPTION))])
@@ -155,36 +152,18 @@ def lost_with_node(run: Harness, times: int) -> Script:
     return script
 
 
-def test_losses_by_preemption_are_endless_by_default_and_count_against_no_node(tmp_path: Path) -> None:
-    run = Harness(tmp_path, (A,), retries=0, quarantine={"failures": 1})
-    assert run.drive(lost_with_node(run, LOSSES + 3)).outcome == Outcome.DONE
+@pytest.mark.parametrize("limit", [{}, {"preemptions": LOSSES + 2}])
+def test_losses_by_preemption_are_endless_by_default_and_count_against_no_node(
+    tmp_path: Path, limit: dict[str, int]
+) -> None:
+    run = Harness(tmp_path, (A,), retries=0, quarantine={"failures": 1}, **limit)
+    with pytest.raises(RunError, match="died") if limit else nullcontext():
+        run.drive(lost_with_node(run, LOSSES + 3))
     failed = run.records(TaskFailed)
-    assert len(failed) == LOSSES + 3
-    assert all(record.preempted and not record.final for record in failed)
+    assert [record.final for record in failed] == [False] * (LOSSES + 2) + [bool(limit)]
+    assert all(record.preempted for record in failed)
     assert not run.records(NodeQuarantined)
     assert len(run.records(NodeLeft)) == LOSSES + 3
-
-
-def test_losses_by_preemption_have_a_budget_of_their_own(tmp_path: Path) -> None:
-    run = Harness(tmp_path, (A,), preemptions=2)
-    with pytest.raises(RunError, match="died"):
-        run.drive(lost_with_node(run, 3))
-    failed = run.records(TaskFailed)
-    assert [record.final for record in failed] == [False, False, True]
-    assert [bool(record.then) for record in failed] == [True, True, False]
-
-
-def test_without_announcement_a_lost_machine_counts_as_before(tmp_path: Path) -> None:
-    run = Harness(tmp_path, (A, B))
-
-    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
-        if spec.task == COARSE:
-            raise CrashError(LOST_NODE)
-        yield from well(spec)
-
-    with pytest.raises(RunError):
-        run.drive(script)
-    assert len(run.records(TaskFailed)) == LOSSES + 1
 
 
 def test_a_node_whose_notice_is_withdrawn_is_used_again(tmp_path: Path) -> None:

@@ -31,6 +31,14 @@ def messages(pool: LocalPool, spec: TaskSpec) -> Iterator[Message]:
     return scripted.messages(pool, spec, Placement(pool.nodes()[0].id, cpus=1.0, memory=2**30))
 
 
+def begun(pool: LocalPool, spec: TaskSpec) -> tuple[int, Iterator[Message]]:
+    """The process of a task that has said Hello, and its other messages."""
+    running = messages(pool, spec)
+    hello = next(running)
+    assert isinstance(hello, Hello)
+    return hello.pid, running
+
+
 @pytest.mark.parametrize(
     ("how", "kind", "reason"),
     [
@@ -42,8 +50,7 @@ def messages(pool: LocalPool, spec: TaskSpec) -> Iterator[Message]:
     ],
 )
 def test_a_failure_says_of_which_kind_it_is(pool: LocalPool, how: str, kind: Failure, reason: str) -> None:
-    hello, notice, failed = messages(pool, Fails(how=how))
-    assert isinstance(hello, Hello)
+    _, (notice, failed) = begun(pool, Fails(how=how))
     assert notice == Notice(TASK, how)
     assert isinstance(failed, Failed)
     assert (failed.kind, failed.reason) == (kind, reason)
@@ -56,10 +63,8 @@ def test_a_killed_worker_is_lost_or_had_no_memory(
 ) -> None:
     counted = oom_kills() + kills
     monkeypatch.setattr("panolog.orchestrator.driver.local_pool.oom_kills", lambda: counted)
-    running = messages(pool, Works())
-    hello = next(running)
-    assert isinstance(hello, Hello)
-    os.kill(hello.pid, signal.SIGKILL)
+    pid, running = begun(pool, Works())
+    os.kill(pid, signal.SIGKILL)
     *_, failed = running
     assert isinstance(failed, Failed)
     assert failed.kind == kind
@@ -76,14 +81,12 @@ def test_a_task_that_is_stopped_yields_a_checkpoint_and_ends(pool: LocalPool) ->
 
 
 def test_a_worker_that_hangs_is_cancelled(pool: LocalPool) -> None:
-    running = messages(pool, Works())
-    hello = next(running)
-    assert isinstance(hello, Hello)
-    os.kill(hello.pid, signal.SIGSTOP)
+    pid, _ = begun(pool, Works())
+    os.kill(pid, signal.SIGSTOP)
     pool.cancel(TASK)
-    assert not psutil.pid_exists(hello.pid)
+    assert not psutil.pid_exists(pid)
     assert pool.ready(0.1) == []
-    assert isinstance(next(messages(pool, Works())), Hello)
+    assert begun(pool, Works())
 
 
 def test_a_worker_that_stops_within_a_message_is_lost(
@@ -91,26 +94,15 @@ def test_a_worker_that_stops_within_a_message_is_lost(
 ) -> None:
     monkeypatch.setattr("panolog.orchestrator.driver.local_pool._STALL_S", 1)
     monkeypatch.setattr("panolog.orchestrator.driver.local_pool._EXIT_S", 1.0)
-    running = messages(pool, SendsMuch())
-    hello = next(running)
-    assert isinstance(hello, Hello)
+    pid, running = begun(pool, SendsMuch())
     assert pool.ready(60) == [TASK]  # its beginning: nothing reads the rest yet
-    os.kill(hello.pid, signal.SIGSTOP)
+    os.kill(pid, signal.SIGSTOP)
     assert next(running) == Failed("the worker stopped within a message for 1 s", Failure.LOST)
     assert pool.ready(0.1) == []
 
 
 def test_a_process_that_does_not_end_is_killed(pool: LocalPool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("panolog.orchestrator.driver.local_pool._EXIT_S", 1.0)
-    hello, _, ended = messages(pool, HangsAtExit())
-    assert isinstance(hello, Hello)
+    pid, (_, ended) = begun(pool, HangsAtExit())
     assert isinstance(ended, Ended)
-    assert not psutil.pid_exists(hello.pid)
-
-
-def test_the_pool_ends_although_a_worker_hangs() -> None:
-    with local_pool() as pool:
-        hello = next(messages(pool, Works()))
-        assert isinstance(hello, Hello)
-        os.kill(hello.pid, signal.SIGSTOP)
-    assert not psutil.pid_exists(hello.pid)
+    assert not psutil.pid_exists(pid)

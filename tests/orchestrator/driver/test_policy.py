@@ -1,11 +1,12 @@
 from dataclasses import replace
 from typing import Any
 
+import pytest
+
 from panolog.orchestrator.driver.policy import (
     LOSSES,
     Consequence,
     after_failure,
-    block_order,
     outcome,
     ready,
 )
@@ -16,18 +17,15 @@ from panolog.orchestrator.run.records import (
     Failure,
     MeasuresSaved,
     Merged,
-    ModelSaved,
     Outcome,
     PlanSaved,
     Record,
-    RunBegan,
     ScoresSaved,
-    Stored,
     TaskFailed,
-    TaskStarted,
 )
-from panolog.orchestrator.run.state import RunState, TaskState, replay
+from panolog.orchestrator.run.state import TaskState
 from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, TaskId
+from tests.orchestrator.history import AGAIN, after, model, started
 
 BLOCKS = (
     BlockPlan(0, cameras=4, gaussians=100, train=True),
@@ -35,10 +33,6 @@ BLOCKS = (
     BlockPlan(2, cameras=0, gaussians=50, train=False),
     BlockPlan(3, cameras=7, gaussians=100, train=True),
 )
-
-
-def model(task: TaskId) -> ModelSaved:
-    return ModelSaved(task, "model.ply", 1, 1, 1, 1.0)
 
 
 STAGE_ONE = model(COARSE)
@@ -49,16 +43,12 @@ MERGED = Merged("point_cloud.ply", 1, 0, 1, 1.0)
 EVALUATED = EvaluationSaved("metrics.json", {})
 
 
-def state(*records: Record) -> RunState:
-    return replay(Stored(i, 0.0, record) for i, record in enumerate(records))
-
-
-def next_tasks(*records: Record, refine: bool = True) -> tuple[TaskId, ...]:
-    return ready(state(*records), shards=2, refine=refine)
+def next_tasks(*records: Record, districts: int = 1) -> tuple[TaskId, ...]:
+    return ready(after(*records), shards=2, refine=True, districts=districts)
 
 
 def end(*records: Record) -> tuple[Outcome, str] | None:
-    return outcome(state(*records), shards=2, refine=True)
+    return outcome(after(*records), shards=2, refine=True)
 
 
 def test_stages_follow_each_other() -> None:
@@ -90,19 +80,11 @@ def test_shards_of_the_evaluation_come_before_it() -> None:
 
 def test_districts_come_before_their_union() -> None:
     both = TaskId.district(0), TaskId.district(1)
-
-    def next_of(*records: Record) -> tuple[TaskId, ...]:
-        return ready(state(*records), shards=2, refine=True, districts=2)
-
-    assert next_of() == both
-    assert next_of(model(both[0])) == (both[1],)
-    assert next_of(*map(model, both)) == (COARSE,)
-    assert next_of(*map(model, both), STAGE_ONE) == (TaskId.shard(0), TaskId.shard(1))
-    failed = TaskFailed(both[1], 3, "NaN", final=True)
-    assert outcome(state(failed), shards=2, refine=True, districts=2) == (
-        "failed",
-        "district/001 failed: NaN",
-    )
+    assert next_tasks(districts=2) == both
+    assert next_tasks(model(both[0]), districts=2) == (both[1],)
+    assert next_tasks(*map(model, both), districts=2) == (COARSE,)
+    assert next_tasks(*map(model, both), STAGE_ONE, districts=2) == (TaskId.shard(0), TaskId.shard(1))
+    assert end(TaskFailed(both[1], 3, "NaN", final=True)) == ("failed", "district/001 failed: NaN")
 
 
 UNIONS = TaskId.union(0), TaskId.union(1)
@@ -135,29 +117,23 @@ def test_what_was_made_of_an_older_model_is_made_again() -> None:
     assert next_tasks(*TRAINED, *whole, MODELS[0]) == UNIONS[:1]
     assert next_tasks(*TRAINED, *whole, model(ROUNDS[0])) == UNIONS[1:]
     assert next_tasks(*TRAINED, *whole, model(REPAIRS[0])) == (MERGE,)
-    assert not {MERGE, *ROUNDS} & state(*TRAINED, *whole, MODELS[0]).tasks.keys()
+    outdated = after(*TRAINED, *whole, EVALUATED, MODELS[0])
+    assert not {MERGE, EVAL, *ROUNDS} & outdated.tasks.keys()
+    assert (outdated.merged, outdated.metrics) == (None, None)
 
 
 def test_a_block_is_part_of_a_model_from_its_union_on() -> None:
     block = TaskId.block(0)
-    assert not state(*TRAINED).joined(block)
-    united = state(*TRAINED, model(UNIONS[0]))
+    assert not after(*TRAINED).joined(block)
+    united = after(*TRAINED, model(UNIONS[0]))
     assert united.joined(block) and not united.joined(ROUNDS[0])
-    assert state(STAGE_ONE, PLANNED, *MODELS, MERGED).joined(block)
+    assert after(STAGE_ONE, PLANNED, *MODELS, MERGED).joined(block)
 
 
 def test_nothing_starts_while_the_stage_before_runs() -> None:
-    running = TaskStarted(TaskId.block(0), 1, 0, "n", 1, "cpu", 1)
+    running = started(TaskId.block(0))
     assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS[1:], running) == ()
     assert end(STAGE_ONE, *SCORES, PLANNED, *MODELS[1:], running) is None
-
-
-def test_blocks_start_longest_first_and_empty_ones_not_at_all() -> None:
-    assert block_order(state(PLANNED)) == (TaskId.block(1), TaskId.block(3), TaskId.block(0))
-
-
-def test_without_refinement_the_merge_follows_stage_one() -> None:
-    assert next_tasks(STAGE_ONE, refine=False) == (MERGE,)
 
 
 def test_a_block_that_has_failed_for_good_holds_nobody_up() -> None:
@@ -188,16 +164,9 @@ def test_other_failures_end_the_run_and_success_too() -> None:
 GIB = 2**30
 
 
-def consequence(
-    task: TaskState,
-    failure: Failure,
-    *,
-    node: str = "a",
-    others: bool = True,
-    memory: int = 0,
-    largest: int = 0,
-) -> Consequence:
-    return after_failure(task, failure, node=node, others=others, retries=2, memory=memory, largest=largest)
+def consequence(task: TaskState, failure: Failure, **given: Any) -> Consequence:
+    usual: dict[str, Any] = {"node": "a", "others": True, "retries": 2, "memory": 0, "largest": 0}
+    return after_failure(task, failure, **usual | given)
 
 
 def finals(failure: Failure, **counts: Any) -> bool:
@@ -223,14 +192,24 @@ def test_a_death_is_not_held_against_the_task_but_not_for_ever() -> None:
     assert [finals(Failure.LOST, losses=losses) for losses in range(LOSSES + 1)] == [False] * LOSSES + [True]
 
 
+@pytest.mark.parametrize(
+    ("allowed", "final"), [(2, [False, False, True]), (0, [True] * 3), (-1, [False] * 3)]
+)
+def test_preemptions_have_a_limit_of_their_own_and_none_by_default(allowed: int, final: list[bool]) -> None:
+    task = TaskState(TaskId.block(0), losses=LOSSES)
+    lost = [replace(task, preemptions=before) for before in range(3)]
+    found = [consequence(each, Failure.LOST, preemptions=allowed) for each in lost]
+    assert [each.final for each in found] == final == [not each.then for each in found]
+
+
 def test_after_a_checkpoint_attempts_are_counted_anew() -> None:
     failures = [
         TaskFailed(COARSE, 1, "died", final=False, kind=Failure.LOST),
         TaskFailed(COARSE, 2, "NaN", final=False),
     ]
-    task = state(*failures).task(COARSE)
+    task = after(*failures).task(COARSE)
     assert (task.errors, task.losses, task.retries) == (1, 1, 2)
-    task = state(*failures, CheckpointSaved(COARSE, 7, "c", 1)).task(COARSE)
+    task = after(*failures, CheckpointSaved(COARSE, 7, "c", 1)).task(COARSE)
     assert (task.errors, task.losses, task.retries) == (0, 0, 2)
 
 
@@ -241,7 +220,7 @@ def test_memory_gets_shorter_step_by_step() -> None:
     task = TaskState(COARSE)
     first = consequence(task, Failure.MEMORY, memory=8 * GIB, largest=24 * GIB)
     assert (first.final, "smaller image cache" in first.then) == (False, True)
-    task = state(failed).task(COARSE)
+    task = after(failed).task(COARSE)
     assert (task.shortages, task.starved, task.reasons) == (1, 8 * GIB, ("out of memory; less",))
     second = consequence(task, Failure.MEMORY, memory=8 * GIB, largest=24 * GIB)
     assert (second.final, "larger device" in second.then) == (False, True)
@@ -251,5 +230,5 @@ def test_memory_gets_shorter_step_by_step() -> None:
 
 def test_a_new_driver_holds_nothing_against_a_task() -> None:
     failed = TaskFailed(COARSE, 1, "out of memory", final=False, kind=Failure.MEMORY, memory=8 * GIB)
-    task = state(failed, failed, RunBegan("host", 2, resumed=True)).task(COARSE)
+    task = after(failed, failed, AGAIN).task(COARSE)
     assert (task.errors, task.shortages, task.starved, task.retries) == (0, 0, 0, 2)

@@ -4,16 +4,21 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from rich.console import Console
 
+from panolog.orchestrator.driver import driver as driver_module
+from panolog.orchestrator.driver import saving, writers
 from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.resources.pool import Failed
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import (
     Failure,
     Outcome,
+    Record,
     RunEnded,
     StopRequested,
     TaskFailed,
@@ -28,11 +33,10 @@ from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
 from panolog.workers.training.config import CacheConfig
-from tests.orchestrator.fakes import CrashError, Harness, Script, fails, well
+from tests.orchestrator.fakes import LOST_NODE, CrashError, Harness, Script, SetClock, doing, fails, well
 
 GIB = 2**30
 NO_MEMORY = Failed("out of memory: CUDA out of memory. Tried to allocate 2.00 GiB", Failure.MEMORY)
-LOSS = Failed("the worker process died: killed or crashed", Failure.LOST)
 
 
 def with_gpu(name: str, gib: int, count: int = 1) -> Node:
@@ -74,12 +78,7 @@ def test_the_order_of_blocks_follows_what_was_measured(tmp_path: Path) -> None:
 
 def test_a_machine_that_joins_is_used(tmp_path: Path) -> None:
     harness = Harness(tmp_path, [with_gpu("a", 24)], device="cuda")
-
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == TaskId.shard(0):
-            harness.pool.join(with_gpu("b", 24))
-        yield from well(spec)
-
+    script = doing(TaskId.shard(0), lambda: harness.pool.join(with_gpu("b", 24)))
     assert harness.drive(script).outcome == "done"
     blocks = [place for place, spec in harness.pool.started if spec.task.stage is Stage.BLOCK]
     assert {place.node for place in blocks} == {"a", "b"}
@@ -100,8 +99,11 @@ def test_the_death_of_a_machine_does_not_use_up_retries(tmp_path: Path) -> None:
 
     assert harness.drive(script).outcome == "done"
     assert [place.node for place, _ in harness.attempts(COARSE)] == ["a", "b"]
-    assert harness.trainings(COARSE)[1].checkpoint == CheckpointFile(harness.folder.checkpoint(COARSE))
-    assert harness.state.task(COARSE).retries == 1
+    first, second = harness.trainings(COARSE)
+    assert (first.checkpoint, second.checkpoint) == (None, CheckpointFile(harness.folder.checkpoint(COARSE)))
+    assert [(s.attempt, s.iteration) for s in harness.records(TaskStarted)][:2] == [(1, 0), (2, 1)]
+    task = harness.state.task(COARSE)
+    assert (task.retries, task.reasons, task.losses) == (1, (LOST_NODE.reason,), 1)  # not pre-empted
 
 
 # Memory
@@ -166,7 +168,7 @@ def stops_in(task: TaskId, harness: Harness, *, obeys: bool = True) -> Script:
             yield from well(spec)
             return
         for iteration in range(2, 100):
-            yield Progress(spec.task, iteration, 100, 1.0)
+            yield Progress(spec.task, iteration, 100, 1.0, gaussians=1000)
             if spec.task == task and iteration == 5:
                 harness.stop.signal()
             if obeys and spec.task in harness.pool.stopped:
@@ -176,7 +178,16 @@ def stops_in(task: TaskId, harness: Harness, *, obeys: bool = True) -> Script:
     return script
 
 
-def test_ctrl_c_waits_for_fresh_checkpoints(harness: Harness) -> None:
+def test_ctrl_c_waits_for_fresh_checkpoints(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For as long as they take at the rate that was measured before, not for a fixed time."""
+    harness.clock = clock = SetClock()
+    monkeypatch.setattr(writers, "GRACE_S", 0.0)
+
+    def slow(folder: RunFolder, event: Event, *rest: Any) -> Record:
+        clock.sleep(1.0)
+        return saving.save(folder, event, *rest)
+
+    monkeypatch.setattr(driver_module, "save", slow)
     with pytest.raises(KeyboardInterrupt):
         harness.drive(stops_in(TaskId.block(0), harness))
     assert harness.pool.stopped == {TaskId.block(0), TaskId.block(1)}
@@ -191,11 +202,17 @@ def test_ctrl_c_waits_for_fresh_checkpoints(harness: Harness) -> None:
     assert began == fresh | {EVAL: 0}
 
 
-def test_a_second_ctrl_c_does_not_wait(harness: Harness) -> None:
+@pytest.mark.parametrize("again", [True, False], ids=["second Ctrl-C", "its time is over"])
+def test_who_does_not_obey_is_not_waited_for(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch, again: bool
+) -> None:
+    if not again:
+        monkeypatch.setattr(writers, "GRACE_S", 0.0)
+
     def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
         for event in stops_in(COARSE, harness, obeys=False)(spec):
             yield event
-            if harness.pool.stopped:
+            if again and harness.pool.stopped:
                 harness.stop.signal()
 
     with pytest.raises(KeyboardInterrupt):
@@ -204,23 +221,9 @@ def test_a_second_ctrl_c_does_not_wait(harness: Harness) -> None:
     assert harness.state.task(COARSE).checkpoint is None
 
 
-def test_who_does_not_obey_is_not_waited_for_for_ever(
-    harness: Harness, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("panolog.orchestrator.driver.writers.GRACE_S", 0.0)
-    with pytest.raises(KeyboardInterrupt):
-        harness.drive(stops_in(COARSE, harness, obeys=False))
-    assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]
-
-
 def test_ctrl_c_where_nothing_trains_ends_at_once(harness: Harness) -> None:
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == EVAL:
-            harness.stop.signal()
-        yield from well(spec)
-
     with pytest.raises(KeyboardInterrupt):
-        harness.drive(script)
+        harness.drive(doing(EVAL, lambda: harness.stop.signal()))  # noqa: PLW0108  # drive makes a new one
     assert harness.records(StopRequested) == [StopRequested(0)]
     assert harness.pool.stopped == set()
 

@@ -5,29 +5,17 @@ import pytest
 
 from panolog.orchestrator.driver import requests
 from panolog.orchestrator.driver.requests import Stop, interruptible, on_signals
+from tests.orchestrator.fakes import SetClock
 
 ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Hand:
-    """A clock that a test sets."""
-
-    now = 0.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Hand:
-    clock = Hand()
-    monkeypatch.setattr(requests, "time", clock)
-    return clock
-
-
 @pytest.mark.parametrize("number", ENDS)
-def test_the_first_signal_requests_and_the_second_interrupts(clock: Hand, number: int) -> None:
-    before = [signal.getsignal(number) for number in ENDS]
+def test_the_first_signal_requests_and_the_second_interrupts(
+    monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    clock, before = SetClock(), [signal.getsignal(number) for number in ENDS]
+    monkeypatch.setattr(requests, "time", clock)
     with on_signals() as stop:
         assert not stop.requested
         os.kill(os.getpid(), number)

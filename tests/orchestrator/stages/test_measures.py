@@ -10,7 +10,7 @@ import pytest
 
 from panolog.orchestrator.dashboard import pictures
 from panolog.orchestrator.driver.job import Job, Specs
-from panolog.orchestrator.resources.pool import InProcess
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import (
     EvaluationSaved,
     MeasuresSaved,
@@ -18,15 +18,19 @@ from panolog.orchestrator.run.records import (
     PlanSaved,
     SeamEvaluated,
 )
+from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.scene.errors import RunError
-from panolog.scene.files import Locate, here
-from panolog.scene.ply import read_ply
+from panolog.scene.files import here
+from panolog.scene.ply import read_ply, write_ply
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import Event, LeftOut, LpipsMissing
+from panolog.workers.events import Evaluated, Event, LeftOut, LpipsMissing, SeamMeasured
+from panolog.workers.seams.schema import parse_seams
 from panolog.workers.specs import ModelFile, TaskSpec
-from panolog.workers.tasks import EVAL, Stage, TaskId
-from tests.orchestrator.fakes import DIED, Harness, fails, well
-from tests.workers.small import small_scene
+from panolog.workers.tasks import EVAL, TaskId
+from panolog.workers.training.initialise import scene_gaussians
+from tests.orchestrator.fakes import DIED, Harness, Noting, doing, fails, well
+from tests.workers.seams.test_schema import FACES
+from tests.workers.small import WIDTH, small_scene
 
 SHARDS = [TaskId.measure(0), TaskId.measure(1), TaskId.measure(2)]  # two of panoramas, one of a face
 
@@ -107,22 +111,18 @@ def test_they_measure_what_one_task_does_with_fewer_gaussians(tmp_path: Path) ->
     assert said[0] == said[1] and len(said[0]) == (found["lpips_reason"] is not None)
 
 
-class _Noting(InProcess):
-    """Takes the place of a pool, and notes which files a task is given."""
-
-    def __init__(self) -> None:
-        self.scene: set[Path] = set()
-        self.run: set[Path] = set()
-
-    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
-        self.scene, self.run = set(scene), set(run)
-        return here
-
-
 def test_a_shard_gets_its_own_panoramas_and_no_model_of_the_whole_place(tmp_path: Path) -> None:
-    harness, noting = measuring(tmp_path), _Noting()
-    harness.drive()
+    harness, noting, there = measuring(tmp_path), Noting(), list[bool]()
     folder, panoramas = harness.folder, harness.job.scene.panoramas
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task in SHARDS:
+            there.extend(path.exists() for path in (folder.seen(spec.task), folder.seen_coarse(spec.task)))
+        yield from well(spec)
+
+    harness.drive(script)
+    assert there == [True, False, True, False, True, True]
+    assert not list(folder.metrics.parent.rglob("*.ply"))  # none of them is left
     specs = Specs(harness.job, noting)
 
     def files(rows: Iterable[int]) -> set[Path]:
@@ -140,22 +140,18 @@ def test_a_shard_gets_its_own_panoramas_and_no_model_of_the_whole_place(tmp_path
     assert noting.run == {folder.seen(SHARDS[2]), folder.seen_coarse(SHARDS[2])}
 
 
-def test_a_worker_that_dies_measures_again(tmp_path: Path) -> None:
+def test_a_worker_that_dies_measures_again_and_a_shard_that_keeps_failing_fails_the_run(
+    tmp_path: Path,
+) -> None:
     harness, whole = measuring(tmp_path / "died"), measuring(tmp_path / "whole")
     whole.drive()
     name = harness.job.scene.panoramas[0].name
-    lost = LeftOut(SHARDS[0], f"{name} is left out", name)  # what an attempt that is over has said is nothing
-    assert harness.drive(fails(SHARDS[0], DIED, 1, before=[lost])).outcome == "done"
-    assert harness.tasks.count(SHARDS[0]) == 2
-    assert outcome(harness) == outcome(whole)
-
-
-def test_a_shard_that_keeps_failing_fails_the_run(tmp_path: Path) -> None:
-    harness = measuring(tmp_path)
+    lost = LeftOut(SHARDS[1], f"{name} is left out", name)  # what an attempt that is over has said is nothing
     with pytest.raises(RunError, match="measure/001 failed"):
-        harness.drive(fails(SHARDS[1], DIED, 9))
-    assert harness.drive(resumed=True).outcome == "done"
-    assert harness.tasks == SHARDS[1:]
+        harness.drive(fails(SHARDS[1], DIED, 9, before=[lost]))
+    assert harness.drive(fails(SHARDS[1], DIED, 1, before=[lost]), resumed=True).outcome == "done"
+    assert harness.tasks.count(SHARDS[1]) == 2 and SHARDS[0] not in harness.tasks
+    assert outcome(harness) == outcome(whole)
 
 
 def test_what_is_left_out_and_why_lpips_is_missing_is_in_the_metrics(tmp_path: Path) -> None:
@@ -179,28 +175,12 @@ def test_what_is_left_out_and_why_lpips_is_missing_is_in_the_metrics(tmp_path: P
     assert said == [Noticed(EVAL, "no lpips here")]
 
 
-def test_a_block_that_is_tried_again_is_measured_again(tmp_path: Path) -> None:
-    harness, whole = measuring(tmp_path / "again"), measuring(tmp_path / "whole")
-    whole.drive()
-    with pytest.raises(RunError, match="block 1 failed"):
-        harness.drive(fails(TaskId.block(1), DIED, 9))
-    assert harness.folder.metrics.exists()
-    assert harness.drive(resumed=True).outcome == "done"
-    assert harness.tasks == [TaskId.block(1), *SHARDS]
-    assert outcome(harness) == outcome(whole)
-
-
 def test_shards_of_another_evaluation_are_not_joined(tmp_path: Path) -> None:
     harness = measuring(tmp_path)
 
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == SHARDS[2]:
-            first, second = (harness.folder.shard(task) for task in SHARDS[:2])
-            first.write_bytes(second.read_bytes())
-        yield from well(spec)
-
+    first, second = (harness.folder.shard(task) for task in SHARDS[:2])
     with pytest.raises(RunError, match="has shards of another evaluation; `panolog eval"):
-        harness.drive(script)
+        harness.drive(doing(SHARDS[2], lambda: first.write_bytes(second.read_bytes())))
 
 
 def test_a_run_whose_plan_knows_no_shards_is_evaluated_as_one_task(
@@ -211,27 +191,46 @@ def test_a_run_whose_plan_knows_no_shards_is_evaluated_as_one_task(
     with monkeypatch.context() as older:
         older.setattr("panolog.orchestrator.driver.job.Specs.measures", ())
         with pytest.raises(KeyboardInterrupt):
-            harness.drive(_stops_in_block)
+            harness.drive(doing(TaskId.block(0), lambda: harness.stop.signal()))  # noqa: PLW0108  # a new one
     assert [record.measures for record in harness.records(PlanSaved)] == [0]
     assert harness.drive(resumed=True).outcome == "done"
     assert harness.tasks[-1] == EVAL
     assert "detail" not in json.loads(harness.folder.metrics.read_bytes())
 
 
-def _stops_in_block(spec: TaskSpec) -> Iterator[Event]:
-    if spec.task.stage is Stage.BLOCK:
-        raise KeyboardInterrupt
-    yield from well(spec)
+# What an evaluation keeps of the events of its task
 
 
-def test_no_model_of_a_shard_is_left(tmp_path: Path) -> None:
-    harness = measuring(tmp_path)
+def test_seams_are_written_with_their_pictures_and_count_for_completeness(tmp_path: Path) -> None:
+    scene, folder = small_scene(tmp_path), RunFolder(tmp_path / "run")
+    write_ply(tmp_path / "model.ply", scene_gaussians(scene))
+    evaluation = Evaluation(scene, tmp_path / "model.ply", WIDTH, 0.0, folder, faces=1)
+    evaluation.add(LeftOut(EVAL, "damaged", scene.panoramas[scene.test[0]].name))
+    evaluation.add(LeftOut(EVAL, "damaged too", scene.panoramas[scene.train[0]].name))
+    assert not evaluation.complete
+    evaluation.add(SeamMeasured(EVAL, FACES[0], {"merged.jpg": b"a picture"}))
+    assert evaluation.complete
+    evaluation.save(folder)
+    assert parse_seams(folder.seams.read_bytes()) == FACES[:1]
+    assert (folder.seam(0, 1) / "merged.jpg").read_bytes() == b"a picture"
+    assert list(evaluation.report()["left_out"].values()) == ["damaged"]
 
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task.stage is Stage.MEASURE:
-            assert harness.folder.seen(spec.task).exists()
-            assert harness.folder.seen_coarse(spec.task).exists() == (spec.task == SHARDS[2])
-        yield from well(spec)
 
-    harness.drive(script)
-    assert not list(harness.folder.metrics.parent.rglob("*.ply"))
+def test_what_is_measured_at_fitted_poses_stands_beside_the_metrics(tmp_path: Path) -> None:
+    scene, folder = small_scene(tmp_path), RunFolder(tmp_path / "run")
+    write_ply(tmp_path / "model.ply", scene_gaussians(scene))
+    shards, whole = [TaskId.measure(0), TaskId.measure(1)], replace(scene, test=(3, 4))
+    for shard, row in zip(shards, whole.test, strict=True):
+        part = Evaluation(whole, tmp_path / "model.ply", WIDTH, 0.0, None, rows=(row,))
+        there: dict[str, float | None] = {"psnr": 24.0 + row, "pixels": row / 2}
+        part.add(Evaluated(shard, scene.panoramas[row].name, {"psnr": 20.0}, b"", there))
+        part.save_shard(folder, shard)
+    joined = Evaluation(whole, tmp_path / "model.ply", WIDTH, 0.0, None)
+    joined.join(folder, shards)
+    report = joined.report()
+    assert report["mean"] == {"psnr": 20.0}
+    assert report["pose_fit"]["mean"] == {"psnr": 27.5, "pixels": 1.75}
+    assert report["pose_fit"]["views"]["pano_4.png"] == {"psnr": 28.0, "pixels": 2.0}
+    plain = Evaluation(scene, tmp_path / "model.ply", WIDTH, 0.0, None)
+    plain.add(Evaluated(EVAL, "pano_4.png", {"psnr": 20.0}, b""))
+    assert "pose_fit" not in plain.report()

@@ -56,22 +56,16 @@ def test_masks_shares_and_pictures_of_the_worst(scene: Scene, tmp_path: Path) ->
     assert tinted[16:28, 8:24].mean() > 3 * tinted[:12].mean()
 
 
-def test_later_stages_have_them_as_masks(scene: Scene, tmp_path: Path) -> None:
+def test_later_stages_have_them_as_masks_and_so_has_a_scene_into_which_they_are_copied(
+    scene: Scene, tmp_path: Path
+) -> None:
     folder, row = RunFolder(tmp_path / "run"), scene.train[0]
     save_captured(folder, captured(scene, {row: 2}), scene)
-    learnt = learnt_scene(folder, scene)
-    view = load_view(learnt.panoramas[row], row, 64)
-    assert view.mask is not None and not view.mask[16:24, 8:24].any() and view.mask[:16].all()
+    learnt, panorama = learnt_scene(folder, scene), scene.panoramas[row]
+    for masked in (learnt.panoramas[row], replace(panorama, mask=folder.mover_mask(panorama.name))):
+        view = load_view(masked, row, 64)
+        assert view.mask is not None and not view.mask[16:24, 8:24].any() and view.mask[:12].all()
     assert all(learnt.panoramas[other].movers is None for other in (*scene.train[1:], *scene.test))
-
-
-def test_masks_are_those_of_a_scene(scene: Scene, tmp_path: Path) -> None:
-    """Copied into it, they do the same to the next run."""
-    folder, row = RunFolder(tmp_path / "run"), scene.train[0]
-    save_captured(folder, captured(scene, {row: 2}), scene)
-    panorama = scene.panoramas[row]
-    view = load_view(replace(panorama, mask=folder.mover_mask(panorama.name)), row, 64)
-    assert view.mask is not None and not view.mask[16:24, 8:24].any() and view.mask[:12].all()
 
 
 def test_a_photograph_that_is_gone_has_no_picture(scene: Scene, tmp_path: Path) -> None:

@@ -77,17 +77,19 @@ def test_what_fails_in_a_pass_stays_as_it_was(tmp_path: Path, task: TaskId) -> N
 
 
 def test_a_block_that_is_tried_again_is_in_all_that_follows(tmp_path: Path) -> None:
-    """Also a checkpoint of a pass over the former union does not count."""
-    harness, whole = passing(tmp_path / "failed"), passing(tmp_path / "whole")
+    """Also a checkpoint of a pass over the former union does not count, nor what was measured."""
+    stage2 = {"exterior": "frozen", "detail": 2.0}
+    harness, whole = (passing(tmp_path / name, stage2=stage2) for name in ("failed", "whole"))
     whole.drive()
     with pytest.raises(Exception, match="block 1 failed"):
         harness.drive(fails(TaskId.block(1), DIED, 9))
     left = harness.folder.checkpoint(REPAIR)
     left.write_bytes(harness.folder.model(COARSE).read_bytes())
     assert harness.drive(resumed=True).outcome == "done"
-    assert harness.tasks == [TaskId.block(1), *ROUNDS, REPAIR, EVAL]
+    assert harness.tasks == [TaskId.block(1), *ROUNDS, REPAIR, TaskId.measure(0), TaskId.measure(1)]
     assert harness.trainings(REPAIR)[0].checkpoint is None
-    assert harness.folder.point_cloud.read_bytes() == whole.folder.point_cloud.read_bytes()
+    for made in (lambda it: it.folder.point_cloud, lambda it: it.folder.metrics, lambda it: it.folder.seams):
+        assert made(harness).read_bytes() == made(whole).read_bytes()
 
 
 def test_with_levels_of_detail_a_repair_has_both_blocks_whole(tmp_path: Path) -> None:
@@ -117,9 +119,3 @@ def test_a_pass_has_low_rates_and_adds_nothing() -> None:
     assert later.stage2.rate == pytest.approx(0.5 * factor * config.stage2.rate)
     assert later.stage2.position == pytest.approx(0.2 * factor * config.stage2.position)
     assert later.depth.w0 <= config.depth.wT
-
-
-def test_without_passes_a_run_has_none(tmp_path: Path) -> None:
-    harness = passing(tmp_path, passes={"repair": 0})
-    state = harness.drive()
-    assert state.passes == () and not harness.folder.of(REPAIR).exists()

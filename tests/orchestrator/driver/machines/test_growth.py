@@ -1,7 +1,6 @@
 """A driver whose machines come when it requests them."""
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 
 from panolog.orchestrator.driver.driver import Hooks
 from panolog.orchestrator.resources.nodes import Node
@@ -45,32 +44,23 @@ class GrowingPool(FakePool):
             self.requests.append(self.wanted)
 
 
-def test_a_run_that_begins_without_a_machine_requests_one_and_says_what_it_waits_for(tmp_path: Path) -> None:
-    harness = Harness(tmp_path)
+def test_a_run_without_a_machine_requests_some_while_it_needs_them_and_says_what_it_waits_for(
+    harness: Harness,
+) -> None:
     harness.clock = clock = SetClock()
-    pool = GrowingPool(clock, startup=120)
-    harness.drive(pool=pool)
+    pool, planning = GrowingPool(clock, startup=120), list[dict[str, int]]()
+    harness.drive(pool=pool, hooks=Hooks(lambda *_: planning.append(dict(pool.wanted))))
     waits = [record.reason for record in harness.records(RunWaiting)]
     assert waits[0].startswith("waiting for machines: 1 of small (1 core, 1024.0 GiB), requested from Ray's")
     assert [record.seconds for record in harness.records(RunContinued)] == [120]
     messages = [record.message for record in harness.records(Noticed)]
     assert "requested from Ray's autoscaler for coarse: 1 more of small (1 core, 1024.0 GiB)" in messages
-    assert pool.requests[-1] == {}
+    assert planning == [{}]  # the driver works itself
+    assert pool.requests == [{"small": 1}, {}]
     assert harness.state.waiting == ""
 
 
-def test_nothing_is_requested_while_the_driver_works(tmp_path: Path) -> None:
-    harness = Harness(tmp_path)
-    harness.clock = clock = SetClock()
-    pool = GrowingPool(clock, startup=120)
-    during = list[dict[str, int]]()
-    harness.drive(pool=pool, hooks=Hooks(lambda *_: during.append(dict(pool.wanted))))
-    assert during == [{}]
-    assert {} in pool.requests[1:]
-
-
-def test_why_no_machine_comes_is_said_again_when_it_changes(tmp_path: Path) -> None:
-    harness = Harness(tmp_path)
+def test_why_no_machine_comes_is_said_again_when_it_changes(harness: Harness) -> None:
     harness.clock = clock = SetClock()
     pool = GrowingPool(clock, startup=20)
     left = ["no spot machines left", "quota exceeded"]
@@ -87,8 +77,7 @@ def test_why_no_machine_comes_is_said_again_when_it_changes(tmp_path: Path) -> N
     assert waits[1:3] == ["it reports: no spot machines left", "it reports: quota exceeded"]
 
 
-def test_a_cluster_without_an_autoscaler_says_that_it_has_no_machine(tmp_path: Path) -> None:
-    harness = Harness(tmp_path)
+def test_a_cluster_without_an_autoscaler_says_that_it_has_no_machine(harness: Harness) -> None:
     harness.clock = SetClock()
     pool = FakePool(well, [])
     pool.when_waiting(lambda: pool.join(Node("a", "host", 1, 2**40)) if not pool.nodes() else None)

@@ -13,17 +13,14 @@ from panolog.orchestrator.run.records import (
     BlockPlan,
     CheckpointSaved,
     Failure,
-    ModelSaved,
     NodeQuarantined,
     NodeReleased,
     Outcome,
     PlanSaved,
     Record,
-    RunBegan,
     RunEnded,
     Stored,
     TaskFailed,
-    TaskStarted,
 )
 from panolog.orchestrator.run.state import RunState, Status, apply, replay
 from panolog.scene.errors import RunError
@@ -31,15 +28,12 @@ from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from tests.orchestrator.fakes import CrashError, Harness, Script, SetClock, well
+from tests.orchestrator.history import AGAIN, after, model, started
 
 A, B = Node("aaaa", "gpu-a", 2, 2**40), Node("bbbb", "gpu-b", 2, 2**40)
 CONFIG = QuarantineConfig(failures=3, seconds=60)
 PLAN = PlanSaved("plan.json", tuple(BlockPlan(block, 4, 100, train=True) for block in range(9)))
 BLOCKS = [TaskId.block(block) for block in range(9)]
-
-
-def started(task: TaskId, node: Node) -> TaskStarted:
-    return TaskStarted(task, 1, 0, node.host, 7, "cuda", 1, node_id=node.id)
 
 
 def failed(task: TaskId, node: Node, reason: str = "", kind: Failure = Failure.ERROR) -> TaskFailed:
@@ -70,6 +64,8 @@ def bad(state: RunState) -> list[str]:
 def test_failures_of_different_tasks_put_a_node_into_quarantine() -> None:
     assert bad(run(failed(BLOCKS[0], A), failed(BLOCKS[1], A))) == []
     assert bad(run(*[failed(BLOCKS[0], A)] * 5)) == []  # one task may be the cause
+    assert bad(run(*(failed(task, A, kind=Failure.MEMORY) for task in BLOCKS))) == []
+    assert bad(run(*(failed(task, A) for task in BLOCKS), nodes=(A,))) == []  # there is no other node
     state = run(*(failed(task, A) for task in BLOCKS[:3]))
     (node,) = state.quarantined()
     assert (node.host, node.until) == ("gpu-a", 62.0)
@@ -79,8 +75,8 @@ def test_failures_of_different_tasks_put_a_node_into_quarantine() -> None:
 
 
 def test_a_success_in_between_clears_a_node() -> None:
-    saved: list[Record] = [started(BLOCKS[8], A), CheckpointSaved(BLOCKS[8], 5, "c", 1)]
-    elsewhere: list[Record] = [started(BLOCKS[8], B), ModelSaved(BLOCKS[8], "m", 1, 1, 1, 1.0)]
+    saved: list[Record] = [started(BLOCKS[8], node=A.id), CheckpointSaved(BLOCKS[8], 5, "c", 1)]
+    elsewhere: list[Record] = [started(BLOCKS[8], node=B.id), model(BLOCKS[8])]
     two: list[Record] = [failed(task, A) for task in BLOCKS[:2]]
     third = failed(BLOCKS[2], A)
     assert bad(run(*two, *saved, third)) == []
@@ -90,33 +86,21 @@ def test_a_success_in_between_clears_a_node() -> None:
 def test_failures_on_a_bad_node_do_not_count_against_its_tasks() -> None:
     lost = failed(BLOCKS[1], A, kind=Failure.LOST)
     good = [failed(BLOCKS[0], B), failed(BLOCKS[0], A), lost]
-    final = TaskFailed(BLOCKS[2], 3, "block/002: no", final=True, node=A.id)
-    records: list[Record] = [PLAN, *good, final]
-    before = replay([Stored(0, 0.0, record) for record in records])
-    assert [(before.task(task).errors, before.task(task).losses) for task in BLOCKS[:3]] == [
-        (2, 0),
-        (0, 1),
-        (1, 0),
-    ]
+    before = after(PLAN, *good, TaskFailed(BLOCKS[2], 3, "block/002: no", final=True, node=A.id))
+    counts = [(before.task(task).errors, before.task(task).losses) for task in BLOCKS[:3]]
+    assert counts == [(2, 0), (0, 1), (1, 0)]
     assert before.status(BLOCKS[2]) == Status.FAILED
     state = review(before, 1.0)
-    assert [(state.task(task).errors, state.task(task).losses) for task in BLOCKS[:3]] == [
-        (1, 0),
-        (0, 0),
-        (0, 0),
-    ]
+    counts = [(state.task(task).errors, state.task(task).losses) for task in BLOCKS[:3]]
+    assert counts == [(1, 0), (0, 0), (0, 0)]
     assert state.status(BLOCKS[2]) == Status.WAITING
     assert quarantine.excuses(state, A.id, Failure.LOST)
     assert not quarantine.excuses(state, A.id, Failure.MEMORY)
     assert not quarantine.excuses(state, B.id, Failure.LOST)
 
 
-def test_a_shortage_of_memory_is_no_fault_of_a_node() -> None:
-    assert bad(run(*(failed(task, A, kind=Failure.MEMORY) for task in BLOCKS))) == []
-
-
 def test_tasks_that_fail_alike_on_a_sound_node_are_the_cause_themselves() -> None:
-    sound: list[Record] = [started(BLOCKS[8], B), CheckpointSaved(BLOCKS[8], 5, "c", 1)]
+    sound: list[Record] = [started(BLOCKS[8], node=B.id), CheckpointSaved(BLOCKS[8], 5, "c", 1)]
     two: list[Record] = [
         failed(BLOCKS[0], A),
         failed(BLOCKS[0], B),
@@ -138,16 +122,12 @@ def test_a_node_is_released_after_its_time() -> None:
     assert bad(again) == []  # its old failures are forgotten
 
 
-def test_a_node_alone_is_never_in_quarantine() -> None:
-    assert bad(run(*(failed(task, A) for task in BLOCKS), nodes=(A,))) == []
-
-
 def test_a_new_driver_knows_of_a_quarantine_unless_the_run_had_failed() -> None:
     three: list[Record] = [failed(task, A) for task in BLOCKS[:3]]
-    assert bad(run(*three, RunBegan("host", 2, resumed=True))) == ["gpu-a"]
+    assert bad(run(*three, AGAIN)) == ["gpu-a"]
     ended = RunEnded(Outcome.FAILED, "no")
-    assert bad(run(*three, ended, RunBegan("host", 2, resumed=True))) == []
-    assert bad(run(*three[:2], RunBegan("host", 2, resumed=True), three[2])) == []
+    assert bad(run(*three, ended, AGAIN)) == []
+    assert bad(run(*three[:2], AGAIN, three[2])) == []
 
 
 def test_if_all_nodes_are_bad_the_run_waits_a_sixth_of_the_time_and_then_fails() -> None:
@@ -173,12 +153,12 @@ def test_if_all_nodes_are_bad_the_run_waits_a_sixth_of_the_time_and_then_fails()
 # With the driver
 
 
-def breaks_on(node: Node, harness: Harness, *, reason: str = "CUDA error: uncorrectable ECC error") -> Script:
-    """All tasks fail on a node, each with the same words."""
+def breaks_on(node: Node, harness: Harness, *, stage: Stage | None = None) -> Script:
+    """All tasks, or those of a stage, fail on a node, each with the same words."""
 
     def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
-        if harness.pool.placement(spec.task).node == node.id:
-            raise CrashError(Failed(f"{spec.task}: {reason}"))
+        if harness.pool.placement(spec.task).node == node.id and stage in (None, spec.task.stage):
+            raise CrashError(Failed(f"{spec.task}: CUDA error: uncorrectable ECC error"))
         yield from well(spec)
 
     return script
@@ -192,23 +172,12 @@ def many(tmp_path: Path) -> Harness:
 
 
 def test_one_bad_node_does_not_eat_the_run(many: Harness) -> None:
-    blocks_only = breaks_on(A, many)
-
-    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
-        yield from blocks_only(spec) if spec.task.stage is Stage.BLOCK else well(spec)
-
-    assert many.drive(script).outcome == "done"
+    assert many.drive(breaks_on(A, many, stage=Stage.BLOCK)).outcome == "done"
     (quarantined,) = many.records(NodeQuarantined)
     assert (quarantined.node, quarantined.host) == (A.id, A.host)
     after = [where.node for where, spec in many.pool.started][-3:]
     assert set(after) == {B.id}
     assert {failed.node for failed in many.records(TaskFailed)} == {A.id}
-
-
-def test_after_a_failure_a_task_starts_on_another_node(tmp_path: Path) -> None:
-    harness = Harness(tmp_path, (A, B))
-    harness.drive(breaks_on(A, harness))
-    assert [where.node for where, _ in harness.attempts(COARSE)] == [A.id, B.id]
 
 
 def test_a_worker_that_is_killed_on_the_sound_node_leaves_no_only_choice(tmp_path: Path) -> None:
@@ -244,19 +213,13 @@ def test_where_all_nodes_fail_the_run_waits_and_then_says_why(many: Harness) -> 
     many.clock = clock = SetClock()
 
     def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        many.pool.when_waiting(lambda: clock.sleep(60))
         if spec.task.stage is Stage.BLOCK:
             raise CrashError(Failed(f"{many.pool.placement(spec.task).node}: no"))
         yield from well(spec)
 
-    def later() -> None:
-        clock.now += 60
-
-    def watched(spec: TaskSpec) -> Iterator[Event | Calibration]:
-        many.pool.when_waiting(later)
-        yield from script(spec)
-
     with pytest.raises(RunError, match="every machine is in quarantine"):
-        many.drive(watched)
+        many.drive(script)
     assert len(many.records(NodeQuarantined)) == 12
     assert {released.reason for released in many.records(NodeReleased)} == {"its time is over"}
     assert 5 * 600 <= clock.now - 1e9 < 2 * 3600
