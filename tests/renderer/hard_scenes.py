@@ -12,13 +12,12 @@ from panolog.scene.gaussians import Gaussians
 from tests.renderer import reference
 
 
-def camera(width: int = 64, seed: int = 0, dtype: torch.dtype = torch.float32) -> Camera:
+def camera(width: int = 64, seed: int = 0) -> Camera:
     """A randomly turned camera near the origin."""
     rng = np.random.default_rng(seed)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     rotation *= np.linalg.det(rotation)
-    made = Camera.of(rotation, rng.normal(size=3) * 0.1, width, width // 2)
-    return Camera(made.rotation.to(dtype), made.translation.to(dtype), width, width // 2)
+    return Camera.of(rotation, rng.normal(size=3) * 0.1, width, width // 2)
 
 
 def wide(at: Camera) -> Camera:
@@ -110,13 +109,11 @@ def as_leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
 def decided(gaussians: Gaussians, at: Camera, near: float) -> Tensor:
     """(H, W) bool: pixels where no pair is within 0.1% of a cut (alpha 1/255, transmittance 1e-4).
 
-    On the others rounding alone decides whether a pair counts, in float64 as in float32.
+    On the others rounding alone decides whether a pair counts, in float64 as in float32. All tensors float64.
     """
-    tensors = {name: tensor.double() for name, tensor in gaussians.tensors().items()}
-    precise, at = gaussians.with_tensors(tensors, 0), wide(at)
-    projected = reference.project(precise, at, 3, near, torch.zeros(len(precise), 2, dtype=torch.float64))
-    rows = projected.drawable.nonzero()[:, 0]
-    rows = rows[projected.distance[rows].argsort(stable=True)]
+    screen = torch.zeros(len(gaussians), 2, dtype=torch.float64)
+    projected = reference.project(gaussians, at, 3, near, screen)
+    rows = reference.nearest_first(projected)
     sorted_rows = reference.Projected(*(field[rows] for field in projected))
     floor, limit = reference.ALPHA_MIN, reference.TRANSMITTANCE_MIN
     alpha = reference.pixel_alphas(sorted_rows, at, floor=floor * 0.999)

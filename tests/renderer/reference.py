@@ -19,7 +19,6 @@ TRANSMITTANCE_MIN = 1e-4  # a pixel below this is opaque: whatever follows does 
 LOW_PASS = 0.3  # px² added to the diagonal of the 2D covariance
 LEAST_NORM = 1e-18  # of a quaternion
 POLE = 1e-4  # sine of the polar distance below which the azimuth counts as undefined
-MOTION_POLE = 0.0  # of the same, below which affine splats take no part in a camera's motion
 
 
 class Projected(NamedTuple):
@@ -184,24 +183,36 @@ def render_reference(
     if screen is None:
         screen = gaussians.means.new_zeros((len(gaussians), 2))
     all_projected = project(gaussians, camera, sh_degree, near, screen)
-    rows = all_projected.drawable.nonzero()[:, 0]
-    rows = rows[all_projected.distance[rows].argsort(stable=True)]
+    rows = nearest_first(all_projected)
     # projected again without the others, so that no gradient meets a value that is not finite
-    drawn = {name: tensor[rows] for name, tensor in gaussians.tensors().items()}
-    near_to_far = gaussians.with_tensors(drawn, 0)
     moving = None if motion is None else motion[rows]
-    projected = project(near_to_far, camera, sh_degree, near, screen[rows], moving)
-    alpha = pixel_alphas(projected, camera)  # (M, H, W)
-    transmittance = torch.cumprod(torch.cat([torch.ones_like(alpha[:1]), 1 - alpha]), 0)
-    weight = torch.where(transmittance[:-1] >= TRANSMITTANCE_MIN, alpha * transmittance[:-1], 0)
-    visible = torch.zeros(len(gaussians), dtype=torch.bool)
+    projected = project(rows_of(gaussians, rows), camera, sh_degree, near, screen[rows], moving)
+    return blended(projected, pixel_alphas(projected, camera), rows, all_projected.invalid)
+
+
+def rows_of(gaussians: Gaussians, rows: Tensor) -> Gaussians:
+    """Some rows (M,), in their order, none of them as sky."""
+    return gaussians.with_tensors({name: tensor[rows] for name, tensor in gaussians.tensors().items()}, 0)
+
+
+def nearest_first(projected: Projected) -> Tensor:
+    """(M,) the rows that are drawn."""
+    rows = projected.drawable.nonzero()[:, 0]
+    return rows[projected.distance[rows].argsort(stable=True)]
+
+
+def blended(projected: Projected, alpha: Tensor, rows: Tensor, invalid: Tensor) -> Render:
+    """Eq. 1 for M Gaussians, nearest first, with alphas (M, H, W): the `rows` (M,) of `invalid` (N,)."""
+    transmittance = torch.cumprod(torch.cat([torch.ones_like(alpha[:1]), 1 - alpha]), 0)[:-1]
+    weight = torch.where(transmittance >= TRANSMITTANCE_MIN, alpha * transmittance, 0)
+    visible = torch.zeros(len(invalid), dtype=torch.bool)
     visible[rows] = (alpha > 0).flatten(1).any(1)
     return Render(
         torch.einsum("nhw,nc->hwc", weight, projected.color),
         weight.sum(0),
         torch.einsum("nhw,n->hw", weight, 1 / projected.distance),
         visible,
-        all_projected.invalid,
+        invalid,
     )
 
 

@@ -16,7 +16,10 @@ from tests.renderer.reference import (
     ALPHA_MIN,
     LOW_PASS,
     TRANSMITTANCE_MIN,
+    blended,
+    nearest_first,
     project,
+    rows_of,
     seen,
 )
 
@@ -65,14 +68,6 @@ def pixel_alphas(
     return gaussians.opacities.sigmoid()[:, None, None] * torch.exp(-0.5 * distance), along
 
 
-def _nearest_first(gaussians: Gaussians, camera: Camera, degree: int, near: float, screen: Tensor) -> Tensor:
-    """Rows that are drawn, nearest first; `project` decides on distance, opacity and what is finite."""
-    with torch.no_grad():
-        found = project(gaussians, camera, degree, near, screen)
-    rows = found.drawable.nonzero()[:, 0]
-    return rows[found.distance[rows].argsort(stable=True)]
-
-
 def render_rays(
     gaussians: Gaussians,
     camera: Camera,
@@ -83,34 +78,26 @@ def render_rays(
     motion: Tensor | None = None,
 ) -> Render:
     """`renderer.render.render` for Gaussians with `exact`; all tensors float64."""
-    rows = _nearest_first(gaussians, camera, sh_degree, near, screen)
-    drawn = gaussians.with_tensors({name: tensor[rows] for name, tensor in gaussians.tensors().items()}, 0)
-    moving = None if motion is None else motion[rows]
+    found = project(gaussians, camera, sh_degree, near, screen)  # what is finite, far and opaque enough
+    rows = nearest_first(found)
+    drawn, moving = rows_of(gaussians, rows), None if motion is None else motion[rows]
     projected = project(drawn, camera, sh_degree, near, screen[rows], moving)
     exponential, along = pixel_alphas(drawn, camera, screen[rows], moving)
-    alpha = torch.where((exponential >= ALPHA_MIN) & (along > 0), exponential.clamp(max=ALPHA_MAX), 0)
-    left = torch.cumprod(torch.cat([torch.ones_like(alpha[:1]), 1 - alpha]), 0)[:-1]
-    weight = torch.where(left >= TRANSMITTANCE_MIN, alpha * left, 0)
-    visible = torch.zeros(len(gaussians), dtype=torch.bool)
-    visible[rows] = (alpha > 0).flatten(1).any(1)
-    return Render(
-        color=torch.einsum("nhw,nc->hwc", weight, projected.color),
-        alpha=weight.sum(0),
-        inverse_depth=torch.einsum("nhw,n->hw", weight, 1 / projected.distance),
-        visible=visible,
-        invalid=project(gaussians, camera, sh_degree, near, screen).invalid,
-    )
+    return blended(projected, _cut(exponential, along), rows, found.invalid)
+
+
+def _cut(exponential: Tensor, along: Tensor) -> Tensor:
+    """(N, H, W) the alphas that count."""
+    return torch.where((exponential >= ALPHA_MIN) & (along > 0), exponential.clamp(max=ALPHA_MAX), 0)
 
 
 def decided_rays(gaussians: Gaussians, camera: Camera, near: float) -> Tensor:
     """(H, W) bool: pixels where no pair is within 0.1% of a cut; on the others rounding decides."""
     screen = torch.zeros(len(gaussians), 2, dtype=torch.float64)
-    rows = _nearest_first(gaussians, camera, 3, near, screen)
-    drawn = gaussians.with_tensors({name: tensor[rows] for name, tensor in gaussians.tensors().items()}, 0)
-    exponential, along = pixel_alphas(drawn, camera, screen[rows])
+    rows = nearest_first(project(gaussians, camera, 3, near, screen))
+    exponential, along = pixel_alphas(rows_of(gaussians, rows), camera, screen[rows])
     close = (exponential - ALPHA_MIN).abs() < ALPHA_MIN * 1e-3
     size = along.abs().amax((1, 2), keepdim=True)
     close |= (exponential > ALPHA_MIN / 2) & (along.abs() < 1e-4 * size)
-    alpha = torch.where((exponential >= ALPHA_MIN) & (along > 0), exponential.clamp(max=ALPHA_MAX), 0)
-    left = torch.cumprod(1 - alpha, 0)
+    left = torch.cumprod(1 - _cut(exponential, along), 0)
     return ~(close | ((left - TRANSMITTANCE_MIN).abs() < TRANSMITTANCE_MIN * 1e-3)).any(0)

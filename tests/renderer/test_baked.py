@@ -7,12 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from panolog.renderer.baked import SLACK, TILE, Baked, bake
+from panolog.renderer.baked import SLACK, Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians, concatenate
 from tests.renderer.agreement import IMAGES, NEAR, random_weights
 from tests.renderer.hard_scenes import as_leaves, camera, cloud, directions, hard_scenes, placed
+from tests.renderer.reference import rows_of
 
 HALF = 1e-3  # rounding of a layer to float16, of values up to 1
 
@@ -22,7 +23,15 @@ def baked(scene: Gaussians, own: int, at: Camera) -> Baked:
 
 
 def first(scene: Gaussians, own: int) -> Gaussians:
-    return scene.with_tensors({name: tensor[:own] for name, tensor in scene.tensors().items()})
+    return rows_of(scene, torch.arange(own))
+
+
+def wall(at: Camera, distance: float, size: float, opacity: float) -> Gaussians:
+    """72 in a circle around the camera."""
+    made = placed(
+        72, directions(torch.linspace(-3.1, 3.1, 24).repeat(3), torch.zeros(72), distance), at, size
+    )
+    return made.with_tensors(made.tensors() | {"opacities": torch.full((72,), opacity)})
 
 
 def active(found: Baked, at: Camera) -> Tensor:
@@ -68,10 +77,8 @@ def test_it_looks_as_the_whole_scene(name: str, exact: bool, width: int, instruc
 def test_own_gaussians_cannot_be_seen_in_tiles_that_are_not_active() -> None:
     """Behind an opaque front there is nothing to train."""
     at = Camera(torch.eye(3), torch.zeros(3), 128, 64)
-    angles = torch.linspace(-3.1, 3.1, 24)
-    walls = placed(72, directions(angles.repeat(3), torch.zeros(72), 2.0), at, 1.5)
-    walls = walls.with_tensors(walls.tensors() | {"opacities": torch.full((72,), 12.0)})
-    behind = placed(6, directions(angles[::4], torch.zeros(6), 20.0), at, -1.0)
+    walls = wall(at, 2.0, 1.5, 12.0)
+    behind = placed(6, directions(torch.linspace(-3.1, 2.3, 6), torch.zeros(6), 20.0), at, -1.0)
     scene = concatenate(behind, walls)
     exterior = baked(scene, 6, at)
     where = active(exterior, at)
@@ -82,17 +89,9 @@ def test_own_gaussians_cannot_be_seen_in_tiles_that_are_not_active() -> None:
     assert float(hidden[~where].max()) < 1 / 255
 
 
-def test_tiles_and_layers_are_those_of_what_is_owned() -> None:
-    at = camera(128)
-    scene = cloud(200)
-    few, many = baked(scene, 2, at), baked(scene, 150, at)
-    assert few.places.max() < many.places.max()
-    for found in (few, many):
-        count = int((found.places >= 0).sum())
-        assert found.front.shape == found.back.shape == (count, 5, TILE, TILE)
-        assert sorted(found.places[found.places >= 0].tolist()) == list(range(count))
-    none = baked(scene, 0, at)
-    assert not active(none, at).any()
+def test_nothing_owned_has_no_tile_and_all_owned_nothing_around_it() -> None:
+    at, scene = camera(128), cloud(200)
+    assert not active(baked(scene, 0, at), at).any()
     everything = baked(scene, len(scene), at)
     assert len(everything.splats) == 0
     assert (everything.front[:, 0] == 1).all() and not everything.front[:, 1:].any()
@@ -101,12 +100,7 @@ def test_tiles_and_layers_are_those_of_what_is_owned() -> None:
 def test_what_is_hidden_is_baked_and_shows_where_it_is_uncovered() -> None:
     """Own walls before and behind frozen ones: little of these is among the own."""
     at = Camera(torch.eye(3), torch.zeros(3), 128, 64)
-    angles = torch.linspace(-3.1, 3.1, 24)
-    near, middle, far = (
-        placed(72, directions(angles.repeat(3), torch.zeros(72), distance), at, size)
-        for distance, size in ((2.0, 1.5), (10.0, 2.0), (40.0, 1.0))
-    )
-    near = near.with_tensors(near.tensors() | {"opacities": torch.full((72,), 12.0)})
+    near, middle, far = wall(at, 2.0, 1.5, 12.0), wall(at, 10.0, 2.0, 2.0), wall(at, 40.0, 1.0, 2.0)
     scene, own = concatenate(concatenate(near, far), middle), 144
     exterior = baked(scene, own, at)
     assert len(exterior.splats) < 16 * 72 / 4

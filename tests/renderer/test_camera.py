@@ -4,25 +4,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from panolog.renderer.camera import Lens, facing, perspective
+from panolog.renderer.camera import Camera, Lens, facing, perspective
 from panolog.renderer.render import encode_png, render_panorama, to_bytes
 from panolog.scene.gaussians import Gaussians
+from tests.renderer.reference_rays import pixel_rays
 
-H, W = 256, 512
-
-
-def directions(height: int, width: int) -> NDArray[np.float64]:
-    """(H, W, 3) unit rays of a panorama's pixels."""
-    azimuth = ((np.arange(width) + 0.5) / width - 0.5) * 2 * np.pi
-    elevation = (((np.arange(height) + 0.5) / height - 0.5) * np.pi)[:, None]
-    return np.stack(
-        [
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation) + 0 * azimuth,
-            np.cos(elevation) * np.cos(azimuth),
-        ],
-        axis=-1,
-    )
+PANORAMA = Camera(torch.eye(3), torch.zeros(3), 512, 256)
 
 
 def paint(rays: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -36,7 +23,7 @@ def paint(rays: NDArray[np.float64]) -> NDArray[np.uint8]:
 @pytest.mark.parametrize("pitch", [0, 90, -90, 30])
 def test_every_direction_shows_what_is_there(yaw: float, pitch: float) -> None:
     lens, direction = Lens(96, 64, 90), facing(yaw, pitch)
-    seen = perspective(paint(directions(H, W)), lens, direction)
+    seen = perspective(paint(pixel_rays(PANORAMA).numpy()), lens, direction)
     x = (np.arange(96) + 0.5 - 48) / lens.focal
     y = (np.arange(64) + 0.5 - 32) / lens.focal
     rays = np.stack([*np.meshgrid(x, y), np.ones((64, 96))], axis=-1) @ direction.T

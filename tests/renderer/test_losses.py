@@ -70,33 +70,37 @@ def test_photometric_loss_and_gradient(
     agrees_with_the_definition(example()[2] if masked else None, weight, sphere, affine)
 
 
-# What counts: rows, columns, of an image of 24 × 48; columns go around the cylinder.
-@pytest.mark.parametrize(
-    ("rows", "columns"),
-    [
-        (range(9, 13), range(20, 30)),
-        (range(2, 24), range(40, 60)),  # over the seam, to a pole
-        (range(4, 24), range(43, 48)),  # to the seam
-        (range(24), range(3, 40)),  # leaves a gap of 11 columns, one more than two windows reach
-        (range(24), range(3, 41)),  # of 10: the whole width
-        (range(7), range(48)),
-    ],
-)
-@pytest.mark.parametrize("sphere", [False, True])
-def test_a_loss_of_a_part_of_the_image(rows: range, columns: range, sphere: bool) -> None:
+def part(rows: range, columns: range) -> Tensor:
+    """Of an image of 24 × 48, a rectangle without a corner; columns go around the cylinder."""
     mask = torch.zeros(24, 48, dtype=torch.bool)
     mask[rows.start : rows.stop, [column % 48 for column in columns]] = True
-    mask[rows.start, columns.start : columns.start + 3] = False  # no rectangle
-    agrees_with_the_definition(mask, 0.4, sphere)
+    mask[rows.start, columns.start : columns.start + 3] = False
+    return mask
 
 
-@pytest.mark.parametrize("sphere", [False, True])
-def test_a_loss_of_scattered_parts_of_the_image(sphere: bool) -> None:
+def scattered() -> Tensor:
     """Rows are computed in runs of cells of 16 columns, of which the last one has 6 here."""
     mask = torch.zeros(51, 102, dtype=torch.bool)
     mask[4:40, 20:33] = mask[12:14, 98:] = mask[13:51, 60:61] = mask[45:, :30] = True
     mask[:9, 0] = mask[30, 101] = True
-    agrees_with_the_definition(mask, 0.4, sphere)
+    return mask
+
+
+PARTS = {
+    "inside": part(range(9, 13), range(20, 30)),
+    "over the seam, to a pole": part(range(2, 24), range(40, 60)),
+    "to the seam": part(range(4, 24), range(43, 48)),
+    "a gap of 11 columns, one more than two windows reach": part(range(24), range(3, 40)),
+    "a gap of 10, so the whole width": part(range(24), range(3, 41)),
+    "all columns": part(range(7), range(48)),
+    "scattered": scattered(),
+}
+
+
+@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("sphere", [False, True])
+def test_a_loss_of_a_part_of_the_image(name: str, sphere: bool) -> None:
+    agrees_with_the_definition(PARTS[name], 0.4, sphere)
 
 
 def agrees_with_the_definition(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from panolog.renderer import ops
+from panolog.renderer.adam import adam_
 from panolog.renderer.baked import Baked, bake
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
 from panolog.renderer.motion import MOTION_SUMS
@@ -54,6 +55,13 @@ def scattered(chance: Tensor) -> Tensor:
     return mask
 
 
+def adam() -> list[Tensor]:
+    """A step of six parts, the last of them a few values."""
+    parameter, gradient, *moments = torch.rand(4, 5 * 2**15 + 7, generator=torch.Generator().manual_seed(0))
+    adam_(parameter, gradient, *moments, lr=0.1, step=3)
+    return [parameter, *moments]
+
+
 AFFINE = torch.tensor([[0.6, 1.0, 1.4], [0.03, 0.0, -0.05]])
 WORKS: dict[str, Callable[[], list[Tensor]]] = {
     "affine": lambda: rendering(exact=False),
@@ -61,9 +69,8 @@ WORKS: dict[str, Callable[[], list[Tensor]]] = {
     "among an exterior": lambda: rendering(exact=True, own=400),
     "losses": lambda: losses(None, lambda chance: chance > 0.3),
     "losses of parts": lambda: losses(None, scattered),
-    "exposed": lambda: losses(
-        torch.tensor([[0.6, 1.0, 1.4], [0.03, 0.0, -0.05]]), lambda chance: chance > 0.3
-    ),
+    "exposed": lambda: losses(AFFINE, lambda chance: chance > 0.3),
+    "adam": adam,
 }
 
 

@@ -1,21 +1,17 @@
-"""What NVRTC reports of the CUDA kernels: registers, shared memory, spills, instructions. Needs no card.
+"""What NVRTC reports of the CUDA kernels: registers, shared memory, spills. Needs no card.
 
-Registers, stack, spills and shared memory are what ptxas reports (-v); instructions are the size of the
-machine code, with its padding; double-precision instructions are those of the PTX, which has every one that a
-kernel can execute.
+Registers, stack, spills and shared memory are what ptxas reports (-v); double-precision instructions are
+those of the PTX, which has every one that a kernel can execute.
 """
 
 import functools
 import io
 import re
-import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from panolog.renderer.cuda import nvrtc
 
 ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")  # those that are supported
-_INSTRUCTION = 16  # bytes, from sm_70 on
 _ENTRY = re.compile(r"Compiling entry function '(\w+)'")
 
 
@@ -29,7 +25,6 @@ class Kernel:
     shared: int  # bytes
     stack: int  # bytes
     spills: int  # bytes stored and loaded
-    instructions: int
     doubles: int  # instructions in double precision
 
 
@@ -38,7 +33,6 @@ class Compiled:
     """A module for one architecture."""
 
     log: str  # of ptxas
-    code: bytes  # a cubin
     ptx: dict[str, str]  # by kernel
 
 
@@ -49,18 +43,17 @@ def compiled(module: str, arch: str) -> Compiled:
 
     log = io.StringIO()
     program = nvrtc.program(module, arch, ptxas_options="-v")
-    code = bytes(program.compile("cubin", logs=log).code)
+    program.compile("cubin", logs=log)
     text = b" " * library.nvrtcGetPTXSize(program.handle)[1]
     library.nvrtcGetPTX(program.handle, text)
     _, *bodies = re.split(r"\.entry (\w+)\(", text.decode())
-    return Compiled(log.getvalue(), code, dict(zip(bodies[::2], bodies[1::2], strict=True)))
+    return Compiled(log.getvalue(), dict(zip(bodies[::2], bodies[1::2], strict=True)))
 
 
 def measure(module: str, arch: str) -> list[Kernel]:
     """The kernels of csrc/cuda/{module}.cu. Raises DeviceError as `nvrtc.cubin`."""
     made = compiled(module, arch)
     _, *reports = _ENTRY.split(made.log)
-    sizes = dict(_sections(made.code))
     return [
         Kernel(
             name,
@@ -69,7 +62,6 @@ def measure(module: str, arch: str) -> list[Kernel]:
             shared=_number(r"(\d+) bytes smem", found, 0),
             stack=_number(r"(\d+) bytes stack frame", found),
             spills=_number(r"(\d+) bytes spill stores", found) + _number(r"(\d+) bytes spill loads", found),
-            instructions=sizes[f".text.{name}"] // _INSTRUCTION,
             doubles=len(re.findall(r"^.*\.f64\s.*;", made.ptx[name], re.MULTILINE)),
         )
         for name, found in zip(reports[::2], reports[1::2], strict=True)
@@ -82,14 +74,3 @@ def _number(pattern: str, text: str, default: int | None = None) -> int:
     if found is None and default is None:
         raise ValueError(f"ptxas does not report {pattern!r}")
     return default or 0 if found is None else int(found[1])
-
-
-def _sections(elf: bytes) -> Iterator[tuple[str, int]]:
-    """Names and sizes of the sections of a 64-bit little-endian ELF file."""
-    (start,) = struct.unpack_from("<Q", elf, 0x28)
-    size, count, names = struct.unpack_from("<HHH", elf, 0x3A)
-    headers = [struct.unpack_from("<IIQQQQ", elf, start + size * i) for i in range(count)]
-    strings = headers[names][4]
-    for header in headers:
-        name = strings + header[0]
-        yield elf[name : elf.index(b"\0", name)].decode(), header[5]

@@ -21,7 +21,7 @@ KPARAM_INFO, SIZED = 0x17, 0x04  # EIATTR_KPARAM_INFO of a cubin's .nv.info, and
 
 
 def sections(elf: bytes) -> Iterator[tuple[str, bytes]]:
-    """The named parts of an ELF file of 64 bits."""
+    """The named parts of a 64-bit little-endian ELF file."""
     (at,), (size, count, names) = struct.unpack_from("<Q", elf, 0x28), struct.unpack_from("<3H", elf, 0x3A)
     heads = [struct.unpack_from("<2I4Q", elf, at + size * i) for i in range(count)]
     for name, _kind, _flags, _address, begin, length in heads:

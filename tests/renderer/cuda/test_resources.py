@@ -57,7 +57,6 @@ def test_kernels_stay_within_their_limits(kernels: list[Kernel]) -> None:
         assert kernel.registers <= REGISTERS[kernel.name], kernel
         assert kernel.shared < SHARED, kernel
         assert kernel.stack <= (STACK if kernel.name.startswith("project_") else 0), kernel
-        assert 0 < kernel.instructions < 10_000, kernel
 
 
 def test_double_precision_is_for_the_loss_only(kernels: list[Kernel]) -> None:

@@ -13,7 +13,7 @@ TURN = Rotation.from_euler("y", 90, degrees=True)  # camera-to-world: looks alon
 CENTER = np.array([1.0, 2.0, 3.0])
 
 
-def write(folder: Path, text: str, name: str = "poses.txt") -> Path:
+def write(folder: Path, text: str, name: str) -> Path:
     path = folder / name
     path.write_text(text)
     return path
@@ -44,61 +44,44 @@ def test_three_formats_say_the_same(tmp_path: Path) -> None:
 
 
 def test_colmap_images_with_points_and_without(tmp_path: Path) -> None:
-    text = "\n".join(
-        [
-            "1 1 0 0 0 0 0 0 1 a.jpg",
-            "1.5 2.5 -1 3 4 7",
-            "2 1 0 0 0 1 0 0 1 b.jpg",
-            "",
-            "3 1 0 0 0 2 0 0 1 c.jpg",
-        ]
-    )
+    text = "1 1 0 0 0 0 0 0 1 a.jpg\n1.5 2.5 -1 3 4 7\n2 1 0 0 0 1 0 0 1 b.jpg\n\n3 1 0 0 0 2 0 0 1 c.jpg"
     poses = read_poses(write(tmp_path, text, "images.txt"))
     assert [pose.name for pose in poses] == ["a.jpg", "b.jpg", "c.jpg"]
     assert [pose.translation[0] for pose in poses] == [0, 1, 2]
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "no pose"),
-        ("# only a comment\n\n", "no pose"),
-        ("0 0 0 0 0 0 0 1\n0 0 0\n", "poses.txt:2: .* 3 fields"),
-        ("0 0 0 zero 0 0 0 1\n", "poses.txt:1: .*zero"),
-        ("0 0 0 0 0 0 0 1\n\n1 0 0 0 0 0 0 2\n", "poses.txt:3: the quaternion has the length 2"),
-        ("0 nan 0 0 0 0 0 1\n", "poses.txt:1: .*finite"),
-        ("1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0\n", "poses.txt:3: .*id qw"),
-        ("1 0 0 0 0 0 0 0 1 a.jpg\n", "poses.txt:1: the quaternion has the length 0"),
-    ],
-)
-def test_nonsense_is_refused_with_its_line(tmp_path: Path, text: str, words: str) -> None:
-    with pytest.raises(InputError, match=words) as refused:
-        read_poses(write(tmp_path, text))
-    assert "\n" not in str(refused.value)
+TEXT = [
+    ("", "no pose"),
+    ("# only a comment\n\n", "no pose"),
+    ("0 0 0 0 0 0 0 1\n0 0 0\n", "poses.txt:2: .* 3 fields"),
+    ("0 0 0 zero 0 0 0 1\n", "poses.txt:1: .*zero"),
+    ("0 0 0 0 0 0 0 1\n\n1 0 0 0 0 0 0 2\n", "poses.txt:3: the quaternion has the length 2"),
+    ("0 nan 0 0 0 0 0 1\n", "poses.txt:1: .*finite"),
+    ("1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0\n", "poses.txt:3: .*id qw"),
+    ("1 0 0 0 0 0 0 0 1 a.jpg\n", "poses.txt:1: the quaternion has the length 0"),
+]
+JSON = [
+    ("[\n{,\n]", r"poses.json:2: is not JSON"),
+    ("{}", "list of poses"),
+    ("[]", "no pose"),
+    ('[{"name": "a"}]', "entry 0: has no camera_to_world"),
+    ('[{"camera_to_world": [[1, 2], [3]]}]', "entry 0: .*rows of 4"),
+    ('[{"camera_to_world": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]', "entry 0: .*rows of 4"),
+    ('[{"camera_to_world": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}]', "scaled or mirrored"),
+    ('[{"camera_to_world": [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}]', "scaled or mirrored"),
+    ('[{"camera_to_world": [[1, 0, 0, NaN], [0, 1, 0, 0], [0, 0, 1, 0]]}]', "finite"),
+]
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("[\n{,\n]", r"poses.json:2: is not JSON"),
-        ("{}", "list of poses"),
-        ("[]", "no pose"),
-        ('[{"name": "a"}]', "entry 0: has no camera_to_world"),
-        ('[{"camera_to_world": [[1, 2], [3]]}]', "entry 0: .*rows of 4"),
-        ('[{"camera_to_world": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]', "entry 0: .*rows of 4"),
-        ('[{"camera_to_world": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}]', "scaled or mirrored"),
-        ('[{"camera_to_world": [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}]', "scaled or mirrored"),
-        ('[{"camera_to_world": [[1, 0, 0, NaN], [0, 1, 0, 0], [0, 0, 1, 0]]}]', "finite"),
-    ],
+    ("name", "text", "words"), [*(("poses.txt", *it) for it in TEXT), *(("poses.json", *it) for it in JSON)]
 )
-def test_nonsense_in_json_is_refused_with_its_entry(tmp_path: Path, text: str, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        read_poses(write(tmp_path, text, "poses.json"))
-
-
-def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+def test_nonsense_is_refused_with_its_place(tmp_path: Path, name: str, text: str, words: str) -> None:
     with pytest.raises(InputError, match="cannot be read"):
-        read_poses(tmp_path / "none.txt")
+        read_poses(tmp_path / name)
+    with pytest.raises(InputError, match=words) as refused:
+        read_poses(write(tmp_path, text, name))
+    assert "\n" not in str(refused.value)
 
 
 def panorama(center: list[float], yaw: float) -> Panorama:
@@ -119,12 +102,10 @@ def test_the_path_goes_through_the_cameras_at_constant_speed() -> None:
     np.testing.assert_allclose(poses[-1].rotation, panorama([0, 0, 0], 40).rotation, atol=1e-9)
 
 
-def test_a_path_needs_two_frames() -> None:
-    with pytest.raises(InputError, match="two frames"):
-        smooth_path([panorama([0.0, 0, 0], 0), panorama([1.0, 0, 0], 0)], 1)
-
-
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_a_path_needs_two_places(count: int) -> None:
-    with pytest.raises(InputError, match="two different positions"):
-        smooth_path([panorama([1.0, 2, 3], 0)] * count, 10)
+@pytest.mark.parametrize(
+    ("places", "frames", "words"),
+    [([0, 1], 1, "two frames"), *(([0] * count, 10, "two different positions") for count in (0, 1, 3))],
+)
+def test_a_path_needs_two_frames_and_two_places(places: list[float], frames: int, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        smooth_path([panorama([x, 2, 3], 0) for x in places], frames)
