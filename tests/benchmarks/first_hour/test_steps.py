@@ -63,7 +63,7 @@ def test_a_scene_is_trained_on_the_cpu_only_if_there_is_time(
 def test_a_rehearsal(tmp_path: Path) -> None:
     """In real processes, on the CPU; without a card a run on one says so in every step."""
     folder = tmp_path / "cpu"
-    steps = "machine,memcheck,waits,memory,demo,gsplat"
+    steps = "machine,memcheck,waits,memory,demo,scene,gsplat"
     assert program.main(["-o", str(folder), "--device", "cpu", "--only", steps]) == 0
     page = (folder / "first-hour.md").read_text()
     results = json.loads((folder / "first-hour.json").read_bytes())["steps"]

@@ -87,7 +87,10 @@ def test_a_switch_that_needs_others_is_a_row_that_says_so(bench: Bench) -> None:
 
 
 def test_a_result_of_other_settings_is_refused(
-    bench: Bench, stored: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+    bench: Bench,
+    stored: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     paper = KNOWN["paper"]
     config = paper.config(SETTINGS, 0, 16)
@@ -106,6 +109,9 @@ def test_a_result_of_other_settings_is_refused(
         for refused in (bench.check, lambda variants: bench.result(*variants)):
             with pytest.raises(panolog.InputError, match=message):
                 refused([paper])
+    given = [str(bench.scene), "-o", str(bench.folder.parent), "--tables", "tau", *SMALL]
+    assert command.main(given) == 2
+    assert "settings that are not stored" in capsys.readouterr().err
 
 
 def test_a_result_of_other_code_says_so(

@@ -87,10 +87,8 @@ def test_goals_are_met_or_missed() -> None:
     ]
     found = [(goal.measured, goal.met) for goal in goals.goals(Results(runs), {})]
     assert found == [("+0.10 dB", True), ("+0.10 dB", False), ("+0.60 dB", True)]
-    flat, flight = (
-        [goal.met for goal in goals.goals(Results(runs), {"street": kind})] for kind in ("flat", "flight")
-    )
-    assert (flat, flight) == ([True, True, True], [True, False, False])
+    for kind, met_there in (("flat", [True, True, True]), ("flight", [True, False, False])):
+        assert [goal.met for goal in goals.goals(Results(runs), {"street": kind})] == met_there
 
 
 def test_the_time_at_a_level_is_between_two_states() -> None:
@@ -135,9 +133,4 @@ def test_overlap_counts_what_gradients_add() -> None:
 
 def test_markdown_keeps_columns_aligned() -> None:
     lines = markdown(["a", "b"], [[1234, 0.5], [None, 12345.6]]).splitlines()
-    assert lines == [
-        "| a     | b      |",
-        "|-------|--------|",
-        "| 1,234 | 0.5000 |",
-        "| –     | 12,346 |",
-    ]
+    assert lines == ["| a     | b      |", "|-------|--------|", "| 1,234 | 0.5000 |", "| –     | 12,346 |"]
