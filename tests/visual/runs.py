@@ -1,4 +1,4 @@
-"""Run folders as drivers leave them: finished, live, failed and preparing, with all that pages show."""
+"""Run folders as drivers leave them: finished, live, preparing and others, with all that pages show."""
 
 import json
 import math
@@ -62,6 +62,8 @@ NAMES = {
     "finished": "harbour",
     "live": "old-town",
     "failed": "market-square",
+    "killed": "riverside",
+    "stopped": "quarry-test",
     "preparing": "arcade",
 }
 LENGTH = 30_000  # iterations of a task
@@ -229,34 +231,28 @@ def _merge_and_evaluate(run: Written) -> None:
     run.add(Delivered("web", 41_000_000, 9.0))
 
 
-def _failed(
-    block: int, attempt: int, reason: str, kind: Failure, *, final: bool, then: str = ""
-) -> TaskFailed:
-    return TaskFailed(TaskId.block(block), attempt, reason, final, kind=kind, memory=24 * 2**30, then=then)
-
-
 def finished(root: Path, clock: Clock) -> RunFolder:
-    """Done an hour ago, with two blocks, one of which ran out of memory once."""
+    """Done an hour ago, with two blocks."""
     with _written(root, clock, 3 * 3600, "2x1x1") as run:
         _stage_one(run)
-        first, second = _partition(run)
-        run.add(_started(first), _started(second), after=4)
-        _train(run, {first: (0.0, 0.4), second: (0.0, 0.38)}, seconds=900, gaussians=640_000)
-        reason = "out of memory: 23.1 of 24.0 GiB were in use, 1.2 GiB more were needed"
-        run.add(
-            _failed(1, 1, reason, Failure.MEMORY, final=False, then="tried again with a smaller image cache")
-        )
-        run.add(_started(second, attempt=2, iteration=11_400), after=10)
-        _train(run, {first: (0.4, 1.0), second: (0.38, 1.0)}, seconds=1500, gaussians=640_000)
-        _finish(run, [first, second], 690_000, 2380.0)
+        blocks = _partition(run)
+        run.add(*map(_started, blocks), after=4)
+        _train(run, dict.fromkeys(blocks, (0.0, 1.0)), seconds=2400, gaussians=640_000)
+        _finish(run, blocks, 690_000, 2380.0)
         _merge_and_evaluate(run)
         run.add(RunEnded(Outcome.DONE))
         write_report(run.folder)
+        _write_scene(run.folder)
     return run.folder
 
 
+def _write_scene(folder: RunFolder) -> None:
+    """As much of the scene as it takes to show a camera."""
+    town.write_scene(Path(json.loads(folder.info.read_bytes())["scene"]["path"]), "street_010.jpg")
+
+
 def live(root: Path, clock: Clock) -> RunFolder:
-    """In Stage II: blocks that are done, training, paused, tried again, waiting and not trained."""
+    """In Stage II: blocks that are done, training, paused, tried again, failed, waiting and not trained."""
     with _written(root, clock, 3_320, "5x2x1") as run:
         _stage_one(run)
         blocks = _partition(run)
@@ -272,41 +268,20 @@ def live(root: Path, clock: Clock) -> RunFolder:
         _finish(run, early[:1], 402_000, 1290.0)
         run.add(PauseRequested(early[2]), TaskYielded(early[2]), after=3)
         run.add(_started(late[0]), after=5)
-        reason = "the worker on borea was lost: its process was killed by signal 9"
-        run.add(_failed(late[0].number, 1, reason, Failure.LOST, final=False), after=30)
+        lost = "the worker on borea was lost: its process was killed by signal 9"
+        run.add(TaskFailed(late[0], 1, lost, final=False, kind=Failure.LOST, memory=24 * 2**30), after=30)
         run.add(_started(late[0], attempt=2), _started(late[1]), after=6)
-        shares = {early[1]: (0.72, 0.91), late[0]: (0.0, 0.31), late[1]: (0.0, 0.27)}
+        damaged = "street_031.jpg cannot be decoded: the file ends after 1,203,200 of 3,145,728 bytes"
+        run.add(_progressed(late[1], 0.3, 380_000), after=9)
+        run.add(TaskFailed(late[1], 3, damaged, final=True, kind=Failure.ERROR, memory=24 * 2**30), after=9)
+        shares = {early[1]: (0.72, 0.91), late[0]: (0.0, 0.31)}
         _train(run, shares, seconds=run.until - clock.now - 20, gaussians=380_000)
         run.folder.control.mkdir()
-        town.write_scene(Path(json.loads(run.folder.info.read_bytes())["scene"]["path"]), "street_010.jpg")
         for node, busy in ((HOST, 0.93), ("borea", 0.71)):
             gpu = GpuUsage("NVIDIA RTX A5000", busy, round(9.4 * busy * 2**30), 24 * 2**30)
             memory, disk = round(41 * busy) * 2**30, 1_900 * 10**9
             usage = Usage(node, busy / 2, memory, 128 * 2**30, round(busy * disk), disk, (gpu,))
             run.database.put_usage(node, asdict(usage))
-    return run.folder
-
-
-def failed(root: Path, clock: Clock) -> RunFolder:
-    """One block of four failed for good; the others are merged. Ended yesterday."""
-    with _written(root, clock, 26 * 3600, "2x2x1") as run:
-        _stage_one(run)
-        blocks = _partition(run)
-        run.add(*map(_started, blocks), after=4)
-        _train(run, dict.fromkeys(blocks, (0.0, 0.3)), seconds=700, gaussians=450_000)
-        reason = "street_031.jpg cannot be decoded: the file ends after 1,203,200 of 3,145,728 bytes"
-        for attempt in (1, 2, 3):
-            run.add(_failed(blocks[1].number, attempt, reason, Failure.ERROR, final=attempt == 3), after=20)
-            if attempt < 3:
-                run.add(_started(blocks[1], attempt=attempt + 1, iteration=9_000), after=5)
-        rest = [task for task in blocks if task != blocks[1]]
-        _train(run, dict.fromkeys(rest, (0.3, 1.0)), seconds=1600, gaussians=450_000)
-        _finish(run, rest, 471_000, 2300.0)
-        _merge_and_evaluate(run)
-        number = blocks[1].number
-        why = f"block {number} failed and keeps its Stage I Gaussians; `panolog resume` tries again"
-        run.add(RunEnded(Outcome.FAILED, why))
-        write_report(run.folder)
     return run.folder
 
 
@@ -331,10 +306,8 @@ def preparing(root: Path, clock: Clock) -> RunFolder:
         run.add(Preparing("finding poses and points", PREPARE), after=2)
         lines = (
             "139 of 142 panoramas have a pose, 61,204 points, seen by 5.2 panoramas, 0.61 pixels off",
-            "no pose: arcade_002871.jpg (shares at most 14 features, with arcade_002894.jpg)",
             "contradiction: arcade_000412.jpg and arcade_003985.jpg share 61 features, but 3 became common"
             " points: one of them stands elsewhere than their matches say, as happens where windows repeat",
-            "the world: z up, units of no known scale (--distance gives one)",
         )
         counts = Counts(panoramas=142, registered=139, points=61_204, weak_links=0, contradictions=1)
         found = StepResult(step=Step.SFM, settings={}, seconds=1_410, lines=lines, counts=counts)
@@ -354,18 +327,21 @@ def preparing(root: Path, clock: Clock) -> RunFolder:
 
 @contextmanager
 def all_runs(root: Path, clock: Clock) -> Iterator[dict[str, RunFolder]]:
-    """The four runs and, for the list, three smaller ones, while drivers hold the locks of the live ones."""
-    makers = {"finished": finished, "live": live, "failed": failed, "preparing": preparing}
+    """The three runs and smaller ones that have ended, while drivers hold the locks of the live ones."""
+    makers = {"finished": finished, "live": live, "preparing": preparing}
     folders = {state: maker(root / NAMES[state], clock) for state, maker in makers.items()}
-    stopped: dict[str, tuple[Record, ...]] = {
-        "riverside": (),  # its driver was killed: no record says so, and nothing holds the lock
-        "quarry-test": (StopRequested(1), RunEnded(Outcome.INTERRUPTED)),
+    why = "Stage I failed: street_031.jpg cannot be decoded; `panolog resume` tries again"
+    ended: dict[str, tuple[Record, ...]] = {
+        "failed": (RunEnded(Outcome.FAILED, why),),
+        "killed": (),  # no record says so, and nothing holds the lock
+        "stopped": (StopRequested(1), RunEnded(Outcome.INTERRUPTED)),
     }
-    for days, (name, last) in enumerate(stopped.items(), 4):
-        with _written(root / name, clock, days * 86_400, "2x1x1") as run:
+    for days, (state, last) in enumerate(ended.items(), 2):
+        with _written(root / NAMES[state], clock, days * 86_400, "2x1x1") as run:
             run.add(_started(COARSE), after=12)
             _train(run, {COARSE: (0.0, 0.42)}, seconds=400, gaussians=900_000)
             run.add(*last, after=9)
+        folders[state] = run.folder
     (root / "damaged").mkdir()
     (root / "damaged" / "run.json").write_text("{")
     with lock.hold(folders["live"].lock), lock.hold(folders["preparing"].lock):

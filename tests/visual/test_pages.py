@@ -55,7 +55,7 @@ _HARD_TO_READ = {  # rules, and a text that is then hard to read
     "#log-text::placeholder { color: #aaa; }": "Search",
     "#view-source { color: #bbb; }": "block 1",  # in a field
     "#facts { opacity: 0.35; }": "Progress",
-    ".tag { background: none !important; color: #fff; }": "render",  # on a picture
+    ".tag { background: none !important; color: #999; }": "render",  # on a picture
 }
 
 
