@@ -62,8 +62,7 @@ def save(path: Path, rgba: NDArray[np.uint8]) -> None:
     if "16" in path.name:
         cv2.imwrite(str(path), cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA).astype(np.uint16) * 257)
     else:
-        options = {"lossless": True, "exact": True} if path.suffix == ".webp" else {}
-        Image.fromarray(rgba).save(path, **options)
+        Image.fromarray(rgba).save(path, None, **dict.fromkeys(["lossless", "exact"], path.suffix == ".webp"))
 
 
 def color_of(name: str) -> tuple[int, int, int]:

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from panolog.renderer.camera import Camera
 from panolog.renderer.motion import MOTION, MOTION_SUMS, moved
@@ -27,12 +26,13 @@ def test_the_definition_is_the_derivative_of_moved_cameras(exact: bool) -> None:
     definition = render_rays if exact else render_reference
     rotation, translation = wide(at).rotation.numpy(), wide(at).translation.numpy()
 
-    def value(motion: np.ndarray) -> Tensor:
-        there = Camera(*map(torch.from_numpy, moved(rotation, translation, motion)), at.width, at.height)
+    def value(motion: np.ndarray) -> float:
+        turned, shifted = map(torch.from_numpy, moved(rotation, translation, motion))
+        there = Camera(turned, shifted, at.width, at.height)
         with torch.no_grad():
             screen = torch.zeros(len(scene), 2, dtype=torch.float64)
             images = definition(precise, there, near=NEAR, screen=screen)[:3]
-        return sum((image * weight).sum() for image, weight in zip(images, truth.weights, strict=True))
+        return sum(float((image * w).sum()) for image, w in zip(images, truth.weights, strict=True))
 
     step = 1e-7
     numeric = np.array([(value(step * e) - value(-step * e)) / (2 * step) for e in np.eye(MOTION)])
