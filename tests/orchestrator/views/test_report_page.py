@@ -13,6 +13,7 @@ from panolog.orchestrator.views.report import write_report
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.dashboard.browser import DESK, PHONE, opened
 from tests.orchestrator.dashboard.served import append, progressed, started, write_whole_run
+from tests.orchestrator.views.models import save_model
 from tests.visual import legible
 
 pytestmark = pytest.mark.system
@@ -21,6 +22,7 @@ pytestmark = pytest.mark.system
 def test_curves_are_hidden_and_all_can_be_read(browser: Browser, tmp_path: Path) -> None:
     """All that a report shows, also a failed block and a long name."""
     folder = write_whole_run(tmp_path / "run")
+    save_model(folder, COARSE)
     append(folder, *(progressed(COARSE, iteration) for iteration in range(51, 100)))
     append(folder, started(TaskId.block(1)), TaskFailed(TaskId.block(1), 1, "out of memory " * 9, final=True))
     name = "a_panorama_with_quite_a_long_name_from_a_camera_2026-11-22T02:47:00.png"
