@@ -275,26 +275,30 @@ class Harness:
         return [s.record for s in read_records(self.folder.database) if isinstance(s.record, kind)]
 
 
-def doing(task: TaskId, action: Callable[[], object]) -> Script:
-    """All goes well, and something is done at the begin of each attempt at one task."""
+def begins(
+    task: TaskId, *steps: Any, times: int = 1, rest: Callable[[TaskSpec], Iterator[Any]] = well
+) -> Script:
+    """All goes well, but the first attempts at one task begin with steps: events, errors and actions.
 
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == task:
-            action()
-        yield from well(spec)
+    Args: rest, the script of what follows these, and of all else.
+    """
+    left = [times]
+
+    def script(spec: TaskSpec) -> Iterator[Any]:
+        if spec.task == task and left[0]:
+            left[0] -= 1
+            for step in steps:
+                if isinstance(step, BaseException):
+                    raise step
+                if callable(step):
+                    step()
+                else:
+                    yield step
+        yield from rest(spec)
 
     return script
 
 
 def fails(task: TaskId, failed: Failed, times: int, before: Sequence[Event] = ()) -> Script:
     """All goes well but for the first attempts at one task."""
-    left = [times]
-
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == task and left[0]:
-            left[0] -= 1
-            yield from before
-            raise CrashError(failed)
-        yield from well(spec)
-
-    return script
+    return begins(task, *before, CrashError(failed), times=times)

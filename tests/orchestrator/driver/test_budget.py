@@ -37,7 +37,7 @@ from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, MERGE, TaskId
 from panolog.workers.training.optimizer import ModelState
 from panolog.workers.training.trainer import TrainSpec
-from tests.orchestrator.fakes import DIED, MACHINE, CrashError, Harness, SetClock, trained, well
+from tests.orchestrator.fakes import DIED, MACHINE, CrashError, Harness, SetClock, begins, trained, well
 
 PRICES = {"currency": "USD", "machine": [{"name": "any", "price": 3600.0, "host": "*"}]}  # 1 USD per second
 AFTER = {"merge": 1.0, "eval": 5.0, "deliver": 4.0}  # seconds: 12 with what is unsure of them
@@ -182,15 +182,9 @@ def test_a_limit_before_the_first_checkpoint_leaves_no_model_and_one_after_the_t
 
 def test_a_driver_that_dies_after_a_limit_leaves_the_rest_to_the_next(tmp_path: Path) -> None:
     harness = Limited(tmp_path, BudgetSet(max_cost=60.0, prices=PRICES))
-
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == EVAL:
-            harness.stop.signal()
-            yield Progress(EVAL, 1, 2, 3.0)
-        yield from slow(harness, {BLOCK: 500})(spec)
-
+    steps = (lambda: harness.stop.signal()), Progress(EVAL, 1, 2, 3.0)  # noqa: PLW0108  # drive makes a new one
     with pytest.raises(KeyboardInterrupt):
-        harness.drive(script)
+        harness.drive(begins(EVAL, *steps, rest=slow(harness, {BLOCK: 500})))
     assert harness.state.outcome == Outcome.INTERRUPTED
     harness.begin()
     state = harness.drive(resumed=True)
@@ -199,21 +193,13 @@ def test_a_driver_that_dies_after_a_limit_leaves_the_rest_to_the_next(tmp_path: 
 
 def test_what_attempts_and_killed_drivers_lose_is_recorded(tmp_path: Path) -> None:
     harness = Limited(tmp_path, BudgetSet(prices=PRICES))
-    ends: list[BaseException] = [SystemExit(), CrashError(DIED)]
-
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == COARSE and ends:
-            harness.passes(10)
-            yield Checkpoint(COARSE, 1, {"x": torch.arange(3)})
-            harness.passes(4)
-            yield Progress(COARSE, 2, 2, 3.0)
-            raise ends.pop()
-        yield from slow(harness, {EVAL: 6})(spec)
-
+    saved = (lambda: harness.passes(10)), Checkpoint(COARSE, 1, {"x": torch.arange(3)})
+    lost = *saved, (lambda: harness.passes(4)), Progress(COARSE, 2, 2, 3.0)
+    killed = begins(COARSE, *lost, SystemExit(), rest=slow(harness, {EVAL: 6}))
     with pytest.raises(SystemExit):
-        harness.drive(script)
+        harness.drive(begins(COARSE, *lost, CrashError(DIED), rest=killed))
     harness.begin()
-    state = harness.drive(script, resumed=True)
+    state = harness.drive(killed, resumed=True)
     assert [(record.task, record.seconds) for record in harness.records(WorkLost)] == [(COARSE, 4.0)] * 2
     assert (state.money.lost.cost, state.money.used.cost) == pytest.approx((8.0, 34.0))
 

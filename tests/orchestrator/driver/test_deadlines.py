@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Set
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import pytest
 
@@ -22,7 +23,7 @@ from panolog.workers.events import Checkpoint, Event, Progress
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.orchestrator.calibrated import calibrated
-from tests.orchestrator.fakes import MACHINE, FakePool, Harness, SetClock, well
+from tests.orchestrator.fakes import MACHINE, FakePool, Harness, SetClock, begins, well
 
 LIMIT = 600.0  # the default of both deadlines
 STEP = 5.0  # seconds of a turn of the driver's loop
@@ -36,7 +37,7 @@ class Silence:
 
 
 HANG = Silence(math.inf)
-Timed = Callable[[TaskSpec], Iterator[Event | Silence]]
+Timed = Callable[[TaskSpec], Iterator[Any]]  # events and silences
 
 
 class TimedPool(SetClock, FakePool):
@@ -45,7 +46,7 @@ class TimedPool(SetClock, FakePool):
     def __init__(self, script: Timed, before: dict[TaskId, list[Silence]] | None = None) -> None:
         """Args: before, the silence before the Hello of each attempt at a task."""
         SetClock.__init__(self)
-        FakePool.__init__(self, script, [MACHINE])  # type: ignore[arg-type]
+        FakePool.__init__(self, script, [MACHINE])
         self.cancelled: list[tuple[TaskId, float]] = []  # with the seconds since its last message
         self.on_take: Callable[[TaskId, Message], None] = lambda task, message: None
         self.others = 0  # times that `waiting` is true
@@ -99,19 +100,6 @@ def drive(harness: Harness, pool: TimedPool) -> RunState:
     return harness.drive(pool=pool)
 
 
-def once(task: TaskId, *events: Event | Silence) -> Timed:
-    """All goes well but for the first attempt at one task."""
-    left = [1]
-
-    def script(spec: TaskSpec) -> Iterator[Event | Silence]:
-        if spec.task == task and left:
-            left.pop()
-            yield from events
-        yield from well(spec)
-
-    return script
-
-
 BLOCK = TaskId.block(0)
 
 
@@ -119,7 +107,7 @@ BLOCK = TaskId.block(0)
 def test_a_worker_that_is_silent_for_too_long_is_lost_and_its_task_tried_again(
     harness: Harness, task: TaskId
 ) -> None:
-    pool = TimedPool(once(task, Progress(task, 1, 9, 1.0), HANG))
+    pool = TimedPool(begins(task, Progress(task, 1, 9, 1.0), HANG))
     state = drive(harness, pool)
     (failed,) = harness.records(TaskFailed)
     assert (failed.task, failed.kind, failed.final) == (task, Failure.LOST, False)
@@ -152,7 +140,7 @@ def test_a_task_may_be_silent_for_ten_times_its_usual_interval_or_what_the_calib
     basis = Basis(calibrated(begin=begin), startup=3.0)
     write_json(harness.folder.preflight, {"basis": asdict(basis)})
     steps = [step for i in range(20) for step in (Silence(interval), Progress(BLOCK, i, 99, 1.0))]
-    pool = TimedPool(once(BLOCK, *steps, Silence(most - 10), Progress(BLOCK, 20, 99, 1.0), HANG))
+    pool = TimedPool(begins(BLOCK, *steps, Silence(most - 10), Progress(BLOCK, 20, 99, 1.0), HANG))
     drive(harness, pool)
     assert pool.cancelled == [(BLOCK, most + STEP)]
 
@@ -170,7 +158,7 @@ def test_a_task_may_be_silent_for_ten_times_its_usual_interval_or_what_the_calib
 def test_the_time_in_which_the_driver_is_busy_does_not_count(
     harness: Harness, events: list[Event | Silence], slow: TaskId, kind: type, seconds: float
 ) -> None:
-    pool = TimedPool(once(BLOCK, *events))
+    pool = TimedPool(begins(BLOCK, *events))
 
     def save(task: TaskId, message: Message) -> None:
         pool.now += seconds if task == slow and isinstance(message, kind) else 0.0
@@ -197,7 +185,7 @@ def test_a_process_that_does_not_end_after_its_result_is_no_failure(harness: Har
 
 
 def test_a_block_that_hangs_on_its_way_to_a_pause_is_paused(harness: Harness) -> None:
-    pool = TimedPool(once(BLOCK, Progress(BLOCK, 1, 9, 1.0), HANG))
+    pool = TimedPool(begins(BLOCK, Progress(BLOCK, 1, 9, 1.0), HANG))
 
     def pause(task: TaskId, message: Message) -> None:
         if task == BLOCK and isinstance(message, Progress) and not pool.cancelled:

@@ -34,7 +34,7 @@ from panolog.workers.seams.schema import parse_seams
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.trainer import TrainSpec
-from tests.orchestrator.fakes import DIED, CrashError, Harness, fails, well
+from tests.orchestrator.fakes import DIED, CrashError, Harness, begins, fails, well
 
 TRUNCATED = Failed("a.jpg is truncated", Failure.INPUT)
 
@@ -56,13 +56,8 @@ def test_a_run_ends_with_everything_in_its_place(harness: Harness) -> None:
 
 
 def test_of_many_previews_the_first_the_latest_and_some_between_are_kept(harness: Harness) -> None:
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == COARSE:
-            for iteration in range(500, 30_001, 500):
-                yield Preview(COARSE, iteration, "1.jpg", b"\xff\xd8\xff")
-        yield from well(spec)
-
-    harness.drive(script)
+    previews = (Preview(COARSE, iteration, "1.jpg", b"\xff\xd8\xff") for iteration in range(500, 30_001, 500))
+    harness.drive(begins(COARSE, *previews))
     paths = [record.path for record in harness.records(PreviewSaved)]
     kept = [path for path in paths if (harness.folder.root / path).exists()]
     assert len(paths) == 60

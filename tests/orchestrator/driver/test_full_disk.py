@@ -5,7 +5,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,9 @@ from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.stages import evaluation
 from panolog.scene.errors import RunError
 from panolog.workers.events import Checkpoint, Event, Preview, Trained
-from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import checkpoint
-from tests.orchestrator.fakes import Harness, well
+from tests.orchestrator.fakes import Harness, begins
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
 QUICK: dict[str, Any] = {"disk": {"retry": 0.01}}
@@ -69,16 +68,10 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def test_a_disk_that_takes_nothing_for_a_while_delays_the_run_and_nothing_else(
     quick: Harness, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch, kind: type, number: int
 ) -> None:
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        for event in well(spec):
-            yield event
-            if isinstance(event, Checkpoint):
-                yield Preview(spec.task, 1, "a.jpg", b"picture")
-
     error = OSError(number, "for a while")
     save = Refusing(saving.save, error, 3, lambda _, event, *__: isinstance(event, kind))
     monkeypatch.setattr(driver_module, "save", save)
-    assert quick.drive(script).outcome == "done"
+    assert quick.drive(begins(COARSE, Preview(COARSE, 1, "a.jpg", b"picture"))).outcome == "done"
     assert save.left == 0
     assert quick.folder.point_cloud.read_bytes() == undisturbed
     assert len(quick.records(RunContinued)) == len({w.reason for w in quick.records(RunWaiting)}) == 1

@@ -32,7 +32,7 @@ from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator import fakes
-from tests.orchestrator.fakes import LOST_NODE, CrashError, FakePool, Harness, Script, well
+from tests.orchestrator.fakes import LOST_NODE, CrashError, FakePool, Harness, Script, begins, well
 from tests.orchestrator.history import AGAIN, after
 
 A, B = Node("aaaa", "spot-a", 1, 2**40), Node("bbbb", "spot-b", 1, 2**40)
@@ -136,20 +136,16 @@ def test_a_task_that_has_not_begun_is_taken_back(tmp_path: Path, monkeypatch: py
 
 def lost_with_node(run: Harness, times: int) -> Script:
     """Stage I is lost so often with a node that announces its end too late, and each time another joins."""
-    left = [times]
 
-    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
-        if spec.task == COARSE and left[0]:
-            left[0] -= 1
-            where = run.pool.placement(COARSE).node
-            run.pool.join(Node(f"n{left[0]}", f"spot-{left[0]}", 1, 2**40))
-            run.pool.leaving[where] = LeaveNotice(Leaving.PREEMPTION, 0.0)
-            yield Progress(COARSE, 1, 9, 1.0)
-            run.pool.leave(where)
-            raise CrashError(LOST_NODE)
-        yield from well(spec)
+    def announce() -> None:
+        where = run.pool.placement(COARSE).node
+        run.pool.join(Node(f"{where}a", f"spot-{where}", 1, 2**40))
+        run.pool.leaving[where] = LeaveNotice(Leaving.PREEMPTION, 0.0)
 
-    return script
+    def leave() -> None:
+        run.pool.leave(run.pool.placement(COARSE).node)
+
+    return begins(COARSE, announce, Progress(COARSE, 1, 9, 1.0), leave, CrashError(LOST_NODE), times=times)
 
 
 @pytest.mark.parametrize("limit", [{}, {"preemptions": LOSSES + 2}])

@@ -33,7 +33,7 @@ from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
 from panolog.workers.training.config import CacheConfig
-from tests.orchestrator.fakes import LOST_NODE, CrashError, Harness, Script, SetClock, doing, fails, well
+from tests.orchestrator.fakes import LOST_NODE, CrashError, Harness, Script, SetClock, begins, fails, well
 
 GIB = 2**30
 NO_MEMORY = Failed("out of memory: CUDA out of memory. Tried to allocate 2.00 GiB", Failure.MEMORY)
@@ -78,8 +78,8 @@ def test_the_order_of_blocks_follows_what_was_measured(tmp_path: Path) -> None:
 
 def test_a_machine_that_joins_is_used(tmp_path: Path) -> None:
     harness = Harness(tmp_path, [with_gpu("a", 24)], device="cuda")
-    script = doing(TaskId.shard(0), lambda: harness.pool.join(with_gpu("b", 24)))
-    assert harness.drive(script).outcome == "done"
+    joins = begins(TaskId.shard(0), lambda: harness.pool.join(with_gpu("b", 24)))
+    assert harness.drive(joins).outcome == "done"
     blocks = [place for place, spec in harness.pool.started if spec.task.stage is Stage.BLOCK]
     assert {place.node for place in blocks} == {"a", "b"}
 
@@ -90,14 +90,9 @@ def test_a_machine_that_joins_is_used(tmp_path: Path) -> None:
 def test_the_death_of_a_machine_does_not_use_up_retries(tmp_path: Path) -> None:
     nodes = [with_gpu("a", 24), with_gpu("b", 24)]
     harness = Harness(tmp_path, nodes, device="cuda", retries=0)
-
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == COARSE and len(harness.pool.started) == 1:
-            yield Checkpoint(spec.task, 1, {"iteration": torch.tensor(1)})
-            harness.pool.lose(harness.pool.placement(COARSE).node)
-        yield from well(spec)
-
-    assert harness.drive(script).outcome == "done"
+    saved = Checkpoint(COARSE, 1, {"iteration": torch.tensor(1)})
+    lost = begins(COARSE, saved, lambda: harness.pool.lose(harness.pool.placement(COARSE).node))
+    assert harness.drive(lost).outcome == "done"
     assert [place.node for place, _ in harness.attempts(COARSE)] == ["a", "b"]
     first, second = harness.trainings(COARSE)
     assert (first.checkpoint, second.checkpoint) == (None, CheckpointFile(harness.folder.checkpoint(COARSE)))
@@ -223,7 +218,7 @@ def test_who_does_not_obey_is_not_waited_for(
 
 def test_ctrl_c_where_nothing_trains_ends_at_once(harness: Harness) -> None:
     with pytest.raises(KeyboardInterrupt):
-        harness.drive(doing(EVAL, lambda: harness.stop.signal()))  # noqa: PLW0108  # drive makes a new one
+        harness.drive(begins(EVAL, lambda: harness.stop.signal()))  # noqa: PLW0108  # drive makes a new one
     assert harness.records(StopRequested) == [StopRequested(0)]
     assert harness.pool.stopped == set()
 

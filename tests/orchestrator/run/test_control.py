@@ -1,6 +1,5 @@
 """Requests to a run reach its driver, and malformed ones are ignored."""
 
-import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,7 +34,7 @@ from panolog.workers.events import Checkpoint, Event, Progress
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
-from tests.orchestrator.fakes import DIED, CrashError, Harness, well
+from tests.orchestrator.fakes import DIED, CrashError, Harness, begins, well
 from tests.orchestrator.history import AGAIN, after, model, started
 
 ZERO, ONE = TaskId.block(0), TaskId.block(1)
@@ -273,16 +272,12 @@ def when_others_are_done(harness: Listening, action: str, block: int) -> None:
 def test_a_block_is_paused_and_unpaused(listening: Listening, dies: bool) -> None:
     """If it dies meanwhile, its failure counts, but it is not started again until a user requests it."""
 
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == ONE and listening.tasks.count(ONE) == 1:
-            listening.send(Action.PAUSE, 1)
-            when_others_are_done(listening, Action.UNPAUSE, 1)
-            yield Progress(spec.task, 1, 2, 1.0)
-            if dies:
-                raise CrashError(DIED)
-        yield from listening.trains(spec)
+    def pause() -> None:
+        listening.send(Action.PAUSE, 1)
+        when_others_are_done(listening, Action.UNPAUSE, 1)
 
-    assert listening.drive(script).outcome == "done"
+    steps = pause, Progress(ONE, 1, 2, 1.0), *([CrashError(DIED)] if dies else [])
+    assert listening.drive(begins(ONE, *steps, rest=listening.trains)).outcome == "done"
     assert listening.yielded == ([] if dies else [ONE])
     assert listening.tasks[-2:] == [ONE, EVAL]
     checkpoint = CheckpointFile(listening.folder.checkpoint(ONE))
@@ -292,33 +287,25 @@ def test_a_block_is_paused_and_unpaused(listening: Listening, dies: bool) -> Non
 
 
 def test_a_failed_block_is_retried_while_another_trains(listening: Listening) -> None:
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        attempt = listening.tasks.count(ONE)
-        if spec.task == ONE and attempt <= 3:
-            if attempt == 3:
-                listening.send(Action.PAUSE, 0)  # so that there is still time
-                when_others_are_done(listening, Action.RETRY, 1)
-            raise CrashError(DIED)
-        if spec.task == ONE:
-            listening.send(Action.UNPAUSE, 0)
-        yield from listening.trains(spec)
+    def last_failure() -> None:
+        listening.send(Action.PAUSE, 0)  # so that there is still time
+        when_others_are_done(listening, Action.RETRY, 1)
 
-    assert listening.drive(script).outcome == "done"
+    fourth = begins(ONE, lambda: listening.send(Action.UNPAUSE, 0), rest=listening.trains)
+    third = begins(ONE, last_failure, CrashError(DIED), rest=fourth)
+    assert listening.drive(begins(ONE, CrashError(DIED), times=2, rest=third)).outcome == "done"
     assert listening.tasks.count(ONE) == 4
     assert listening.records(RetryRequested) == [RetryRequested(ONE)]
 
 
 def test_stop_is_a_remote_ctrl_c_and_what_cannot_be_done_is_said(listening: Listening) -> None:
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == COARSE:
-            listening.send(Action.RETRY, 0)
-            put(listening.folder, "2.json", json.dumps({"action": "rm"}).encode())
-        if spec.task == ONE:
-            listening.send(Action.STOP)
-        yield from listening.trains(spec)
+    def ask() -> None:
+        listening.send(Action.RETRY, 0)
+        put(listening.folder, "2.json", b'{"action": "rm"}')
 
+    stop = begins(ONE, lambda: listening.send(Action.STOP), rest=listening.trains)
     with pytest.raises(KeyboardInterrupt):
-        listening.drive(script)
+        listening.drive(begins(COARSE, ask, rest=stop))
     assert sorted(listening.yielded) == [ZERO, ONE]
     state = listening.state
     assert [state.outcome, state.status(ZERO), state.status(ONE)] == [

@@ -28,7 +28,7 @@ from panolog.workers.seams.schema import parse_seams
 from panolog.workers.specs import ModelFile, TaskSpec
 from panolog.workers.tasks import EVAL, TaskId
 from panolog.workers.training.initialise import scene_gaussians
-from tests.orchestrator.fakes import DIED, Harness, Noting, doing, fails, well
+from tests.orchestrator.fakes import DIED, Harness, Noting, begins, fails, well
 from tests.workers.seams.test_schema import FACES
 from tests.workers.small import WIDTH, small_scene
 
@@ -180,7 +180,7 @@ def test_shards_of_another_evaluation_are_not_joined(tmp_path: Path) -> None:
 
     first, second = (harness.folder.shard(task) for task in SHARDS[:2])
     with pytest.raises(RunError, match="has shards of another evaluation; `panolog eval"):
-        harness.drive(doing(SHARDS[2], lambda: first.write_bytes(second.read_bytes())))
+        harness.drive(begins(SHARDS[2], lambda: first.write_bytes(second.read_bytes())))
 
 
 def test_a_run_whose_plan_knows_no_shards_is_evaluated_as_one_task(
@@ -191,7 +191,7 @@ def test_a_run_whose_plan_knows_no_shards_is_evaluated_as_one_task(
     with monkeypatch.context() as older:
         older.setattr("panolog.orchestrator.driver.job.Specs.measures", ())
         with pytest.raises(KeyboardInterrupt):
-            harness.drive(doing(TaskId.block(0), lambda: harness.stop.signal()))  # noqa: PLW0108  # a new one
+            harness.drive(begins(TaskId.block(0), lambda: harness.stop.signal()))  # noqa: PLW0108  # a new one
     assert [record.measures for record in harness.records(PlanSaved)] == [0]
     assert harness.drive(resumed=True).outcome == "done"
     assert harness.tasks[-1] == EVAL
