@@ -1,4 +1,4 @@
-"""What each CUDA kernel takes of a card: registers, shared memory, spills, instructions. Needs no card.
+"""What each CUDA kernel takes of a card: registers, shared memory, spills. Needs no card.
 
     python -m benchmarks.cuda_resources [--arch sm_89,sm_120] [--json]
 
@@ -16,7 +16,7 @@ from tests.renderer.cuda.resources import ARCHITECTURES, Kernel, measure
 
 
 def table(kernels: Sequence[Kernel]) -> str:
-    """A row for each kernel: the most over all architectures; registers and instructions for each."""
+    """A row for each kernel: the most over all architectures; registers for each."""
     architectures = list(dict.fromkeys(kernel.arch for kernel in kernels))
     rows = []
     for name in dict.fromkeys(kernel.name for kernel in kernels):
@@ -25,9 +25,9 @@ def table(kernels: Sequence[Kernel]) -> str:
             max(getattr(kernel, field) for kernel in own)
             for field in ("shared", "stack", "spills", "doubles")
         ]
-        rows.append([name, *most, *(f"{kernel.registers} / {kernel.instructions}" for kernel in own)])
+        rows.append([name, *most, *(kernel.registers for kernel in own)])
     head = ("kernel", "shared B", "stack B", "spills B", "f64", *architectures)
-    return report.markdown(head, rows) + "\n\nUnder each architecture: registers / instructions."
+    return report.markdown(head, rows) + "\n\nUnder each architecture: registers."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
