@@ -1,108 +1,92 @@
 """What a fault has cost, from histories made by hand."""
 
+from collections.abc import Callable
+
 import pytest
 
 from benchmarks.chaos.fault_costs import Fault, fault_costs, longest_unsaved, true_times
 from benchmarks.chaos.faults import DAY_S, LIMITS, Kind
-from panolog.orchestrator.run.records import (
-    CheckpointSaved,
-    Failure,
-    Outcome,
-    Record,
-    RunEnded,
-    ScoresSaved,
-    TaskFailed,
-)
+from panolog.orchestrator.run.records import CheckpointSaved, Failure, Record, ScoresSaved, Stored, TaskFailed
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.benchmarks.histories import history
 from tests.orchestrator.history import AGAIN, BEGAN, model, started
 
-
-def saved(task: TaskId) -> CheckpointSaved:
-    return CheckpointSaved(task, 10, "checkpoint", 1)
-
-
 ZERO, ONE = TaskId.block(0), TaskId.block(1)
-Timed = tuple[float, Record]
+TASKS = {"0": ZERO, "1": ONE, "coarse": COARSE, "eval": EVAL, "shard": TaskId.shard(0)}
+MADE: dict[str, Callable[[TaskId], Record]] = {
+    "started": started,
+    "saved": lambda task: CheckpointSaved(task, 10, "checkpoint", 1),
+    "model": model,
+    "scores": lambda task: ScoresSaved(task, "0.npz", 4),
+    "lost": lambda task: TaskFailed(task, 1, "died", final=False, kind=Failure.LOST),
+    "unread": lambda task: TaskFailed(task, 1, "Input/output error", final=False),
+}
 
 
-def lost(task: TaskId) -> TaskFailed:
-    return TaskFailed(task, 1, "died", final=False, kind=Failure.LOST)
-
-
-def unread(task: TaskId) -> TaskFailed:
-    return TaskFailed(task, 1, "Input/output error", final=False)
+def written(text: str) -> list[Stored]:
+    """The history that says what happened after how many seconds: "0 began, 1 started coarse, 9 again"."""
+    found = list[tuple[float, Record]]()
+    for time, what, *task in map(str.split, text.split(",")):
+        record = MADE[what](TASKS[task[0]]) if task else {"began": BEGAN, "again": AGAIN}[what]
+        found.append((float(time), record))
+    return history(*found)
 
 
 def fault(time: float, kind: Kind, until: float = 0.0) -> Fault:
     return Fault(time, kind, str(kind), until)
 
 
-# What happened, the time and kind of the fault, the tasks that it ended, seconds done again and of recovery.
-CASES: dict[str, tuple[list[Timed], float, Kind, tuple[TaskId, ...], float, float]] = {
-    "a worker's work since its checkpoint, and the time to its next start": (
-        [
-            *[(0.0, BEGAN), (1.0, started(ZERO)), (1.5, started(ONE)), (4.0, saved(ZERO))],
-            *[(9.0, lost(ZERO)), (11.0, started(ZERO)), (20.0, model(ONE)), (21.0, model(ZERO))],
-        ],
-        *(6.0, Kind.WORKER, (ZERO,), 2.0, 5.0),
-    ),
-    "a task that takes the place of the dead one ends the recovery": (
-        [
-            *[(0.0, BEGAN), (1.0, started(ZERO)), (5.0, lost(ZERO)), (7.0, started(ONE))],
-            *[(30.0, model(ONE)), (31.0, started(ZERO))],
-        ],
-        *(4.0, Kind.WORKER, (ZERO,), 3.0, 3.0),
-    ),
-    "a driver takes all running tasks with it": (
-        [
-            *[(0.0, BEGAN), (1.0, started(ZERO)), (2.0, started(ONE)), (3.0, saved(ONE)), (15.0, AGAIN)],
-            *[(16.0, started(ZERO)), (18.0, started(ONE)), (30.0, RunEnded(Outcome.DONE))],
-        ],
-        *(5.0, Kind.DRIVER, (ZERO, ONE), 4.0, 13.0),
-    ),
-    "a driver that dies between tasks loses its own work": (
-        [(0.0, BEGAN), (2.0, ScoresSaved(TaskId.shard(0), "0.npz", 4)), (9.0, AGAIN), (10.0, started(EVAL))],
-        *(3.0, Kind.DRIVER, (), 1.0, 7.0),
-    ),
-    "a driver that dies before its first record": (
-        [(9.0, BEGAN), (12.0, started(COARSE))],
-        *(3.0, Kind.DRIVER, (), 0.0, 9.0),
-    ),
-    "a bad node costs each attempt that fails there": (
-        [
-            *[(0.0, BEGAN), (1.0, started(COARSE)), (4.0, saved(COARSE)), (6.0, unread(COARSE))],
-            *[(8.0, started(COARSE)), (20.0, model(COARSE)), (22.0, started(ZERO)), (23.0, unread(ZERO))],
-            *[(24.0, started(ONE)), (50.0, model(ONE))],
-        ],
-        *(2.0, Kind.BADNODE, (COARSE, ZERO), 2.0 + 1.0, 2.0 + 1.0),
-    ),
-    "a task that had ended loses nothing": (
-        [(0.0, BEGAN), (1.0, started(COARSE)), (9.0, model(COARSE))],
-        *(3.0, Kind.WORKER, (), 0.0, 0.0),
-    ),
-    "a task that had not begun loses no work": (
-        [(3.0, BEGAN), (4.0, lost(COARSE)), (6.0, started(COARSE)), (9.0, model(COARSE))],
-        *(2.0, Kind.RAYLET, (COARSE,), 0.0, 4.0),
-    ),
-}
+BROKEN_NODE = (
+    "0 began, 1 started coarse, 4 saved coarse, 6 unread coarse, 8 started coarse, 20 model coarse,"
+    " 22 started 0, 23 unread 0, 24 started 1, 50 model 1"
+)
 
 
 @pytest.mark.parametrize(
-    ("records", "time", "kind", "tasks", "redone", "recovery"), CASES.values(), ids=CASES
+    ("text", "at", "tasks", "redone", "recovery"),
+    [
+        (
+            "0 began, 1 started 0, 1.5 started 1, 4 saved 0, 9 lost 0, 11 started 0, 20 model 1, 21 model 0",
+            fault(6.0, Kind.WORKER),
+            (ZERO,),
+            2.0,  # since its checkpoint
+            5.0,
+        ),
+        (  # another task takes the place of the dead one
+            "0 began, 1 started 0, 5 lost 0, 7 started 1, 30 model 1, 31 started 0",
+            fault(4.0, Kind.WORKER),
+            (ZERO,),
+            3.0,
+            3.0,
+        ),
+        (  # with its driver all running tasks end
+            "0 began, 1 started 0, 2 started 1, 3 saved 1, 15 again, 16 started 0, 18 started 1",
+            fault(5.0, Kind.DRIVER),
+            (ZERO, ONE),
+            4.0,
+            13.0,
+        ),
+        # between two tasks it loses its own work, before its first record none
+        ("0 began, 2 scores shard, 9 again, 10 started eval", fault(3.0, Kind.DRIVER), (), 1.0, 7.0),
+        ("9 began, 12 started coarse", fault(3.0, Kind.DRIVER), (), 0.0, 9.0),
+        # a bad node costs each attempt that fails there
+        (BROKEN_NODE, fault(2.0, Kind.BADNODE), (COARSE, ZERO), 2.0 + 1.0, 2.0 + 1.0),
+        # what had ended or had not begun loses no work
+        ("0 began, 1 started coarse, 9 model coarse", fault(3.0, Kind.WORKER), (), 0.0, 0.0),
+        ("3 began, 4 lost coarse, 6 started coarse", fault(2.0, Kind.RAYLET), (COARSE,), 0.0, 4.0),
+    ],
 )
-def test_the_cost_of_a_fault(
-    records: list[Timed], time: float, kind: Kind, tasks: tuple[TaskId, ...], redone: float, recovery: float
+def test_a_fault_costs_work_that_is_done_again_and_the_time_until_all_is_as_before(
+    text: str, at: Fault, tasks: tuple[TaskId, ...], redone: float, recovery: float
 ) -> None:
-    (cost,) = fault_costs(history(*records), [fault(time, kind)])
+    (cost,) = fault_costs(written(text), [at])
     assert cost.tasks == tasks
     assert (cost.redone, cost.recovery, cost.seconds) == (redone, recovery, redone + recovery)
 
 
 def test_kills_before_the_recovery_count_together() -> None:
-    records = history(
-        *[(0.0, BEGAN), (1.0, started(ZERO)), (4.0, lost(ZERO)), (9.0, AGAIN), (12.0, started(ZERO))],
-        *[(20.0, saved(ZERO)), (24.0, lost(ZERO)), (25.0, started(ZERO))],
+    records = written(
+        "0 began, 1 started 0, 4 lost 0, 9 again, 12 started 0, 20 saved 0, 24 lost 0, 25 started 0"
     )
     kills = [fault(3.0, Kind.WORKER), fault(5.0, Kind.DRIVER), fault(23.0, Kind.WORKER)]
     first, second = fault_costs(records, kills)
@@ -116,10 +100,7 @@ def test_a_worker_that_hangs_has_recovered_when_its_next_attempt_begins(
     begun: float, others: tuple[Fault, ...]
 ) -> None:
     """Neither with the next fault, which counts together with it, nor with its hello."""
-    records = history(
-        *[(0.0, BEGAN), (begun, started(COARSE)), (13.0, lost(COARSE))],
-        *[(16.0, started(COARSE)), (30.0, model(COARSE))],
-    )
+    records = written(f"0 began, {begun} started coarse, 13 lost coarse, 16 started coarse, 30 model coarse")
     (cost,) = fault_costs(records, [fault(3.0, Kind.HANG), *others])
     assert [one.kind for one in cost.faults] == [Kind.HANG, *(one.kind for one in others)]
     assert (cost.tasks, cost.recovery) == ((COARSE,), 13.0)
@@ -130,21 +111,18 @@ def test_a_worker_that_hangs_has_recovered_when_its_next_attempt_begins(
 def test_a_full_disk_and_a_clock_that_jumps_cost_the_silence_around_them(
     kind: Kind, until: float, more: float
 ) -> None:
-    records = history((0.0, BEGAN), (1.0, started(COARSE)), (3.0, saved(COARSE)), (9.5, saved(COARSE)))
+    records = written("0 began, 1 started coarse, 3 saved coarse, 9.5 saved coarse")
     (cost,) = fault_costs(records, [fault(4.0, kind, until)])
     assert (cost.tasks, cost.seconds, cost.allowed) == ((), 5.5, LIMITS[kind].costs + more)
 
 
 def test_jumps_of_the_clock_are_taken_back() -> None:
-    records = history(
-        (1001.0, BEGAN), (1002.0 - DAY_S, started(COARSE)), (1003.0 + DAY_S, saved(COARSE)), (1004.0, AGAIN)
-    )
+    records = written(f"1001 began, {1002 - DAY_S} started coarse, {1003 + DAY_S} saved coarse, 1004 again")
     assert [stored.time for stored in true_times(records, 1000.0)] == [1001.0, 1002.0, 1003.0, 1004.0]
 
 
 def test_the_longest_time_without_a_checkpoint() -> None:
-    records = history(
-        *[(0.0, BEGAN), (1.0, started(COARSE)), (4.0, saved(COARSE)), (5.0, started(EVAL))],
-        *[(9.0, saved(COARSE)), (11.0, model(COARSE))],
+    records = written(
+        "0 began, 1 started coarse, 4 saved coarse, 5 started eval, 9 saved coarse, 11 model coarse"
     )
     assert longest_unsaved(records) == pytest.approx(5.0)

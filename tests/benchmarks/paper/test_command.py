@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -37,7 +38,12 @@ def stored(bench: Bench) -> Callable[..., None]:
 
     def make(name: str, **more: object) -> None:
         config = KNOWN[name].config(SETTINGS, 0, SETTINGS.iterations)
-        given = {"settings": config, "sources": bench.code.sources, "code": bench.code.name, **more}
+        given: dict[str, Any] = {
+            "settings": config,
+            "sources": bench.code.sources,
+            "code": bench.code.name,
+            **more,
+        }
         bench.folder.mkdir(parents=True, exist_ok=True)
         save(bench.folder / f"{name}@0.json", result(name, 24.0, **given))
 
