@@ -162,7 +162,8 @@ import signal, sys
 from pathlib import Path
 from panolog.orchestrator.commands import supervise
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it,
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and those of nohup this one
 supervise._PROGRAM = (sys.executable, "-c", sys.argv[2])
 supervise._FIRST_S = 600.0
 say = lambda line: print(line, flush=True)
@@ -190,7 +191,7 @@ def launch(root: Path, driver: str) -> tuple[subprocess.Popen[str], str]:
 def test_requests_to_stop_reach_the_driver(tmp_path: Path, number: signal.Signals) -> None:
     process, _ = launch(tmp_path, WAITS)
     process.send_signal(number)
-    assert process.communicate(timeout=60)[0].split() == [number.name]
+    assert process.communicate(timeout=300)[0].split() == [number.name]
     assert process.returncode == 130
 
 
@@ -198,14 +199,14 @@ def test_a_stop_between_two_drivers(tmp_path: Path) -> None:
     process, said = launch(tmp_path, "import os; os.kill(os.getpid(), 9)")
     assert said.endswith("resume 1 of at most 3 without progress in 300 s")
     process.terminate()
-    assert process.communicate(timeout=60)[0].split()[0] == "stopped;"
+    assert process.communicate(timeout=300)[0].split()[0] == "stopped;"
     assert process.returncode == 130
 
 
 def test_a_supervisor_that_is_killed_stops_its_driver(tmp_path: Path) -> None:
     process, _ = launch(tmp_path, WAITS)
     process.kill()
-    assert process.communicate(timeout=60)[0].split() == ["SIGTERM"]  # the end of the driver's output
+    assert process.communicate(timeout=300)[0].split() == ["SIGTERM"]  # the end of the driver's output
 
 
 def test_a_limit_needs_a_supervisor(tmp_path: Path) -> None:

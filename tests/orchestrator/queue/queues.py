@@ -17,12 +17,13 @@ from tests.ray_head import wait_until
 ANY = Needs()  # an even part
 STAND_IN = Path(__file__).with_name("stand_in.py")
 RUNNER = """
-import sys
+import signal, sys
 from pathlib import Path
 from panolog.orchestrator.queue.processes import Processes
 from panolog.orchestrator.queue.runner import Limits, run_queue, sole_runner
 from panolog.orchestrator.queue.store import opened
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 folder, boot, at_once, forever, *program = sys.argv[1:]
 limits = Limits(int(at_once), bool(int(forever)), tuple(program), Processes(Path(boot)))
 with opened(Path(folder)) as queue, sole_runner(Path(folder)):
