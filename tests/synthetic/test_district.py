@@ -5,12 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from panolog.synthetic.__main__ import main
 from panolog.synthetic.district import PITCH, district, flight_path
 from panolog.synthetic.layout import ROAD
-from panolog.synthetic.make import make_flight
 from panolog.synthetic.paint import Plain
 from panolog.synthetic.shapes import Convex, Shape, box, ellipsoid, moved
 from panolog.synthetic.trace import PanoramaRays, cast
@@ -56,27 +54,32 @@ def test_a_flight_covers_the_district_between_its_heights() -> None:
     assert (rotations[:, 1, 2] < -0.99).all()  # upright
 
 
-def test_a_flight_is_a_scene(tmp_path: Path) -> None:
-    folder = make_flight(tmp_path / "flight", blocks=(1, 1), panoramas=3, width=64, points=200)
-    scene = read_scene(folder)
-    assert [panorama.name for panorama in scene.panoramas] == [f"flight_{i:03d}.png" for i in range(3)]
-    assert len(scene.points) == 200
-
-
-@pytest.mark.parametrize("blocks", [(0, 1), (1, -2)])
-def test_a_district_without_blocks_is_refused(tmp_path: Path, blocks: tuple[int, int]) -> None:
-    with pytest.raises(InputError, match="blocks is not possible"):
-        make_flight(tmp_path / "flight", blocks=blocks)
-    assert not (tmp_path / "flight").exists()
-
-
 def test_the_command_writes_scenes_of_any_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    size = ["--panoramas", "2", "--width", "32", "--points", "20"]
+    size = ["--panoramas", "3", "--width", "32", "--points", "20"]
     assert main(["flight", str(tmp_path / "a"), "--blocks", "1x1", *size]) == 0
     assert main(["town", str(tmp_path / "b"), *size]) == 0
     assert capsys.readouterr().out.split() == [str(tmp_path / "a"), str(tmp_path / "b")]
-    assert main(["flight", str(tmp_path / "c"), "--blocks", "0x1"]) == 2
-    assert "not possible" in capsys.readouterr().err
+    scene = read_scene(tmp_path / "a")
+    assert [panorama.name for panorama in scene.panoramas] == [f"flight_{i:03d}.png" for i in range(3)]
+    assert len(scene.points) == 20
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["flight", "--blocks", "0x1"], "blocks is not possible"),
+        (["city", "--panoramas", "1"], "a scene of 1 panoramas cannot be reconstructed: give 2"),
+        (["town", "--panoramas", "1"], "a scene of 1 panoramas"),
+        (["town", "--width", "66"], "a width of 66 is not possible"),
+        (["town", "--width", "0"], "a width of 0"),
+    ],
+)
+def test_nonsense_is_one_line(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*arguments, str(tmp_path / "c")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
     with pytest.raises(SystemExit, match="2"):
         main(["flight", str(tmp_path / "c"), "--blocks", "six"])
     assert not (tmp_path / "c").exists()

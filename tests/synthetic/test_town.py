@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from panolog.scene.colmap import read_panoramas
-from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.synthetic import make_town
@@ -60,13 +59,10 @@ def test_every_point_is_seen_twice(folder: Path) -> None:
     assert views.min() >= 2
 
 
-def test_equal_arguments_write_equal_bytes(folder: Path, tmp_path: Path) -> None:
+def test_bytes_depend_on_arguments_alone(folder: Path, tmp_path: Path) -> None:
     again = make_town(tmp_path / "again", panoramas=PANORAMAS, width=WIDTH, points=600)
     assert digest(again) == digest(folder)
-
-
-def test_the_seed_changes_the_town(folder: Path, tmp_path: Path) -> None:
-    other = digest(make_town(tmp_path, panoramas=2, width=WIDTH, points=100, seed=1))
+    other = digest(make_town(tmp_path / "other", panoramas=2, width=WIDTH, points=100, seed=1))
     assert other["images/street_000.png"] != digest(folder)["images/street_000.png"]
 
 
@@ -149,13 +145,6 @@ def test_what_is_met_lies_on_the_surface() -> None:
         assert np.linalg.norm(normals, axis=0) == pytest.approx(1, abs=1e-4)
         facing = (normals * rays.directions[:, rows]).sum(axis=0)
         assert (facing < 1e-3).all()  # surfaces are seen from outside
-
-
-@pytest.mark.parametrize("change", [{"panoramas": 1}, {"width": 66}, {"width": 0}])
-def test_nonsense_is_refused(tmp_path: Path, change: dict[str, int]) -> None:
-    with pytest.raises(InputError):
-        make_town(tmp_path / "town", panoramas=change.get("panoramas", 3), width=change.get("width", 64))
-    assert not (tmp_path / "town").exists()
 
 
 def test_progress_is_reported_in_order(tmp_path: Path) -> None:
