@@ -42,16 +42,9 @@ def test_its_error_is_the_one_that_noise_makes() -> None:
 def test_parts_that_no_point_holds_together_have_no_common_scale() -> None:
     centers, points, seen = _walk(12)
     seen = [rows[rows < 1200] if camera != 5 else rows for camera, rows in enumerate(seen)]
-    weakest = find_links(centers, points, seen, SIGMA)[
-        0
-    ]  # one camera of the first part sees what the second does
+    weakest = find_links(centers, points, seen, SIGMA)[0]  # camera 5 sees what the second part does
     assert weakest.points == 0
     assert weakest.scale_error == float("inf")
-
-
-def test_more_points_hold_better() -> None:
-    few, many = (find_links(*_walk(count), SIGMA)[0].scale_error for count in (12, 192))
-    assert few / many == pytest.approx(4.0, rel=0.3)  # the root of sixteen times as many
 
 
 def _scale_ratio(centers: Array, points: Array, random: np.random.Generator) -> float:

@@ -27,10 +27,12 @@ def _pictures(folder: Path, *shapes: tuple[int, int]) -> None:
         ("damaged", "truncated"),
         ("another format", r"1\.png: COLMAP cannot read this image; save it as"),
         ("taken", "already exists"),
+        ("inside", "give a folder elsewhere"),
     ],
 )
 def test_refusals(what: str, message: str, tmp_path: Path) -> None:
-    folder, output = tmp_path / "images", tmp_path / "scene"
+    folder = tmp_path / "images"
+    output = (folder if what == "inside" else tmp_path) / "scene"
     shapes = {"one": [(64, 128)], "flat": [(64, 128), (64, 100)], "sizes": [(64, 128), (32, 64)]}
     if what != "nothing":
         _pictures(folder, *shapes.get(what, []))
@@ -52,12 +54,6 @@ def test_pictures_of_nothing_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no features"):
         make_scene(tmp_path / "images", tmp_path / "scene", SfmSettings(), no_progress)
     assert not (tmp_path / "scene").exists()
-
-
-def test_a_scene_inside_of_its_source(tmp_path: Path) -> None:
-    _pictures(tmp_path / "images")
-    with pytest.raises(InputError, match="give a folder elsewhere"):
-        make_scene(tmp_path / "images", tmp_path / "images" / "scene", SfmSettings(), no_progress)
 
 
 @pytest.mark.parametrize(

@@ -42,11 +42,8 @@ class Made:
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """Walls of random patches, and the operator; each job goes on where the last one was stopped."""
-    source, jobs, shots = (
-        tmp_path_factory.mktemp("street"),
-        tmp_path_factory.mktemp("jobs"),
-        walk([0.9] * COUNT),
-    )
+    source, jobs = tmp_path_factory.mktemp("street"), tmp_path_factory.mktemp("jobs")
+    shots = walk([0.9] * COUNT)
     (source / "images").mkdir()
     (source / "masks").mkdir()
     mask = np.full((WIDTH // 2, WIDTH), 255, np.uint8)

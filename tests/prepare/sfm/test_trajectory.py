@@ -45,30 +45,26 @@ def test_csv_with_names(names: list[str], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text, message",
+    "content, message",
     [
-        ("", "is empty"),
-        ("# only\n", "is empty"),
-        ("1 2 3\n", "line 1: is not 8 numbers"),
-        (TUM + "13 0 0 nan 0 0 0 1\n", "line 5: is not 8 numbers"),
-        ("name,x,y\na,1,2\n", "has no x, y and z"),
-        ("x,y,z\n1,2,3\n", "neither name nor t"),
-        ("t,x,y,z\n1,2,3\n", "line 2: has 3 cells"),
-        ("t,x,y,z\n1,2,three,4\n", "line 2: is not 4 numbers"),
-        ("t,x,y,z\n", "a header only"),
+        (None, "there is no such file"),
+        (b"\xff\xfe\x00\x01" * 9, "is not text"),
+        (b"", "is empty"),
+        (b"# only\n", "is empty"),
+        (b"1 2 3\n", "line 1: is not 8 numbers"),
+        (TUM.encode() + b"13 0 0 nan 0 0 0 1\n", "line 5: is not 8 numbers"),
+        (b"name,x,y\na,1,2\n", "has no x, y and z"),
+        (b"x,y,z\n1,2,3\n", "neither name nor t"),
+        (b"t,x,y,z\n1,2,3\n", "line 2: has 3 cells"),
+        (b"t,x,y,z\n1,2,three,4\n", "line 2: is not 4 numbers"),
+        (b"t,x,y,z\n", "a header only"),
     ],
 )
-def test_wrong_files_are_one_line(text: str, message: str, tmp_path: Path) -> None:
+def test_wrong_files_are_one_line(content: bytes | None, message: str, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / "walk.txt").write_bytes(content)
     with pytest.raises(InputError, match=message):
-        read_trajectory(_file(tmp_path, text))
-
-
-def test_no_file_and_no_text(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is no such file"):
-        read_trajectory(tmp_path / "none")
-    (tmp_path / "walk").write_bytes(b"\xff\xfe\x00\x01" * 9)
-    with pytest.raises(InputError, match="is not text"):
-        read_trajectory(tmp_path / "walk")
+        read_trajectory(tmp_path / "walk.txt")
 
 
 def test_a_trajectory_of_other_panoramas(tmp_path: Path) -> None:

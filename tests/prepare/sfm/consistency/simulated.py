@@ -16,11 +16,7 @@ from panolog.scene.projection import project_to_fractions
 Array = NDArray[np.float64]
 SIZE = (1024, 512)
 _SIDE, _ROUND = 12.0, 8.0  # metres from the middle to the fronts, and to the way
-_SEEN, _NEAR, _ALIKE = (
-    22.0,
-    4.5,
-    1.6,
-)  # metres to points, between neighbours, from where a place looks the same
+_SEEN, _NEAR, _ALIKE = 22.0, 4.5, 1.6  # metres to points, between neighbours, to where a place looks the same
 _NOISE = 0.3  # pixels
 
 
@@ -47,7 +43,7 @@ def square(
         pixels = project_to_fractions((points[seen] - center) @ rotation.T) * SIZE
         keypoints.append(pixels + random.normal(0, _NOISE, pixels.shape))
         rows.append(seen)
-    work = _database(folder, keypoints)
+    work = database_of(folder, keypoints)
     ids = work.ids()
     with pycolmap.Database.open(work.database) as database:
         for a in range(count):
@@ -101,7 +97,8 @@ def _matches(one: NDArray[np.int64], other: NDArray[np.int64], copy: NDArray[np.
     return np.column_stack([np.flatnonzero(there >= 0), there[there >= 0]])
 
 
-def _database(folder: Path, keypoints: list[Array]) -> Workspace:
+def database_of(folder: Path, keypoints: list[Array]) -> Workspace:
+    """The workspace of empty panoramas with keypoints (K, 2) in pixels, and nothing else."""
     folder.mkdir(parents=True, exist_ok=True)
     empty = cv2.imencode(".png", np.zeros(SIZE[::-1], np.uint8))[1].tobytes()
     panoramas = []

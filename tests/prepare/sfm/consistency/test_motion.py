@@ -8,15 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from panolog.prepare.sfm.consistency.agreement import Posed, has_moved
-from panolog.prepare.sfm.consistency.contradictions import (
-    Contradiction,
-    consistent_part,
-    is_repetitive,
-    is_trusted,
-)
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
 from panolog.prepare.sfm.consistency.motion import Motion, leads, look_again
-from panolog.prepare.sfm.consistency.skeleton import Skeleton, find_skeleton
 
 Array = NDArray[np.float64]
 
@@ -82,40 +75,6 @@ def test_of_two_rivals_the_motion_that_continues_is_taken(back: bool) -> None:
     assert len(chosen[2, 3].matches) == (160 if back else 220)
     assert chosen[2, 3].rivalled
     assert not chosen[1, 2].rivalled
-
-
-def test_what_has_many_rivals_is_not_trusted_and_is_cut_at_them() -> None:
-    edges = [(row, row + 1) for row in range(9)]
-    evidence = Evidence(
-        tuple(np.empty((0, 3)) for _ in range(10)),
-        tuple(Pair(edge, np.empty((0, 2), np.int64), 0.9, rivalled=edge[0] < 3) for edge in edges),
-    )
-    skeleton = find_skeleton(evidence)
-    assert skeleton.rivalled == set(edges[:3])
-    assert is_repetitive(skeleton, range(10))
-    assert not is_trusted([], skeleton, range(10))
-    assert is_trusted([], skeleton, range(2, 10))
-    assert consistent_part(range(10), [], skeleton, evidence) == list(range(3, 10))
-
-
-def test_a_guess_is_believed_only_without_a_contradiction() -> None:
-    tree = frozenset({(0, 1), (1, 2), (2, 3)})
-    doubt = [Contradiction((0, 3), 80, 3)]
-    assert is_trusted(doubt, Skeleton(True, tree, tree), range(4))
-    assert not is_trusted(doubt, Skeleton(True, tree, tree, frozenset({(1, 2)})), range(4))
-    assert is_trusted([], Skeleton(True, tree, tree, frozenset({(1, 2)})), range(4))
-
-
-def test_neighbours_that_share_less_come_before_others_but_are_guesses() -> None:
-    walk = {(row, row + 1): 0.8 for row in range(11)} | {(5, 6): 0.5}
-    pairs = walk | {(2, 9): 0.9}
-    evidence = Evidence(
-        tuple(np.empty((0, 3)) for _ in range(12)),
-        tuple(Pair(edge, np.empty((0, 2), np.int64), share) for edge, share in sorted(pairs.items())),
-    )
-    found = find_skeleton(evidence)
-    assert found.tree == set(walk)
-    assert found.guessed == {(5, 6)}
 
 
 def test_poses_that_do_not_move_as_a_pair_does() -> None:

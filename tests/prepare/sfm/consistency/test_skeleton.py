@@ -1,16 +1,30 @@
 """Which pairs carry a reconstruction, and which of its pairs contradict it."""
 
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import replace
 
-from panolog.prepare.sfm.consistency.contradictions import Contradiction, consistent_part, is_trusted
+import numpy as np
+import pytest
+
+from panolog.prepare.sfm.consistency.contradictions import (
+    Contradiction,
+    consistent_part,
+    is_repetitive,
+    is_trusted,
+)
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, covered
 from panolog.prepare.sfm.consistency.skeleton import Skeleton, find_skeleton, hops, tree_path
 
 NOTHING = np.empty((0, 2), np.int64)
 
 
-def _evidence(coverages: dict[tuple[int, int], float], count: int) -> Evidence:
-    pairs = tuple(Pair(between, NOTHING, coverage) for between, coverage in sorted(coverages.items()))
+Edge = tuple[int, int]
+
+
+def _evidence(coverages: dict[Edge, float], count: int, rivalled: Sequence[Edge] = ()) -> Evidence:
+    pairs = tuple(
+        Pair(it, NOTHING, share, rivalled=it in rivalled) for it, share in sorted(coverages.items())
+    )
     return Evidence(tuple(np.empty((0, 3)) for _ in range(count)), pairs)
 
 
@@ -28,12 +42,25 @@ def test_without_order_those_that_share_most_of_the_sphere() -> None:
     assert found.tree == {(0, 3), (1, 3), (1, 4), (2, 4)}
 
 
-def test_an_interrupted_walk_is_joined_where_most_is_shared() -> None:
-    walk = {(row, row + 1): 0.8 for row in range(11)} | {(5, 6): 0.3}
-    found = find_skeleton(_evidence(walk | {(2, 9): 0.7}, 12))
+@pytest.mark.parametrize(("share", "other", "joined"), [(0.3, 0.7, True), (0.5, 0.9, False)])
+def test_an_interrupted_walk_is_joined_where_most_is_shared(share: float, other: float, joined: bool) -> None:
+    """Neighbours that share less come before others, but are guesses."""
+    walk = {(row, row + 1): 0.8 for row in range(11)} | {(5, 6): share}
+    found = find_skeleton(_evidence(walk | {(2, 9): other}, 12))
     assert found.ordered
-    assert (2, 9) in found.tree
-    assert (5, 6) not in found.tree
+    assert ((2, 9) in found.tree, (5, 6) in found.tree) == (joined, not joined)
+    assert joined or found.guessed == {(5, 6)}
+
+
+def test_what_has_many_rivals_is_not_trusted_and_is_cut_at_them() -> None:
+    edges = [(row, row + 1) for row in range(9)]
+    evidence = _evidence(dict.fromkeys(edges, 0.9), 10, edges[:3])
+    skeleton = find_skeleton(evidence)
+    assert skeleton.rivalled == set(edges[:3])
+    assert is_repetitive(skeleton, range(10))
+    assert not is_trusted([], skeleton, range(10))
+    assert is_trusted([], skeleton, range(2, 10))
+    assert consistent_part(range(10), [], skeleton, evidence) == list(range(3, 10))
 
 
 def test_known_places_take_the_part_of_the_order() -> None:
@@ -67,14 +94,14 @@ def test_trust() -> None:
     assert not is_trusted([*other, Contradiction((0, 3), 80, 3)], skeleton, range(30))
     assert is_trusted([*other, Contradiction((0, 3), 80, 3)], skeleton, range(300))
     assert not is_trusted([Contradiction((1, 2), 80, 3)], skeleton, range(300))
+    guess = replace(skeleton, guessed=frozenset({(1, 2)}))  # believed only without a contradiction
+    assert is_trusted([], guess, range(3)) and not is_trusted(other, guess, range(3))
 
 
 def test_the_part_that_agrees_is_cut_where_the_tree_is_weakest() -> None:
     walk = {(row, row + 1): 0.9 for row in range(9)} | {(6, 7): 0.4}
     evidence = _evidence(walk, 10)
     skeleton = Skeleton(True, frozenset(walk), frozenset(walk))
-    assert consistent_part(range(10), [Contradiction((2, 9), 80, 3)], skeleton, evidence) == list(range(7))
-    assert consistent_part(range(10), [Contradiction((3, 4), 80, 3)], skeleton, evidence) == list(
-        range(4, 10)
-    )
-    assert consistent_part(range(10), [], skeleton, evidence) == list(range(10))
+    for edge, part in (((2, 9), range(7)), ((3, 4), range(4, 10)), (None, range(10))):
+        doubt = [] if edge is None else [Contradiction(edge, 80, 3)]
+        assert consistent_part(range(10), doubt, skeleton, evidence) == list(part)
