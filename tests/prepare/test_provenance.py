@@ -31,9 +31,7 @@ def test_a_stamped_layer_is_a_png_of_its_pixels(tmp_path: Path, layer: NDArray[A
     path = tmp_path / "a.png"
     path.write_bytes(png_with_provenance(layer, KEY))
     assert read_provenance(path) == Provenance(KEY, "intact") and not is_user_file(path)
-    found = read_layer(path)
-    assert found.dtype == layer.dtype
-    np.testing.assert_array_equal(found, layer)
+    np.testing.assert_array_equal(read_layer(path), layer, strict=True)
 
 
 def test_without_a_stamp_it_is_the_users(tmp_path: Path) -> None:
@@ -43,11 +41,7 @@ def test_without_a_stamp_it_is_the_users(tmp_path: Path) -> None:
     assert read_provenance(path) is None and is_user_file(path)
     path.write_bytes(b"PanoLOG")
     assert read_provenance(path) is None and is_user_file(path)
-
-
-def test_a_damaged_layer_of_ours_is_not_the_users(tmp_path: Path) -> None:
-    path = tmp_path / "a.png"
-    path.write_bytes(png_with_provenance(LAYER, KEY)[:-50])
+    path.write_bytes(png_with_provenance(LAYER, KEY)[:-50])  # a damaged layer of ours is not
     assert read_provenance(path) == Provenance(KEY, "damaged") and not is_user_file(path)
 
 

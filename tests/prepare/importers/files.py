@@ -12,11 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from tests.prepare.importers.known import Array, Known
 
+_VERTEX = [("x", "f8"), ("y", "f8"), ("z", "f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+
 
 def write_ply(path: Path, points: Array, colors: NDArray[np.uint8], *, ascii_ply: bool = False) -> None:
     """A cloud with doubles, as no format has to be that exact."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    table = np.rec.fromarrays([*points.T, *colors.T], names="x,y,z,red,green,blue")
+    table = np.rec.fromarrays([*points.T, *colors.T], dtype=_VERTEX)
     PlyData([PlyElement.describe(np.asarray(table), "vertex")], text=ascii_ply).write(str(path))
 
 

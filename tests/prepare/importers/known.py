@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tests.scenes import HEIGHT, WIDTH, write_image
+from tests.scenes import HEIGHT, WIDTH, observe, write_image
 
 Array = NDArray[np.float64]
 
@@ -50,19 +50,9 @@ def make_known(folder: Path, *, images: str = "images", seed: int = 7) -> Known:
     centers = np.column_stack([np.arange(6.0), random.normal(0, 0.2, 6), random.normal(0, 1, 6)])
     points = random.normal((2.5, 0, 0), 4, (40, 3))
     colors = random.integers(0, 256, (40, 3), np.uint8)
-    observed = tuple(np.flatnonzero(random.random(40) < 0.6) for _ in names)
-    pixels = tuple(
-        project((points[rows] - center) @ rotation.T)
-        for rotation, center, rows in zip(rotations, centers, observed, strict=True)
+    observed, pixels = zip(
+        *(observe(points, *pose, random) for pose in zip(rotations, centers, strict=True)), strict=True
     )
     for name in names:
         write_image(folder / images / name, random)
     return Known(names, rotations, centers, points, colors, observed, pixels)
-
-
-def project(cameras: Array) -> Array:
-    """Pixels (N, 2) of camera-space points (N, 3), written out: longitude 0 is the middle column."""
-    x, y, z = cameras.T
-    longitude = np.arctan2(x, z)
-    latitude = np.arcsin(y / np.linalg.norm(cameras, axis=1))
-    return np.stack([WIDTH * (longitude / (2 * np.pi) + 0.5), HEIGHT * (latitude / np.pi + 0.5)], axis=1)

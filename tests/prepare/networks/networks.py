@@ -19,7 +19,7 @@ def save(
     outputs: Sequence[str],
     manifest: Mapping[str, Any],
     *,
-    shape: Sequence[int | str | None],
+    shape: Sequence[int | str],
     constants: Mapping[str, NDArray[Any]] | None = None,
     dtype: int = FLOAT,
 ) -> Path:

@@ -311,8 +311,8 @@ def test_a_picture_is_its_file() -> None:
 
 
 def test_half_precision(scene: Path) -> None:
-    shape, half = ["N", 3, HEIGHT, WIDTH], onnx.TensorProto.FLOAT16
-    nodes, head = [channel(0, "depth")], manifest(depth=INVERSE)
+    nodes, head, half = [channel(0, "depth")], manifest(depth=INVERSE), onnx.TensorProto.FLOAT16
+    shape: list[int | str] = ["N", 3, HEIGHT, WIDTH]
     made(scene, save(scene.parent, nodes, ["depth"], head, shape=shape, constants=CHANNELS, dtype=half))
     red = rgb(scene)[0]
     found = pixels(scene / "depths" / NAMES[0]) / FULL * red.max()

@@ -133,7 +133,7 @@ def test_a_mask_of_another_size_loses_nothing(scene: Path) -> None:
 def movers(scene: Path, nodes: list[onnx.NodeProto], layout: str = "NCHW", **head: Any) -> MaskJob:
     """A job by a network whose output is `found`, with the manifest's head, "classes" or "ignore"."""
     manifest = {"task": "mask", "input": given(HEIGHT, layout=layout), **head}
-    shape = ["N", 3, HEIGHT, WIDTH] if layout == "NCHW" else ["N", HEIGHT, WIDTH, 3]
+    shape: list[int | str] = ["N", 3, HEIGHT, WIDTH] if layout == "NCHW" else ["N", HEIGHT, WIDTH, 3]
     model = save(scene.parent, nodes, ["found"], manifest, shape=shape, constants=CHANNELS)
     return MaskJob(movers=MoverNetwork(model))
 
