@@ -1,38 +1,27 @@
+from dataclasses import is_dataclass
+from itertools import zip_longest
+from typing import Any, get_args, get_origin, get_type_hints
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from panolog.orchestrator.run.money.records import BudgetSet
 from panolog.orchestrator.run.records import (
     BlockPlan,
     CheckpointSaved,
-    EvaluationSaved,
-    Leaving,
-    MeasuresSaved,
     Merged,
-    NodeLeaving,
-    NodeLeft,
     NodeQuarantined,
-    NodeReleased,
-    NodeStaying,
     Noticed,
     Outcome,
     Part,
-    PauseRequested,
     PlanSaved,
     PreflightSaved,
-    Preparing,
-    PreviewSaved,
     Progressed,
     Record,
-    RetryRequested,
     RunEnded,
-    ScoresSaved,
-    SeamEvaluated,
     Stored,
     TaskFailed,
-    TaskYielded,
-    UnpauseRequested,
-    ViewEvaluated,
 )
 from panolog.orchestrator.run.state import Status, replay
 from panolog.orchestrator.run.store import from_json, to_json
@@ -41,38 +30,41 @@ from panolog.scene.errors import InputError
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.orchestrator.history import AGAIN, BEGAN, after, model, started
 
-EVERY_RECORD: list[Record] = [
-    BEGAN,
-    Preparing("calibrating"),
-    PreflightSaved("preflight.json", {"coarse": 5.0, "block": None}),
-    started(COARSE),
-    Progressed(COARSE, 5, 10, 2.0, loss=0.5, gaussians=3, rates={"means": 1e-4}),
-    PreviewSaved(COARSE, 5, "a.jpg", "coarse/previews/000005.jpg"),
-    Noticed(COARSE, "a.jpg is left out"),
-    CheckpointSaved(COARSE, 5, "coarse/checkpoint.safetensors", 9),
-    model(COARSE),
-    ScoresSaved(TaskId.shard(0), "partition/scores/000.npz", 4),
-    PlanSaved("partition/plan.json", (BlockPlan(0, 3, 5, train=True), BlockPlan(1, 0, 2, train=False))),
-    TaskFailed(TaskId.block(0), 1, "gone", final=False, detail="trace"),
-    Merged("point_cloud.ply", 10, 2, 100, 0.1),
-    ViewEvaluated(EVAL, "a.jpg", {"psnr": 20.0, "lpips": None}),
-    SeamEvaluated(EVAL, "0|1", 1.5),
-    MeasuresSaved(TaskId.measure(0), "eval/shards/000.json", 3, 0),
-    EvaluationSaved("eval/metrics.json", {"psnr": 20.0, "lpips": None}),
-    PauseRequested(TaskId.block(0)),
-    UnpauseRequested(TaskId.block(0)),
-    RetryRequested(TaskId.block(0)),
-    TaskYielded(TaskId.block(0)),
-    NodeQuarantined("n1", "host", "3 tasks have failed", 99.0, ("block/000",)),
-    NodeLeaving("n1", "host", Leaving.PREEMPTION, 120.0),
-    NodeStaying("n1", "host"),
-    NodeLeft("n1", "host"),
-    NodeReleased("n1", "host", "its time is over"),
-    RunEnded(Outcome.DONE),
-]
+PLAIN = {int: st.integers(0, 2**40), float: st.floats(0, 1e9), str: st.text(max_size=9)}
+TASKS = [COARSE, EVAL, TaskId.block(0), TaskId.block(1), TaskId.shard(0), TaskId.measure(0)]
+NAMES = {  # of tasks in values that are text, and what is free in form
+    PlanSaved: {"passes": st.just((("round/000",), ("repair/000",)))},
+    NodeQuarantined: {"tasks": st.just(("block/000",))},
+    BudgetSet: {"prices": st.just({"currency": "USD"})},
+}
 
 
-@pytest.mark.parametrize("record", EVERY_RECORD, ids=lambda record: type(record).__name__)
+def values(kind: Any) -> st.SearchStrategy[Any]:
+    """Any values of a type that a record may have."""
+    parts = get_args(kind)
+    if kind is TaskId:
+        return st.sampled_from(TASKS)
+    if get_origin(kind) is tuple:
+        return st.lists(values(parts[0]), max_size=2).map(tuple)
+    if get_origin(kind) is dict:
+        return st.dictionaries(values(parts[0]), values(parts[1]), max_size=2)
+    if parts:
+        return st.one_of(*map(values, parts))
+    if is_dataclass(kind):
+        return made(kind)
+    return PLAIN[kind] if kind in PLAIN else st.from_type(kind)
+
+
+def made(kind: Any) -> st.SearchStrategy[Any]:
+    """Any object of a dataclass."""
+    of_fields = {name: values(of) for name, of in get_type_hints(kind).items()}
+    return st.builds(kind, **of_fields | NAMES.get(kind, {}))
+
+
+RECORDS = st.one_of(*map(made, get_args(Record)))
+
+
+@given(RECORDS)
 def test_records_survive_json(record: Record) -> None:
     assert from_json(type(record).__name__, to_json(record)) == record
 
@@ -120,20 +112,12 @@ def test_notices_are_kept_once_and_ten_thousand_are_not_compared_with_each_other
     assert compared < 100
 
 
-@given(
-    st.lists(
-        st.tuples(
-            st.integers(0, len(EVERY_RECORD) - 1), st.sampled_from([COARSE, TaskId.block(0), TaskId.block(1)])
-        )
-    )
-)
-def test_only_the_last_progress_of_each_task_matters(history: list[tuple[int, TaskId]]) -> None:
-    stored = []
-    for i, (kind, task) in enumerate(history, 1):
-        record = EVERY_RECORD[kind]
-        if isinstance(record, Progressed):
-            record = Progressed(task, i, 100, 1.0)
-        stored.append(Stored(i, float(i), record))
+@given(st.lists(RECORDS, max_size=20), st.lists(made(Progressed), max_size=9))
+def test_only_the_last_progress_of_each_task_matters(
+    history: list[Record], progress: list[Progressed]
+) -> None:
+    mixed = [item for pair in zip_longest(history, progress) for item in pair if item is not None]
+    stored = [Stored(i, float(i), record) for i, record in enumerate(mixed, 1)]
     last = {s.record.task: s.id for s in stored if isinstance(s.record, Progressed)}
     reduced = [s for s in stored if not isinstance(s.record, Progressed) or last[s.record.task] == s.id]
     assert replay(reduced) == replay(stored)
