@@ -11,28 +11,14 @@ from benchmarks.merge_scale import SKY, _check, fill, measure
 from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.runs import clock, stage_seconds
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import (
-    CheckpointSaved,
-    Merged,
-    Noticed,
-    Outcome,
-    Part,
-    Preparing,
-    Progressed,
-    RunEnded,
-    ScoresSaved,
-    Stored,
-)
+from panolog.orchestrator.run.records import Progressed, Stored
 from panolog.orchestrator.run.state import Status, replay
 from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.run.thinning import DENSE
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import join_ply, ply_header
-from panolog.workers.tasks import COARSE, TaskId
-from tests.benchmarks.histories import history
-from tests.orchestrator.history import AGAIN, BEGAN, model, started
-
-ZERO, ONE = TaskId.block(0), TaskId.block(1)
+from panolog.workers.tasks import TaskId
+from tests.benchmarks.histories import ONE, ZERO, written
 
 
 def test_rates_among_other_processes_have_medians_spread_and_ratios() -> None:
@@ -69,14 +55,15 @@ def test_a_wrong_merge_and_a_full_disk_are_noticed(tmp_path: Path) -> None:
 
 def test_a_fresh_process_shares_no_memory_and_its_error_comes_back() -> None:
     held = bytes(range(256)) * 2**18  # 64 MiB, all pages written
-    assert peak_memory() > len(held)
+    assert in_fresh_process(peak_memory) < peak_memory() - len(held)
     with pytest.raises(ValueError, match="invalid literal"):
         in_fresh_process(int, "nothing")
 
 
 def test_the_start_of_workers_may_count_or_not() -> None:
-    first = ((100.0, BEGAN), (112.0, started(COARSE)), (120.0, model(COARSE)))
-    records = history(*first, (200.0, AGAIN), (205.0, started(ZERO)), (209.0, model(ZERO)))
+    records = written(
+        "100 began, 112 started coarse, 120 model coarse, 200 again, 205 started 0, 209 model 0"
+    )
     assert stage_seconds(records) == {"coarse": 20, "block": 9}
     assert stage_seconds(records, start=False) == {"coarse": 8, "block": 4}
     assert clock(records, start=False) == {3: 8, 6: 12}
@@ -84,28 +71,14 @@ def test_the_start_of_workers_may_count_or_not() -> None:
 
 def test_the_stages_add_up_to_the_run() -> None:
     """What precedes the first task, and a preflight, do not count as training."""
-    records = history(
-        (80.0, BEGAN),
-        (81.0, Preparing("calibrating")),
-        (89.0, Noticed(Part.PREFLIGHT, "it fits")),
-        (100.0, Preparing("starting workers")),
-        (110.0, model(COARSE)),
-        (112.0, ScoresSaved(TaskId.shard(0), "000.npz", 4)),
-        (114.0, started(ZERO)),
-        (121.0, model(ZERO)),
-        (122.0, Merged("point_cloud.ply", 10, 1, 100, 1.0)),
-        (122.5, RunEnded(Outcome.DONE)),
+    records = written(
+        "80 began, 81 calibrating, 89 preflight, 100 starting, 103 started coarse, 110 model coarse,"
+        " 112 scores shard, 113 started 0, 114 started 1, 120 model 0, 121 model 1, 122 merged, 122.5 done"
     )
     assert stage_seconds(records) == {"coarse": 10, "score": 2, "block": 9, "merge": 1, "": 0.5}
 
 
 def test_time_without_a_driver_does_not_count() -> None:
-    records = history(
-        (0.0, model(COARSE)),  # borrowed from another run
-        (5.0, BEGAN),
-        (6.0, started(ZERO)),
-        (9.0, CheckpointSaved(ZERO, 10, "checkpoint", 1)),
-        (500.0, AGAIN),  # the first was killed
-        (502.0, model(ZERO)),
-    )
+    """Nor does what was borrowed from another run."""
+    records = written("0 model coarse, 5 began, 6 started 0, 9 saved 0, 500 again, 502 model 0")
     assert stage_seconds(records) == {"block": 6}

@@ -1,35 +1,11 @@
 """What a fault has cost, from histories made by hand."""
 
-from collections.abc import Callable
-
 import pytest
 
 from benchmarks.chaos.fault_costs import Fault, fault_costs, longest_unsaved, true_times
 from benchmarks.chaos.faults import DAY_S, LIMITS, Kind
-from panolog.orchestrator.run.records import CheckpointSaved, Failure, Record, ScoresSaved, Stored, TaskFailed
-from panolog.workers.tasks import COARSE, EVAL, TaskId
-from tests.benchmarks.histories import history
-from tests.orchestrator.history import AGAIN, BEGAN, model, started
-
-ZERO, ONE = TaskId.block(0), TaskId.block(1)
-TASKS = {"0": ZERO, "1": ONE, "coarse": COARSE, "eval": EVAL, "shard": TaskId.shard(0)}
-MADE: dict[str, Callable[[TaskId], Record]] = {
-    "started": started,
-    "saved": lambda task: CheckpointSaved(task, 10, "checkpoint", 1),
-    "model": model,
-    "scores": lambda task: ScoresSaved(task, "0.npz", 4),
-    "lost": lambda task: TaskFailed(task, 1, "died", final=False, kind=Failure.LOST),
-    "unread": lambda task: TaskFailed(task, 1, "Input/output error", final=False),
-}
-
-
-def written(text: str) -> list[Stored]:
-    """The history that says what happened after how many seconds: "0 began, 1 started coarse, 9 again"."""
-    found = list[tuple[float, Record]]()
-    for time, what, *task in map(str.split, text.split(",")):
-        record = MADE[what](TASKS[task[0]]) if task else {"began": BEGAN, "again": AGAIN}[what]
-        found.append((float(time), record))
-    return history(*found)
+from panolog.workers.tasks import COARSE, TaskId
+from tests.benchmarks.histories import ONE, ZERO, written
 
 
 def fault(time: float, kind: Kind, until: float = 0.0) -> Fault:
