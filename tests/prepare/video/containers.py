@@ -68,6 +68,7 @@ def write_clip(
     range_: str | None = "limited",
     transfer: int | None = None,
     container: str | None = None,
+    lenses: int = 1,
 ) -> Path:
     """Frames as a video.
 
@@ -79,42 +80,29 @@ def write_clip(
         colours, range_: the tags; None for none.
         transfer: the transfer characteristics, by their number in H.273.
         container: FFmpeg's name of it.
+        lenses: tracks with these frames.
     """
     height, width = frames[0][0].shape
-    options = {"write_crc32": "0"} if path.suffix in (".mkv", ".webm") else {}
-    with av.open(str(path), "w", format=container, options=options) as file:
-        stream = file.add_stream(encoding.codec, rate=30, options=encoding.options)
-        assert isinstance(stream, av.VideoStream)
-        stream.width, stream.height, stream.pix_fmt = width, height, encoding.pixels
-        context = stream.codec_context
-        context.time_base = Fraction(1, 90_000)
-        if colours is not None:
-            context.colorspace = _COLOURS[colours]
-        if range_ is not None:
-            context.color_range = _RANGES[range_]
-        if transfer is not None:
-            context.color_trc = transfer
-        for number, planes in enumerate(frames):
-            frame = _frame(planes, encoding.pixels)
-            frame.pts = number * 3_000 if times is None else times[number] * 90
-            frame.time_base = Fraction(1, 90_000)
-            file.mux(stream.encode(frame))
-        file.mux(stream.encode(None))
-    return path
-
-
-def write_lenses(path: Path, frames: Sequence[Planes]) -> Path:
-    """Frames as an MP4 with a track for each of two lenses."""
-    height, width = frames[0][0].shape
-    with av.open(str(path), "w", format="mp4") as file:
-        streams = [file.add_stream(H264.codec, rate=30, options=H264.options) for _ in range(2)]
+    with av.open(str(path), "w", format=container) as file:
+        streams = [file.add_stream(encoding.codec, rate=30, options=encoding.options) for _ in range(lenses)]
         for stream in streams:
             assert isinstance(stream, av.VideoStream)
-            stream.width, stream.height, stream.pix_fmt = width, height, H264.pixels
+            stream.width, stream.height, stream.pix_fmt = width, height, encoding.pixels
+            context = stream.codec_context
+            context.time_base = Fraction(1, 90_000)
+            if colours is not None:
+                context.colorspace = _COLOURS[colours]
+            if range_ is not None:
+                context.color_range = _RANGES[range_]
+            if transfer is not None:
+                context.color_trc = transfer
         for stream in streams:
             assert isinstance(stream, av.VideoStream)
-            for planes in frames:
-                file.mux(stream.encode(_frame(planes, H264.pixels)))
+            for number, planes in enumerate(frames):
+                frame = _frame(planes, encoding.pixels)
+                frame.pts = number * 3_000 if times is None else times[number] * 90
+                frame.time_base = Fraction(1, 90_000)
+                file.mux(stream.encode(frame))
             file.mux(stream.encode(None))
     return path
 
@@ -194,46 +182,16 @@ def add_spherical_xml(path: Path, **values: object) -> Path:
     return insert(path, "moov/trak", box(b"uuid", SPHERICAL, text.encode()))
 
 
-def add_matroska_projection(path: Path, projection: int, private: bytes, stereo: int = 0) -> Path:
-    """The same in Matroska's elements: the type and the content of the box after its flags.
-
-    It is what FFmpeg wrote without checksums. Sizes keep their lengths, so there is room for little.
-    """
-    video = _element(0x53B8, bytes([stereo])) + _element(
-        0x7670, _element(0x7671, bytes([projection])) + _element(0x7672, bytes(4) + private)
-    )
-    data = bytearray(path.read_bytes())
-    at, end = 0, len(data)
-    for wanted in (0x18538067, 0x1654AE6B, 0xAE, 0xE0):  # Segment, Tracks, TrackEntry, Video
-        while (identity := _vint(data, at, marked=True))[0] != wanted:
-            length, size = _size_at(data, identity[1])
-            at = identity[1] + length + size
-            assert at < end
-        length, size = _size_at(data, identity[1])
-        grown = (size + len(video)) | 1 << 7 * length
-        data[identity[1] : identity[1] + length] = grown.to_bytes(length, "big")
-        at, end = identity[1] + length, identity[1] + length + size
-    data[end:end] = video
-    path.write_bytes(data)
-    return path
-
-
-def _element(identity: int, content: bytes) -> bytes:
-    """An element of Matroska of less than 127 bytes."""
-    return identity.to_bytes((identity.bit_length() + 7) // 8, "big") + bytes([0x80 | len(content)]) + content
-
-
-def _vint(data: bytearray, at: int, *, marked: bool) -> tuple[int, int]:
-    """A number of Matroska with or without the bit that marks its length, and the byte after it."""
-    length = 9 - data[at].bit_length()
-    value = int.from_bytes(data[at : at + length], "big")
-    return value if marked else value & ~(1 << 7 * length), at + length
-
-
-def _size_at(data: bytearray, at: int) -> tuple[int, int]:
-    """The length of a size in bytes, and the size."""
-    value, after = _vint(data, at, marked=False)
-    return after - at, value
+def as_matroska(path: Path) -> Path:
+    """The same video and metadata in Matroska's elements, as FFmpeg writes them."""
+    target = path.with_suffix(".mkv")
+    with av.open(str(path)) as source, av.open(str(target), "w") as file:
+        stream = file.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                file.mux(packet)
+    return target
 
 
 def turn(path: Path, matrix: tuple[int, int, int, int]) -> Path:

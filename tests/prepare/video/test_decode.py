@@ -14,13 +14,9 @@ from panolog.prepare.video.decode import MAX_FRAMES
 from panolog.prepare.video.frames import extract_frames
 from panolog.scene.errors import InputError
 from panolog.scene.image_files import decode
-from tests.prepare.video.videos import HEIGHT, WIDTH, short_video, tour_images, write_video
+from tests.prepare.video.videos import HEIGHT, WIDTH, numbers, short_video, tour_images, write_video
 
 pytestmark = pytest.mark.system
-
-
-def numbers(files: list[Path]) -> list[int]:
-    return [int(file.stem.rpartition("_")[2]) for file in files]
 
 
 @pytest.fixture(scope="module")
@@ -82,13 +78,9 @@ except InputError:
     assert (ended.stdout, ended.stderr) == ("refused\n", "")
 
 
-@pytest.mark.parametrize(
-    ("size", "said"),
-    [((512, 512), "2:1"), ((640, 360), "2:1"), ((256, 512), "2:1"), ((64, 32), "256 to 12288")],
-)
-def test_frames_that_are_no_panoramas(size: tuple[int, int], said: str, tmp_path: Path) -> None:
-    video = write_video(tmp_path / "flat.avi", [np.zeros((size[1], size[0], 3), np.uint8)] * 3)
-    with pytest.raises(InputError, match=rf"flat\.avi: its .*{said}"):
+def test_frames_that_are_too_small(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "flat.avi", [np.zeros((32, 64, 3), np.uint8)] * 3)
+    with pytest.raises(InputError, match=r"flat\.avi: its .*256 to 12288"):
         extract_frames(video, tmp_path / "out")
 
 
@@ -128,28 +120,11 @@ def test_a_header_of_absurd_frames(size: tuple[int, int], short: Path, tmp_path:
         extract_frames(short, tmp_path / "out")
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_mutated_bytes_crash_nothing(seed: int, short: Path, tmp_path: Path) -> None:
-    random = np.random.default_rng(seed)
-    data = bytearray(short.read_bytes())
-    reach = 6000 if seed % 2 else len(data)  # the headers, or all of it
-    for at in random.integers(0, reach, 12):
-        data[at] = random.integers(256)
-    short.write_bytes(data)
-    try:
-        files = extract_frames(short, tmp_path / "out", most=4)
-    except InputError as error:
-        assert str(short) in str(error) and "\n" not in str(error)
-    else:
-        assert all(decode(file, cv2.IMREAD_COLOR).shape[1] % 2 == 0 for file in files)
-
-
 def test_a_frame_of_another_size_spoils_no_other(short: Path, tmp_path: Path) -> None:
     data = short.read_bytes()
     frame = [found.start() for found in re.finditer(b"00dc", data)][2] + 4  # of a header, the first, this one
-    small = cv2.imencode(".jpg", cv2.resize(tour_images(1)[0], (400, 200)), [cv2.IMWRITE_JPEG_QUALITY, 20])[
-        1
-    ].tobytes()
+    resized = cv2.resize(tour_images(1)[0], (400, 200))
+    small = cv2.imencode(".jpg", resized, [cv2.IMWRITE_JPEG_QUALITY, 20])[1].tobytes()
     (length,) = struct.unpack("<I", data[frame : frame + 4])
     assert len(small) < length
     rest = data[frame + 4 + length :]
@@ -157,19 +132,3 @@ def test_a_frame_of_another_size_spoils_no_other(short: Path, tmp_path: Path) ->
     files = extract_frames(short, tmp_path / "out", parallax=2.0)
     assert len(files) >= 3
     assert all(decode(file, cv2.IMREAD_COLOR).shape == (HEIGHT, WIDTH, 3) for file in files)
-
-
-@pytest.mark.parametrize("quarters", [1, 2])
-def test_only_a_half_turn_of_the_picture_is_undone(quarters: int, tmp_path: Path) -> None:
-    video = write_video(tmp_path / "turned.mp4", tour_images(30, 45, 2), fourcc="mp4v")
-    data = bytearray(video.read_bytes())
-    matrix = {1: (0, 0x10000, 0, -0x10000, 0, 0), 2: (-0x10000, 0, 0, 0, -0x10000, 0)}[quarters]
-    at = data.index(b"tkhd") + 4 + 40
-    data[at : at + 24] = struct.pack(">6i", *matrix)
-    video.write_bytes(data)
-    first = decode(extract_frames(video, tmp_path / "out", parallax=2.0)[0], cv2.IMREAD_COLOR).astype(int)
-    number = numbers(sorted((tmp_path / "out").glob("*.jpg")))[0]
-    expected = tour_images(30, 45, 2)[number]
-    if quarters == 2:
-        expected = np.asarray(expected[::-1, ::-1], np.uint8)
-    assert np.abs(first - expected).mean() < 12

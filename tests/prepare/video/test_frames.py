@@ -18,6 +18,7 @@ from tests.prepare.video.videos import (
     HEIGHT,
     WIDTH,
     Shot,
+    numbers,
     render,
     short_video,
     tour,
@@ -28,10 +29,6 @@ from tests.prepare.video.videos import (
 pytestmark = pytest.mark.system
 
 PARALLAX = 5.0
-
-
-def numbers(files: list[Path]) -> list[int]:
-    return [int(file.stem.rpartition("_")[2]) for file in files]
 
 
 @pytest.fixture(scope="module")

@@ -107,6 +107,11 @@ def short_video(path: Path) -> Path:
     return write_video(path, tour_images(30, 45, 2))
 
 
+def numbers(files: Sequence[Path]) -> list[int]:
+    """Which frames of a video files of `extract_frames` are."""
+    return [int(file.stem.rpartition("_")[2]) for file in files]
+
+
 def _rays(width: int, turned: tuple[float, float, float]) -> tuple[Array, Array]:
     """Directions (N, 3) of all pixels in the world, and in the camera: x right, y down, z forward."""
     local = _grid(width)
