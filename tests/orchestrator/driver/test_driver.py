@@ -69,13 +69,14 @@ def test_of_many_previews_the_first_the_latest_and_some_between_are_kept(harness
     assert pictures.previews(entry, None)["previews"][0]["iteration"] == 30_000
 
 
+@pytest.mark.parametrize(("failed", "attempts"), [(DIED, 3), (TRUNCATED, 2)], ids=["retries", "confirmed"])
 def test_a_block_that_keeps_failing_keeps_its_stage_one_gaussians_until_it_is_resumed(
-    harness: Harness, tmp_path: Path
+    harness: Harness, tmp_path: Path, failed: Failed, attempts: int
 ) -> None:
     with pytest.raises(RunError, match="block 1 failed and keeps its Stage I Gaussians"):
-        harness.drive(fails(TaskId.block(1), DIED, 99))
-    assert harness.tasks.count(TaskId.block(1)) == 1 + harness.job.config.retries
-    assert harness.state.status(TaskId.block(1)) == Status.FAILED
+        harness.drive(fails(TaskId.block(1), failed, 99))
+    assert harness.tasks.count(TaskId.block(1)) == attempts
+    assert [harness.state.status(TaskId.block(n)) for n in (0, 1)] == [Status.DONE, Status.FAILED]
     assert harness.state.outcome == "failed"
     assert ply_header(harness.folder.point_cloud) == (202, 2)  # nothing is missing
     assert harness.folder.metrics.exists()
@@ -96,15 +97,6 @@ def test_wrong_input_ends_the_run_once_a_second_attempt_has_confirmed_it(harness
     assert [failed.final for failed in harness.records(TaskFailed)] == [False, True]
     assert harness.records(StopRequested) == [StopRequested(0)]
     assert harness.records(RunEnded) == [RunEnded(Outcome.FAILED, "a.jpg is truncated")]
-
-
-def test_a_block_with_wrong_input_holds_up_neither_the_others_nor_the_merge(harness: Harness) -> None:
-    with pytest.raises(RunError, match="block 0 failed and keeps its Stage I Gaussians"):
-        harness.drive(fails(TaskId.block(0), TRUNCATED, 99))
-    assert harness.tasks.count(TaskId.block(0)) == 2  # the second confirms it
-    assert harness.state.status(TaskId.block(1)) == Status.DONE
-    assert harness.folder.kept(0).is_file()
-    assert harness.folder.metrics.exists()
 
 
 def test_a_worker_that_ends_without_a_result_has_failed(harness: Harness) -> None:

@@ -22,6 +22,7 @@ from panolog.orchestrator.run.records import (
     RunContinued,
     RunWaiting,
 )
+from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.stages import evaluation
 from panolog.scene.errors import RunError
@@ -194,42 +195,27 @@ def test_a_checkpoint_on_a_full_device_has_its_error_number(
     assert why_waiting(raised.value, tmp_path).startswith("disk full")
 
 
-SMALL_DISK = """
-import sys, threading
-from pathlib import Path
-from panolog.orchestrator.run.records import RunContinued
-from tests.orchestrator.driver.test_full_disk import QUICK, Harness, fill
-from panolog.orchestrator.run import presence
+def on_a_small_disk(root: Path) -> None:
+    """A run whose disk has 200 kB, less than its models and its database, until it waits."""
+    harness, ballast = Harness(root, **QUICK), root / "ballast"
+    ballast.write_bytes(bytes(shutil.disk_usage(root).free - 200_000))
 
-root = Path(sys.argv[1])
-harness = Harness(root, **QUICK)
-fill(root / "ballast")
+    def free(state: RunState, _: object) -> None:
+        if state.waiting:
+            ballast.unlink(missing_ok=True)
 
-def free():
-    while not presence.waiting(harness.folder.presence):
-        threading.Event().wait(0.05)
-    (root / "ballast").unlink()
-
-threading.Thread(target=free, daemon=True).start()
-assert harness.drive().outcome == "done"
-assert harness.records(RunContinued)
-print("continued")
-"""
-
-
-def fill(path: Path) -> None:
-    """Takes all the space of a disk but for 200 kB, less than the database and the models of a run."""
-    rest = shutil.disk_usage(path.parent).free - 200_000
-    path.write_bytes(bytes(rest))
+    assert harness.drive(on_change=free).outcome == "done"
+    assert harness.records(RunContinued) and not ballast.exists()
 
 
 @pytest.mark.nightly
 def test_a_real_disk_that_is_full_and_then_freed(tmp_path: Path) -> None:
     """A tmpfs of a few megabytes in a namespace of its own."""
-    command = 'mount -t tmpfs -o size=8m tmpfs $1 && exec $2 -c "$3" $1'
+    command = 'mount -t tmpfs -o size=8m tmpfs $1 && exec $2 -c "$3"'
     arguments = ["unshare", "-rm", "sh", "-c", command, "sh", str(tmp_path), sys.executable]
     probe = subprocess.run([*arguments, "pass"], capture_output=True, check=False)
     if probe.returncode:
         pytest.skip(f"needs user namespaces: {probe.stderr.decode().strip()}")
-    done = subprocess.run([*arguments, SMALL_DISK], capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "continued", done.stderr[-2000:]
+    program = f"from pathlib import Path; from {__name__} import *; on_a_small_disk(Path({str(tmp_path)!r}))"
+    done = subprocess.run([*arguments, program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from dataclasses import replace
 
 import pytest
 
@@ -45,15 +46,10 @@ def scaling(
     return Scaling(Growth(tuple(groups), members or {}, joining), True, overhead, price=price)
 
 
-def test_a_stage_of_many_hours_gets_all_machines_that_shorten_it() -> None:
+def test_a_stage_of_many_hours_gets_all_machines_that_shorten_it_and_no_others() -> None:
     assert scaling().wanted(work(8, HOUR), (), ()) == {"small": 8}
     assert scaling().wanted(work(3, HOUR), (), ()) == {"small": 3}
-
-
-def test_machines_that_would_not_end_it_sooner_are_not_requested() -> None:
-    uneven = Work(
-        [Demand(TaskId.block(i), 12 * GIB) for i in range(4)], [4 * HOUR, HOUR, HOUR, HOUR], 7 * HOUR
-    )
+    uneven = replace(work(4, HOUR, whole=7 * HOUR), seconds=[4 * HOUR, HOUR, HOUR, HOUR])
     assert scaling().wanted(uneven, (), ()) == {"small": 2}
 
 

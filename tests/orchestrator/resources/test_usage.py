@@ -3,10 +3,8 @@
 import json
 import secrets
 import socket
-import sqlite3
 import sys
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from subprocess import PIPE, Popen
@@ -82,9 +80,3 @@ def test_the_driver_keeps_one_measurement_of_each_machine(harness: Harness) -> N
     assert shown | {"node": "node"} == json.loads(json.dumps(asdict(HERE)))
     at_rest = view_run(History.of(records), {}, running=False, usages=kept)
     assert at_rest.nodes[0].usage is None
-
-
-def test_a_run_of_an_older_version_has_no_measurements(tmp_path: Path) -> None:
-    with closing(sqlite3.connect(tmp_path / "run.db")) as connection:
-        connection.execute("CREATE TABLE events (id INTEGER PRIMARY KEY)")
-    assert queries.usages(tmp_path / "run.db") == {}

@@ -16,6 +16,7 @@ from panolog.orchestrator.run.records import (
     RunBegan,
 )
 from panolog.orchestrator.run.store import Database, read_milestones, read_news, read_records
+from panolog.orchestrator.views import queries
 from panolog.scene.errors import InputError, RunLockedError
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.fakes import SetClock
@@ -144,6 +145,7 @@ def test_a_database_of_an_older_version_is_read_and_continued(path: Path) -> Non
     assert [s.id for s in read_milestones(path)] == [1, 3, 5, 6, 7]
     assert [s.id for s in read_news(path, 4, 10)] == [5, 6, 7]
     assert reading.version(path)[1:] == (7, None, None)
+    assert queries.usages(path) == {}
     with closing(Database(path)) as database:
         assert [s.id for s in database.milestones()] == [1, 3, 5, 6, 7]
         assert database.append([Progressed(COARSE, 3, 10, 2.0)])[0].id == 8

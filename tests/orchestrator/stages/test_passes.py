@@ -108,7 +108,7 @@ def test_with_levels_of_detail_a_repair_has_both_blocks_whole(tmp_path: Path) ->
     assert repair.cell is not None
     assert starts[REPAIR] == repair.cell.contains(union.means[union.scene].numpy()).sum() > 0
     assert not harness.folder.initial(REPAIR).exists()
-    assert not harness.records(Noticed) or all(n.task != REPAIR for n in harness.records(Noticed))
+    assert all(notice.task != REPAIR for notice in harness.records(Noticed))
 
 
 def test_a_pass_has_low_rates_and_adds_nothing() -> None:

@@ -130,26 +130,6 @@ def test_a_new_driver_knows_of_a_quarantine_unless_the_run_had_failed() -> None:
     assert bad(run(*three[:2], AGAIN, three[2])) == []
 
 
-def test_if_all_nodes_are_bad_the_run_waits_a_sixth_of_the_time_and_then_fails() -> None:
-    state, now = run(), 0.0
-    for _ in range(6):
-        assert quarantine.hopeless(state, BLOCKS, (A, B)) is None
-        for node in (A, B):
-            for task in BLOCKS[:3]:
-                state = apply(state, [Stored(0, now, failed(task, node))])
-            state = review(state, now)
-        assert bad(state) == ["gpu-a", "gpu-b"]
-        assert "every machine is in quarantine, gpu-a because 3 tasks" in str(
-            quarantine.waiting(state, (A, B))
-        )
-        assert bad(review(state, now + 9)) == ["gpu-a", "gpu-b"]
-        now += 10
-        last, state = state, review(state, now)
-        assert bad(state) == []
-    assert "6 times without a success" in str(quarantine.hopeless(last, BLOCKS, (A, B)))
-    assert quarantine.hopeless(last, (), (A, B)) is None
-
-
 # With the driver
 
 
