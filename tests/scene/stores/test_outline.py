@@ -45,9 +45,9 @@ def large_scene(root: Path, names: tuple[str, ...] = ()) -> Path:
 def test_a_scene_in_a_store_is_that_of_its_folder(tmp_path: Path, names: tuple[str, ...]) -> None:
     root = large_scene(tmp_path / "place", names)
     (root / "test.txt").write_text(f"{'p1' if names else 'pano_1'}\n")
-    for name in (".panolog", "notes"):  # neither belongs to a scene
-        (root / name).mkdir()
-        (root / name / "x").write_text("x")
+    (root / "notes").mkdir()
+    for name in ("notes/x", ".hidden"):  # neither belongs to a scene
+        (root / name).write_text("x")
     url = f"file://{root}"
     plain, stored = read_scene(root), read_scene(url)
     assert stored.fingerprint == plain.fingerprint
@@ -55,10 +55,8 @@ def test_a_scene_in_a_store_is_that_of_its_folder(tmp_path: Path, names: tuple[s
     assert url_of(stored.root) == url
     assert local_folder(url) == stored.root
     assert local_folder(str(root)) == root
-    assert {path.name for path in root.iterdir()} - {path.name for path in stored.root.iterdir()} == {
-        ".panolog",
-        "notes",
-    }
+    apart = {path.name for path in root.iterdir()} - {path.name for path in stored.root.iterdir()}
+    assert apart == {"notes", ".hidden"}
     for row, (ours, theirs) in enumerate(zip(stored.panoramas, plain.panoramas, strict=True)):
         assert [path.relative_to(stored.root) for path in ours.files] == [
             path.relative_to(root) for path in theirs.files
