@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.commands import session
 from panolog.orchestrator.driver.local_pool import local_pool
+from panolog.orchestrator.run import control
 from panolog.orchestrator.run.config import load_config
+from panolog.orchestrator.run.control import Action
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import CheckpointSaved, Stored, TaskStarted, ViewEvaluated
+from panolog.orchestrator.run.records import CheckpointSaved, Stored, TaskStarted, TaskYielded, ViewEvaluated
 from panolog.orchestrator.run.state import OnChange, RunState, ignore
 from panolog.orchestrator.run.store import read_records
 from panolog.scene.read import read_scene
@@ -50,12 +52,20 @@ def write_walk(folder: Path) -> Path:
     return folder / "walk"
 
 
-def interrupt(kind: type, task: TaskId) -> OnChange:
-    """Ends a driver at the first record of a kind; its workers are killed where they are."""
+def interrupt(folder: RunFolder, kind: type, task: TaskId) -> OnChange:
+    """Ends a driver at the first record of a kind.
+
+    In Stage I by a request to stop, so that its worker saves a last checkpoint wherever it is; then by force.
+    """
+    begun = list[TaskId]()
 
     def show(_: RunState, news: Sequence[Stored]) -> None:
-        if any(isinstance(it.record, kind) and it.record.task == task for it in news):
+        if begun or not any(isinstance(it.record, kind) and it.record.task == task for it in news):
+            return
+        begun.append(task)
+        if task != COARSE:
             raise KeyboardInterrupt
+        control.send(folder, Action.STOP)
 
     return show
 
@@ -68,7 +78,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, RunFolder
     with local_pool() as pool:
         session.start(scene, calm.root, CONFIG, None, ignore, pool)
     for number, (kind, task) in enumerate(INTERRUPTED):
-        show = interrupt(kind, task)
+        show = interrupt(disturbed, kind, task)
         with local_pool() as pool, pytest.raises(KeyboardInterrupt):
             if number:
                 session.resume(disturbed.root, None, show, pool)
@@ -94,6 +104,7 @@ def test_what_was_interrupted_everywhere_ends_with_the_same_bytes(runs: tuple[Ru
     records = [stored.record for stored in read_records(disturbed.database)]
     attempts = [record.task for record in records if isinstance(record, TaskStarted)]
     assert all(attempts.count(task) == 2 for task in (COARSE, BLOCK, EVAL))
+    assert TaskYielded(COARSE) in records
     ours, theirs = files_of(disturbed), files_of(calm)
     assert [name for name in theirs if ours[name] != theirs[name]] == []
     assert not list(disturbed.root.rglob("*.part"))
