@@ -56,7 +56,7 @@ def test_a_known_distance_is_measured(browser: Browser, tmp_path: Path, metres: 
         assert written == pytest.approx(2 * (metres or 1), rel=0.02)
         box = page.locator("#lines line").evaluate("line => line.getBoundingClientRect().toJSON()")
         assert box["width"] == pytest.approx(2 * focal / 5, rel=0.03)
-        page.mouse.click(WIDTH / 2, HEIGHT / 4)  # nothing is there
+        page.mouse.click(WIDTH / 2, HEIGHT / 2 + 70)  # nothing is there
         expect(page.locator("#measured")).to_contain_text("nothing to measure")
         page.keyboard.press("Escape")
         expect(page.locator("#lines line")).to_have_count(0)
