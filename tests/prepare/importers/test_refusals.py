@@ -33,7 +33,12 @@ def _mirrored(content: Any) -> None:
 
 
 OPENMVG: list[tuple[Change, str]] = [
-    *[(_named(name), _NAME) for name in ("../secret.png", "/../x", "a\0b", "x" * 2000, "", "..")],
+    *[
+        (_named(it), f"{it[:80]!r} is not a path inside")
+        for it in ("../secret.png", "a\0b", "x" * 2000, "..")
+    ],
+    (_named("/../x"), f"{_NAME}/../x is not in "),
+    (_named(""), f"{_NAME}a text was expected"),
     (lambda p: p["extrinsics"][2]["value"]["center"].pop(), "extrinsics[2].value.center: 3 finite"),
     (lambda p: p["extrinsics"][2]["value"].pop("rotation"), "extrinsics[2].value: has no 'rotation'"),
     (lambda p: p["extrinsics"][1]["value"]["rotation"][0].reverse(), "extrinsics[1].value.rotation: "),
