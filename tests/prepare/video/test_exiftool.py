@@ -40,27 +40,19 @@ def with_track(kind: bytes, packet: bytes) -> Callable[[Path], Path]:
     return lambda path: add_track(path, kind, [(0, packet)], 1000)
 
 
-PLACED = {
-    f"GPS{name}": value for name, value in zip(("Latitude", "Longitude", "Altitude"), PLACE, strict=True)
-}
-SPHERICAL: dict[str, float | str] = {
-    "PoseYawDegrees": 10,
-    "PosePitchDegrees": 20,
-    "PoseRollDegrees": -5,
-    "Stereoscopic3D": 1,
-}
-SPHERICAL |= {"StereoMode": "top-bottom", "ProjectionType": "equirectangular"}
+def spherical(path: Path) -> Path:
+    return add_spherical_xml(add_spherical(path, stereo=1, pose=(10.0, 20.0, -5.0)), StereoMode="top-bottom")
+
+
+PLACED = dict(zip(("GPSLatitude", "GPSLongitude", "GPSAltitude"), PLACE.tolist(), strict=True))
+SPHERICAL: dict[str, float | str] = {"PoseYawDegrees": 10, "PosePitchDegrees": 20, "PoseRollDegrees": -5}
+SPHERICAL |= {"Stereoscopic3D": 1, "StereoMode": "top-bottom", "ProjectionType": "equirectangular"}
 
 
 @pytest.mark.parametrize(
     ("change", "wanted"),
     [
-        (
-            lambda path: add_spherical_xml(
-                add_spherical(path, stereo=1, pose=(10.0, 20.0, -5.0)), StereoMode="top-bottom"
-            ),
-            SPHERICAL,
-        ),
+        (spherical, SPHERICAL),
         (with_track(b"gpmd", payload(gps5(PLACE[None]))), PLACED),
         (with_track(b"camm", camm_gps(PLACE)), PLACED),
         (with_track(b"camm", camm(5, *PLACE)), PLACED),
