@@ -21,13 +21,7 @@ from panolog.orchestrator.run.money.records import (
     NodeReserved,
     WorkLost,
 )
-from panolog.orchestrator.run.records import (
-    Outcome,
-    PreflightSaved,
-    Record,
-    RunBegan,
-    Stored,
-)
+from panolog.orchestrator.run.records import Outcome, PreflightSaved, Record, RunBegan, Stored
 from panolog.orchestrator.run.state import RunState, Status, replay
 from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import ConfigError

@@ -11,13 +11,7 @@ from panolog.orchestrator.estimates.calibration import Basis
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Message
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.folder import write_json
-from panolog.orchestrator.run.records import (
-    EvaluationSaved,
-    Failure,
-    ModelSaved,
-    TaskFailed,
-    TaskYielded,
-)
+from panolog.orchestrator.run.records import EvaluationSaved, Failure, ModelSaved, TaskFailed, TaskYielded
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.workers.events import Checkpoint, Event, Progress
 from panolog.workers.specs import TaskSpec

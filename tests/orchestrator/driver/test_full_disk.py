@@ -16,12 +16,7 @@ from panolog.orchestrator.driver import driver as driver_module
 from panolog.orchestrator.driver import results, saving
 from panolog.orchestrator.run import control, presence
 from panolog.orchestrator.run.presence import why_waiting
-from panolog.orchestrator.run.records import (
-    ModelSaved,
-    Record,
-    RunContinued,
-    RunWaiting,
-)
+from panolog.orchestrator.run.records import ModelSaved, Record, RunContinued, RunWaiting
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.stages import evaluation
@@ -135,14 +130,15 @@ def test_what_landed_is_recorded_before_the_run_ends(quick: Harness, monkeypatch
     assert landed == on_disk
 
 
+def request(harness: Harness, text: str) -> None:
+    harness.folder.control.mkdir(exist_ok=True)
+    (harness.folder.control / "1.json").write_text(text)
+
+
 @pytest.mark.parametrize("how", ["signal", "request"])
 def test_a_run_that_waits_can_be_stopped(quick: Harness, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
     def full(*_: Any) -> Record:
-        if how == "signal":
-            quick.stop.signal()
-        else:
-            (quick.folder.control).mkdir(exist_ok=True)
-            (quick.folder.control / "1.json").write_text('{"action": "stop"}')
+        quick.stop.signal() if how == "signal" else request(quick, '{"action": "stop"}')
         raise FULL
 
     monkeypatch.setattr(results, "merge_run", full)
@@ -158,8 +154,7 @@ def test_a_request_during_the_wait_is_carried_out_after_it(
     def full(*arguments: Any) -> Any:
         if quick.folder.control.is_dir():
             return saving.save(*arguments)
-        quick.folder.control.mkdir()
-        (quick.folder.control / "1.json").write_text('{"action": "retry", "block": 0}')
+        request(quick, '{"action": "retry", "block": 0}')
         raise FULL
 
     monkeypatch.setattr(driver_module, "save", full)

@@ -30,7 +30,6 @@ from panolog.scene.errors import RunError
 from panolog.workers.events import Calibration, Checkpoint, Event, Progress
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId
-from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator import fakes
 from tests.orchestrator.fakes import LOST_NODE, CrashError, FakePool, Harness, Script, begins, well
 from tests.orchestrator.history import AGAIN, after
@@ -67,43 +66,38 @@ def test_what_may_never_come_counts_only_where_another_node_stays() -> None:
     assert [type(record) for record in worse] == [NodeLeaving]
 
 
-class Notices:
-    """Workers that train until they are requested to stop; the first one's node then gets its notice."""
+def noticed(run: Harness, task: TaskId = COARSE) -> Script:
+    """The node of the first attempt at a task gets its notice; the worker trains until it is to stop."""
 
-    def __init__(self, run: Harness, script: Script | None = None, *, task: TaskId = COARSE) -> None:
-        self.run, self.task, self.inner = run, task, script or well
-        self.node = ""
-
-    def __call__(self, spec: TaskSpec) -> Iterator[Event | Calibration]:
-        if spec.task != self.task or self.node or not isinstance(spec, TrainSpec):
-            yield from self.inner(spec)
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        if spec.task != task or len(run.attempts(task)) > 1:
+            yield from well(spec)
             return
-        pool = self.run.pool
-        self.node = pool.placement(spec.task).node
-        yield Progress(spec.task, 1, 9, 1.0)
-        pool.leaving[self.node] = SOON
+        yield Progress(task, 1, 9, 1.0)
+        run.pool.leaving[run.pool.placement(task).node] = SOON
         for iteration in range(2, 9):
-            yield Progress(spec.task, iteration, 9, 1.0)
-            if spec.task in pool.stopped:
-                yield Checkpoint(spec.task, iteration, {"iteration": torch.tensor(iteration)})
+            yield Progress(task, iteration, 9, 1.0)
+            if task in run.pool.stopped:
+                yield Checkpoint(task, iteration, {"iteration": torch.tensor(iteration)})
                 return
         raise AssertionError("it is not requested to stop")
+
+    return script
 
 
 @pytest.mark.parametrize("task", [COARSE, TaskId.block(1)], ids=str)
 def test_tasks_save_and_move_at_once(tmp_path: Path, task: TaskId) -> None:
     run = Harness(tmp_path, (A, B), retries=0)
-    script = Notices(run, task=task)
-    assert run.drive(script).outcome == Outcome.DONE
+    assert run.drive(noticed(run, task)).outcome == Outcome.DONE
     (leaves,) = run.records(NodeLeaving)
-    assert (leaves.node, leaves.kind, leaves.seconds) == (script.node, Leaving.PREEMPTION, 120.0)
+    assert (leaves.kind, leaves.seconds) == (Leaving.PREEMPTION, 120.0)
     (yielded,) = run.records(TaskYielded)
     assert yielded == TaskYielded(task, leaves.host)
     first, second = [record for record in run.records(TaskStarted) if record.task == task]
-    assert first.node_id == script.node != second.node_id
+    assert first.node_id == leaves.node != second.node_id
     assert second.iteration >= 2  # the checkpoint that was saved then
     after = run.tasks.index(task) + 1
-    assert all(where.node != script.node for where, spec in run.pool.started[after:] if spec.task == task)
+    assert all(where.node != leaves.node for where, spec in run.pool.started[after:] if spec.task == task)
     assert not run.records(TaskFailed)
     assert not run.records(NodeQuarantined)
     assert run.state.task(task).moves == 1
@@ -164,13 +158,8 @@ def test_losses_by_preemption_are_endless_by_default_and_count_against_no_node(
 
 def test_a_node_whose_notice_is_withdrawn_is_used_again(tmp_path: Path) -> None:
     run = Harness(tmp_path, (A,))
-    first = Notices(run)
-
-    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
-        run.pool.when_waiting(run.pool.leaving.clear)
-        yield from first(spec)
-
-    assert run.drive(script).outcome == Outcome.DONE
+    withdrawn = begins(COARSE, lambda: run.pool.when_waiting(run.pool.leaving.clear), rest=noticed(run))
+    assert run.drive(withdrawn).outcome == Outcome.DONE
     assert len(run.records(NodeStaying)) == 1
     waits = [notice.message for notice in run.records(Noticed)]
     assert any(message.startswith("every machine leaves") for message in waits)

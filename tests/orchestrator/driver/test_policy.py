@@ -3,13 +3,7 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator.driver.policy import (
-    LOSSES,
-    Consequence,
-    after_failure,
-    outcome,
-    ready,
-)
+from panolog.orchestrator.driver.policy import LOSSES, Consequence, after_failure, outcome, ready
 from panolog.orchestrator.run.records import (
     BlockPlan,
     CheckpointSaved,

@@ -18,7 +18,7 @@ from panolog.orchestrator.run.machines.config import DeadlinesConfig
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
-from panolog.workers.events import Calibration, IterationCost
+from panolog.workers.events import Calibration, IterationCost, Notice
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import CALIBRATE, Stage, TaskId
 from tests.orchestrator.calibrated import MEBI, calibrated, says
@@ -218,7 +218,9 @@ def test_nothing_is_proposed_where_nothing_helps(scene: Scene) -> None:
 
 
 def test_a_calibration_that_fails_leaves_assumptions_or_finds_the_input_wrong(scene: Scene) -> None:
-    dies = fails(CALIBRATE, Failed("out of memory", Failure.MEMORY), 1)
+    dies = fails(
+        CALIBRATE, Failed("out of memory", Failure.MEMORY), 1, before=[Notice(CALIBRATE, "passed over")]
+    )
     assert examined(scene, script=dies).estimate.seconds is None
     finds = fails(CALIBRATE, Failed("a.jpg: cannot be decoded", Failure.INPUT), 1)
     with pytest.raises(InputError, match=r"a\.jpg: cannot be decoded"):

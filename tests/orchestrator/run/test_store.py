@@ -1,6 +1,7 @@
 import shutil
 import sqlite3
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from panolog.orchestrator.run.records import (
     RunBegan,
 )
 from panolog.orchestrator.run.store import Database, read_milestones, read_news, read_records
+from panolog.orchestrator.run.thinning import PREVIEWS, surplus
 from panolog.orchestrator.views import queries
 from panolog.scene.errors import InputError, RunLockedError
 from panolog.workers.tasks import COARSE, TaskId
@@ -192,3 +194,23 @@ def test_a_database_whose_making_was_cut_off_has_no_rows_and_is_made_whole(
     with closing(Database(path)) as database:
         database.append(HISTORY)
     assert len(read_records(path)) == len(HISTORY)
+
+
+# Previews
+
+
+def test_previews_are_the_first_the_latest_and_some_evenly_between() -> None:
+    kept: list[int] = []
+    for iteration in range(500, 100_001, 500):
+        kept.append(iteration)
+        if (gone := surplus(kept, iteration)) is not None:
+            kept.remove(gone)
+        assert len(kept) <= PREVIEWS
+        assert (kept[0], kept[-1]) == (500, iteration)
+    gaps = [after - before for before, after in pairwise(kept)]
+    assert max(gaps) < 2 * 100_000 / PREVIEWS
+
+
+def test_the_preview_of_a_repeated_iteration_is_kept() -> None:
+    kept = list(range(100, 100 * PREVIEWS + 1, 100))
+    assert surplus(sorted([*kept, 501]), 501) in (500, 600)

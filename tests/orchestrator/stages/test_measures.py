@@ -11,13 +11,7 @@ import pytest
 from panolog.orchestrator.dashboard import pictures
 from panolog.orchestrator.driver.job import Job, Specs
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import (
-    EvaluationSaved,
-    MeasuresSaved,
-    Noticed,
-    PlanSaved,
-    SeamEvaluated,
-)
+from panolog.orchestrator.run.records import EvaluationSaved, MeasuresSaved, Noticed, PlanSaved, SeamEvaluated
 from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.scene.errors import RunError
 from panolog.scene.files import here
