@@ -14,7 +14,7 @@ def fault(time: float, kind: Kind, until: float = 0.0) -> Fault:
 
 BROKEN_NODE = (
     "0 began, 1 started coarse, 4 saved coarse, 6 unread coarse, 8 started coarse, 20 model coarse,"
-    " 22 started 0, 23 unread 0, 24 started 1, 50 model 1"
+    " 22 started 0, 23 unread 0, 24 started 1, 30 lost 1, 31 started 1, 50 model 1"
 )
 
 
