@@ -80,7 +80,9 @@ def test_the_firmware_names_the_provider_without_a_request(
 
 
 @amazon
-def test_amazon_announces_an_interruption_with_its_time(served: Metadata) -> None:
+def test_amazon_announces_an_interruption_with_its_time_and_before_that_recommends_to_rebalance(
+    served: Metadata,
+) -> None:
     provider = detected()
     assert provider.notice() is None
     served.spot(120)
@@ -93,11 +95,7 @@ def test_amazon_announces_an_interruption_with_its_time(served: Metadata) -> Non
     assert again is not None and again.kind == Leaving.PREEMPTION
     assert served.tokens == 2
     assert not provider.withdraws(Leaving.PREEMPTION)
-
-
-@amazon
-def test_amazon_recommends_to_rebalance_and_an_interruption_is_worse(served: Metadata) -> None:
-    provider = detected()
+    served.values.clear()
     served.values[REBALANCE] = '{"noticeTime": "2026-05-01T08:00:00Z"}'
     assert provider.notice() == LeaveNotice(Leaving.REBALANCE, None)
     assert provider.withdraws(Leaving.REBALANCE)

@@ -32,7 +32,9 @@ from tests.orchestrator.history import AGAIN, BEGAN, after, model, started
 
 PLAIN = {int: st.integers(0, 2**40), float: st.floats(0, 1e9), str: st.text(max_size=9)}
 TASKS = [COARSE, EVAL, TaskId.block(0), TaskId.block(1), TaskId.shard(0), TaskId.measure(0)]
-NAMES = {  # of tasks in values that are text, and what is free in form
+NAMES: dict[
+    type, dict[str, st.SearchStrategy[Any]]
+] = {  # of tasks in values that are text, and what is free in form
     PlanSaved: {"passes": st.just((("round/000",), ("repair/000",)))},
     NodeQuarantined: {"tasks": st.just(("block/000",))},
     BudgetSet: {"prices": st.just({"currency": "USD"})},
@@ -72,7 +74,7 @@ def test_records_survive_json(one_of_each: tuple[Record, ...]) -> None:
 
 
 def test_a_task_waits_and_runs_until_it_is_done_or_a_failure_is_final() -> None:
-    begun = [BEGAN, started(COARSE)]
+    begun: list[Record] = [BEGAN, started(COARSE)]
     assert (after(BEGAN).status(COARSE), after(*begun).status(COARSE)) == (Status.WAITING, Status.RUNNING)
     done = after(*begun, CheckpointSaved(COARSE, 20, "p", 1), model(COARSE)).task(COARSE)
     assert (done.status, done.checkpoint, done.seconds) == (Status.DONE, 20, 1.5)

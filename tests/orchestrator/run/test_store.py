@@ -66,7 +66,7 @@ def test_milestones_leave_out_old_progress_without_a_look_at_it(
     steps, connect = [0], sqlite3.connect
 
     def counted(*arguments: Any, **options: Any) -> sqlite3.Connection:
-        connection = connect(*arguments, **options)
+        connection: sqlite3.Connection = connect(*arguments, **options)
         connection.set_progress_handler(lambda: steps.append(1), 100)
         return connection
 

@@ -79,14 +79,11 @@ def test_stage_one_adds_to_the_moves_of_the_adjustment(truth: Scene, tmp_path: P
     assert table[held_out.name]["moved"] < 0.3
 
 
-def test_poses_that_fit_stay(truth: Scene) -> None:
+def test_poses_that_fit_or_are_not_to_be_refined_stay(truth: Scene) -> None:
     assert measured(truth, "auto")[0] == Measured(None, None)
     found, _ = measured(truth, True)
     assert found.adjusted is None
     assert found.captured is not None and found.captured.residuals is not None
-
-
-def test_nothing_is_measured_unless_it_is_to_be_learnt(truth: Scene) -> None:
     found, lines = measured(shaken(truth), False)
     assert found == Measured(None, None) and not any("poses" in line for line in lines)
 

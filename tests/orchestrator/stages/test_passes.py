@@ -30,7 +30,7 @@ def passing(folder: Path, **settings: Any) -> Harness:
     return Harness(folder, partition=partition, iterations=40, retries=0, **{"passes": passes, **settings})
 
 
-def test_a_round_and_a_repair_start_from_the_union_before_them(tmp_path: Path) -> None:
+def test_a_round_and_a_repair_start_from_the_union_before_them_and_are_merged(tmp_path: Path) -> None:
     harness = passing(tmp_path)
     assert harness.drive().outcome == "done"
     assert harness.tasks[-4:] == [*ROUNDS, REPAIR, EVAL]
@@ -46,15 +46,8 @@ def test_a_round_and_a_repair_start_from_the_union_before_them(tmp_path: Path) -
     assert isinstance(repair.cell, Region)
     unions = [record.task for record in harness.records(ModelSaved) if record.task.stage is Stage.UNION]
     assert unions == [TaskId.union(0), TaskId.union(1)]
-
-
-def test_the_merged_model_has_every_gaussian_once_as_it_was_trained_last(tmp_path: Path) -> None:
-    """Each training makes its Gaussians brighter by one: two of all, three of what is near the face."""
-    harness = passing(tmp_path)
-    harness.drive()
-    (repair,) = harness.trainings(REPAIR)
+    # The merged model has every Gaussian once as it was trained last, each time brighter by one.
     coarse, merged = read_ply(harness.folder.model(COARSE)), read_ply(harness.folder.point_cloud)
-    assert repair.cell is not None
     near = repair.cell.contains(coarse.means[coarse.scene].numpy())
     assert 0 < near.sum() < len(near)
     expected = coarse.sh0[coarse.scene, 0, 0] + 2 + torch.from_numpy(near)
@@ -88,8 +81,8 @@ def test_a_block_that_is_tried_again_is_in_all_that_follows(tmp_path: Path) -> N
     assert harness.drive(resumed=True).outcome == "done"
     assert harness.tasks == [TaskId.block(1), *ROUNDS, REPAIR, TaskId.measure(0), TaskId.measure(1)]
     assert harness.trainings(REPAIR)[0].checkpoint is None
-    for made in (lambda it: it.folder.point_cloud, lambda it: it.folder.metrics, lambda it: it.folder.seams):
-        assert made(harness).read_bytes() == made(whole).read_bytes()
+    for made in ("point_cloud", "metrics", "seams"):
+        assert getattr(harness.folder, made).read_bytes() == getattr(whole.folder, made).read_bytes()
 
 
 def test_with_levels_of_detail_a_repair_has_both_blocks_whole(tmp_path: Path) -> None:
