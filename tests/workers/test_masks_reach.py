@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import torch
 
+from panolog.scene.depth_alignment import Alignment, align_depth
 from panolog.scene.gaussians import Gaussians
+from panolog.scene.images import load_layers
 from panolog.scene.model import Scene
 from panolog.workers.evaluation import evaluate
 from panolog.workers.events import Evaluated, Scored
@@ -20,7 +22,7 @@ from panolog.workers.scoring import score
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
 from tests.workers import trainings
-from tests.workers.small import small_scene
+from tests.workers.small import WIDTH, small_scene
 from tests.workers.trainings import coarse_of, evaluation_of, same, score_of
 
 IGNORED, SSIM_REACH = 12, 5  # rows
@@ -72,8 +74,16 @@ def metrics(scene: Scene, model: Gaussians) -> dict[str, float | None]:
     return next(event.metrics for event in events if isinstance(event, Evaluated))
 
 
+def test_alignment(clean: Scene, spoilt: Scene) -> None:
+    def aligned(scene: Scene) -> Alignment:
+        return align_depth(scene, load_layers(scene.panoramas[1], 1, WIDTH), 0)
+
+    assert aligned(clean) == aligned(spoilt)
+    assert aligned(clean).points < aligned(without_masks(clean)).points  # those under the mask are not used
+
+
 def test_training(clean: Scene, spoilt: Scene) -> None:
-    """Both losses, the alignment of depth images and the colours of the sky."""
+    """Both losses and the colours of the sky."""
     assert same(trained(clean), trained(spoilt))
     assert not same(trained(without_masks(clean)), trained(without_masks(spoilt)))
 

@@ -182,6 +182,19 @@ def test_what_is_not_finite_teaches_nothing(broken: float, scene: Scene) -> None
     assert not made._motion.any()
 
 
+def test_a_checkpoint_continues_with_the_same_bytes(scene: Scene) -> None:
+    whole, first, resumed = (poses(scene) for _ in range(3))
+    rng = np.random.default_rng(6)
+    for number in range(5 * VIEWS + 3):
+        if number == 21:
+            resumed.restore(first.tensors())
+        step = number % VIEWS, number + 1, sums_of(rng.normal(size=6))
+        for each in (whole, first if number < 21 else resumed):
+            each.step(*step)
+    assert whole.learnt().tobytes() == resumed.learnt().tobytes()
+    assert all(resumed.tensors()[name].equal(tensor) for name, tensor in whole.tensors().items())
+
+
 def test_when_poses_are_refined(scene: Scene) -> None:
     def chosen(refine: bool | str, residual: float | None) -> bool:
         known = replace(scene, panoramas=tuple(replace(p, residual=residual) for p in scene.panoramas))
