@@ -6,7 +6,6 @@ counts at the end of the file; then orphans, which have lost their parents, and 
 fixture of the whole session calls `accept` when it has started something.
 """
 
-import ctypes
 import os
 import shutil
 import signal
@@ -28,9 +27,7 @@ _MEMORY = Path("/dev/shm")
 _MINE = "PANOLOG_TESTS"  # in the environment of all processes that this one has started
 # Helpers of Python itself; they end with this process.
 _SERVERS = ("multiprocessing.forkserver", "multiprocessing.resource_tracker")
-# Threads of libraries, and that of a lease, which a test abandons as a killed driver does.
-_POOLS = ("fsspecIO", "asyncio_", "AnyIO worker thread", "ray_", "tqdm", "lease")
-_GET_SUBREAPER = 37  # of prctl(2)
+_POOLS = ("fsspecIO", "asyncio_", "AnyIO worker thread", "ray_", "tqdm")  # threads of libraries
 _OF_A_FILE = ("dashboard_",)  # threads that a server of a whole file starts when it is used
 _CACHES = ("pymp-", "torchinductor_", ".ses")  # files of Python, torch and ONNX Runtime
 
@@ -128,10 +125,7 @@ def _when_settled(left: Callable[[], Found]) -> Found:
 def _left(before: _Held) -> Found:
     """What exists now and did not before, but for what libraries keep."""
     found: Found = {}
-    adopts = _adopts()
     for pid in _children(before.processes):
-        if adopts and not _bytes(_PROC / str(pid) / "cmdline"):
-            continue  # a zombie of what a file shares, such as a head of Ray: its fixture reaps it
         if pid not in before.processes and not (_parent(pid) == os.getpid() and _is_server(pid)):
             found[f"process {pid}: {_command(pid)}"] = pid
     found |= _threads(before, but=_POOLS + _OF_A_FILE)
@@ -189,13 +183,6 @@ def _children(but: set[int] | None = None) -> Iterator[int]:
             yield pid
             if but is None or pid not in but or _is_server(pid):
                 waiting.append(pid)
-
-
-def _adopts() -> bool:
-    """Whether processes that have lost their parents become children of this one."""
-    answer = ctypes.c_int(0)
-    ctypes.CDLL(None).prctl(_GET_SUBREAPER, ctypes.byref(answer))
-    return bool(answer.value)
 
 
 def _is_server(pid: int) -> bool:

@@ -3,12 +3,13 @@
 import ctypes
 import os
 import secrets
+import select
 import socket
 import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing import resource_tracker
@@ -19,7 +20,8 @@ import psutil
 import pytest
 
 BIN = Path(sys.executable).parent
-_RECOVERY = Path(__file__).parents[1] / "deploy" / "recovery.env"  # how soon Ray notices a lost process
+_ROOT = Path(__file__).parents[1]
+_RECOVERY = _ROOT / "deploy" / "recovery.env"  # how soon Ray notices a lost process
 _SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER of prctl(2)
 _TIMEOUT_S = 120.0  # for processes to end
 _REPORTS = '{"metrics_report_interval_ms": 500}'
@@ -88,6 +90,30 @@ def all_end() -> Iterator[None]:
         prctl(_SUBREAPER, 0)
 
 
+@contextmanager
+def started(command: Sequence[str | Path], environment: dict[str, str], log: Path) -> Iterator[None]:
+    """A command below a process that reaps all that it leaves behind; with the context all of it ends."""
+    keeper = (sys.executable, "-m", "tests.ray_head", *command)
+    with log.open("w") as said:
+        process = subprocess.Popen(
+            keeper, env=environment, stdin=subprocess.PIPE, stdout=said, stderr=said, cwd=_ROOT
+        )
+        try:
+            yield
+        finally:
+            process.communicate(timeout=2 * _TIMEOUT_S)
+
+
+def _keep() -> None:
+    """Runs the command of this process, and reaps what ends below it, until standard input ends."""
+    with all_end():
+        subprocess.Popen(sys.argv[1:], stdin=subprocess.DEVNULL)
+        while not select.select([sys.stdin], [], [], 0.1)[0]:
+            with suppress(ChildProcessError):
+                while os.waitpid(-1, os.WNOHANG)[0]:
+                    pass
+
+
 def living(word: str, parent: int | None = None) -> list[psutil.Process]:
     """Children of a process, by default of this one, with a word in their command line, but no zombies."""
     found = []
@@ -129,7 +155,10 @@ def ray_head() -> Iterator[Head]:
         command += [f"--dashboard-agent-listen-port={agent}", f"--ray-client-server-port={client}"]
         command += ["--min-worker-port=0", "--max-worker-port=0", "--object-store-memory=80000000"]
         ours = head.environment | {"RAY_AUTH_MODE": "token"}
-        with Path(folder, "start.log").open("w") as log, all_end():
-            subprocess.Popen(command, env=ours, stdout=log, stderr=log)
+        with started(command, ours, Path(folder, "start.log")):
             wait_until(lambda: read(f"{head.address}/api/gcs_healthz"), "the head is up")
             yield head
+
+
+if __name__ == "__main__":
+    _keep()

@@ -1,14 +1,12 @@
 """A Ray cluster whose autoscaler starts and ends nodes on this machine."""
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from tests.ray_head import BIN, all_end, cluster_environment, free_ports
+from tests.ray_head import BIN, cluster_environment, free_ports, started, wait_until
 
 _HEAD = f"{'f' * 51}00000"  # Node.id, by which Ray's provider of local nodes knows the head
 _HEAD_TYPE = "ray.head.default"
@@ -31,14 +29,14 @@ def autoscaled(most: int, idle: float = 5.0) -> Iterator[tuple[str, dict[str, st
     fake = {"RAY_FAKE_CLUSTER": "1", "AUTOSCALER_UPDATE_INTERVAL_S": "1"}
     fake |= {"RAY_CLOUD_INSTANCE_ID": _HEAD, "RAY_OVERRIDE_NODE_ID_FOR_TESTING": _HEAD}
     with TemporaryDirectory(prefix="scaled-", dir="/tmp", ignore_cleanup_errors=True) as folder:
-        config = Path(folder) / "autoscaler.json"
+        config, log = Path(folder, "autoscaler.json"), Path(folder, "start.log")
         config.write_text(json.dumps(_config(address, most, idle)))
-        command = [str(BIN / "ray"), "start", "--head", f"--port={port}", "--node-ip-address=127.0.0.1"]
-        command += ["--num-cpus=0", f"--autoscaling-config={config}", f"--temp-dir={folder}"]
+        command = [str(BIN / "ray"), "start", "--head", "--block", f"--port={port}"]
+        command += ["--node-ip-address=127.0.0.1", "--num-cpus=0", "--include-dashboard=false"]
+        command += [f"--autoscaling-config={config}", f"--temp-dir={folder}"]
         command += ["--min-worker-port=0", "--max-worker-port=0", "--object-store-memory=100000000"]
-        command += ["--include-dashboard=false"]
-        with all_end():
-            subprocess.run(command, env=variables | fake, check=True, stdout=sys.stderr)
+        with started(command, variables | fake, log):
+            wait_until(lambda: "Ray runtime started" in log.read_text(), "the head is up")
             yield address, variables
 
 

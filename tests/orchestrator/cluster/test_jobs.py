@@ -4,22 +4,19 @@ import json
 import os
 import re
 import subprocess
-import threading
 import urllib.request
+from base64 import b64encode
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
-from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app
-from panolog.orchestrator.cluster.jobs import Cluster, ClusterJob
+from panolog.orchestrator.cluster.jobs import RUN_KEY, Cluster, ClusterJob
 from panolog.orchestrator.run import log
 from panolog.orchestrator.run.config import as_settings, load_config
 from panolog.orchestrator.run.folder import RunFolder
@@ -28,35 +25,26 @@ from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
+from tests.orchestrator.cli.program import call, one_line
 from tests.orchestrator.follower.receivers import receiver
-from tests.orchestrator.messages import without_progress
 from tests.ray_head import BIN, Head, free_ports, ray_head, read, wait_until
 
 pytestmark = pytest.mark.system
 
-SMALL: tuple[str, ...] = (
-    "--device",
-    "cpu",
-    "--set",
-    "sky.count=50",
-    "--set",
-    "checkpoint.every=500",
-    "--blocks",
-    "2x1x1",
-)
-SMALL += ("--set", "checkpoint.share=1")
+SMALL = "--device cpu --blocks 2x1x1 --set sky.count=50 --set checkpoint.every=500 --set checkpoint.share=1"
 
 
-@dataclass
-class Ended:
-    """How a command has ended."""
+class Ended(NamedTuple):
+    """How a command has ended in another process; the same names as in typer's `Result`."""
 
-    code: int
+    exit_code: int
     stdout: str
     stderr: str
+    output: str = ""
 
 
 Panolog = Callable[..., Ended]
+invoke = partial(call, "cluster")
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +62,9 @@ def enter(environment: dict[str, str]) -> None:
     os.environ.update(environment)
 
 
-def invoke(*words: object) -> Ended:
-    result = CliRunner().invoke(app.app, ["cluster", *map(str, words)])
-    return Ended(result.exit_code, result.stdout, result.stderr)
+def ended(*words: object) -> Ended:
+    result = invoke(*words)
+    return Ended(result.exit_code, result.stdout, result.stderr, result.output)
 
 
 @pytest.fixture(scope="module")
@@ -84,35 +72,22 @@ def panolog(head: Head) -> Iterator[Panolog]:
     """`panolog cluster …` in a process that has the environment of the head, which Ray reads once."""
     with ProcessPoolExecutor(1, get_context("spawn"), enter, (head.environment,)) as process:
         process.submit(os.getpid).result()  # it begins with the fixture, not within a test
-        yield lambda *words: process.submit(invoke, *words, "--address", head.address).result()
-
-
-def described(head: Head, job: str) -> str:
-    """All that the job server says of a job; requested without a process, which takes a second."""
-    request = urllib.request.Request(
-        f"{head.address}/api/jobs/{job}", headers={"Authorization": f"Bearer {head.token}"}
-    )
-    with urllib.request.urlopen(request, timeout=10) as reply:
-        text: str = reply.read().decode()
-    return text
+        yield lambda *words: process.submit(ended, *words, "--address", head.address).result()
 
 
 def over(head: Head, job: str) -> bool:
-    """Whether the job server says that a job has ended."""
-    return json.loads(described(head, job))["status"] not in ("PENDING", "RUNNING")
+    """Whether the job server says that a job has ended; requested without a process, which takes a second."""
+    request = urllib.request.Request(
+        f"{head.address}/api/jobs/{job}", headers={"Authorization": f"Bearer {head.token}"}
+    )
+    with urllib.request.urlopen(request, timeout=60) as reply:
+        return json.load(reply)["status"] not in ("PENDING", "RUNNING")
 
 
-def shown(ended: Ended) -> Any:
+def shown(ended: Any) -> Any:
     """What it printed as JSON."""
-    assert ended.code == 0, ended.stderr
+    assert ended.exit_code == 0, ended.output
     return json.loads(ended.stdout)
-
-
-def one_line(ended: Ended) -> str:
-    assert (ended.code, ended.stdout) == (2, ""), ended.stderr
-    lines = without_progress(ended.stderr)
-    assert len(lines) == 1, ended.stderr
-    return lines[0]
 
 
 def recorded(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[str]]:
@@ -135,17 +110,13 @@ def state_of(root: Path) -> RunState:
     return replay(read_milestones(database)) if database.exists() else RunState()
 
 
-def starts(root: Path) -> list[int]:
-    """The iterations at which workers have begun."""
-    records = [stored.record for stored in read_records(RunFolder(root).database)]
-    return [record.iteration for record in records if isinstance(record, TaskStarted)]
-
-
 def test_a_run_is_submitted_watched_stopped_and_resumed(
     head: Head, panolog: Panolog, scene: Path, tmp_path: Path
 ) -> None:
     root = tmp_path / "rün"
-    job = shown(panolog("submit", scene, "-o", root, *SMALL, "--iterations", "100000", "--json"))["job"]
+    job = shown(panolog("submit", scene, "-o", root, *SMALL.split(), "--iterations", "100000", "--json"))[
+        "job"
+    ]
     assert job["status"] in ("waiting", "running")
     assert f"job {job['id']} is driving it" in one_line(panolog("resume", root))
 
@@ -169,31 +140,10 @@ def test_a_run_is_submitted_watched_stopped_and_resumed(
     assert coarse.checkpoint and coarse.progress
     assert coarse.checkpoint >= coarse.progress.iteration  # a fresh one
     assert shown(panolog("resume", root, "--json"))["job"]["id"] != job["id"]
-    wait_until(lambda: starts(root) == [0, coarse.checkpoint], "the run continues")
-    shown(panolog("stop", root, "--json"))
-
-
-def test_a_run_to_its_end(head: Head, panolog: Panolog, scene: Path, tmp_path: Path) -> None:
-    root = tmp_path / "run"
-    settings = tmp_path / "settings.yaml"  # of this machine: the head receives its content
-    settings.write_text("iterations: 10\nrefine: false\n")
-    hook = tmp_path / "hook"
-    with receiver() as server:
-        hook.write_text(f"{server.url}/T0PSECRET")
-        hook.chmod(0o600)
-        passing = ("--notify", f"webhook:@{hook}", "--log", "tensorboard")
-        ended = panolog("submit", scene, "-o", root, *SMALL, *passing, "--config", settings)
-        assert re.fullmatch(r"raysubmit_\w+\n", ended.stdout), ended.stderr
-        assert "panolog cluster status" in ended.stderr
-        wait_until(lambda: over(head, ended.stdout.strip()), "the job has ended")
-    assert [(it.path, it.json["type"]) for it in server.received] == [("/T0PSECRET", "run.done")]
-    assert "T0PSECRET" not in described(head, ended.stdout.strip())
-    assert list((root / "tensorboard").rglob("events.out.tfevents.*"))
-    shown = panolog("status", root)
-    assert shown.code == 0, shown.stderr
-    assert shown.stdout.startswith(f"job {ended.stdout.strip()} · done\ndone"), shown.stdout
-    coarse = state_of(root).task(COARSE).progress
-    assert coarse and coarse.iterations == 10
+    wait_until(lambda: state_of(root).status(COARSE) == "running", "the run continues")
+    records = [stored.record for stored in read_records(RunFolder(root).database)]
+    starts = [record.iteration for record in records if isinstance(record, TaskStarted)]
+    assert starts == [0, coarse.checkpoint]
 
 
 @pytest.mark.parametrize(
@@ -207,12 +157,12 @@ def test_a_run_to_its_end(head: Head, panolog: Panolog, scene: Path, tmp_path: P
 )
 def test_no_secret_becomes_a_word_of_a_job(option: str, value: str, line: str) -> None:
     for command in (("submit", "/scene", "-o", "/runs/a"), ("resume", "/runs/a")):
-        said = refused(*command, option, value)
+        said = one_line(invoke(*command, option, value))
         assert line in said
         assert "T0PSECRET" not in said
 
 
-def test_notifications_and_sinks_are_words_of_the_job(
+def test_notifications_sinks_and_settings_are_words_of_the_job(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """References are those of the head: nothing is read here, and they come there as they are."""
@@ -220,73 +170,42 @@ def test_notifications_and_sinks_are_words_of_the_job(
     monkeypatch.setenv("PANOLOG_NOTIFY", "slack:https://hooks.example/T0PSECRET")
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
     (tmp_path / "netrc").write_text("not its format")
+    settings = tmp_path / "settings.yaml"  # of this machine: the head receives its content
+    settings.write_text("iterations: 10\n")
     given = ["--notify", "slack:@/etc/panolog/slack.url", "--notify", "env:TARGETS", "--notify", "@~/more"]
     given += ["--notify", "webhook:https://h.example/hook", "--notify", "mail:smtp://h.example/a@b.c"]
     given += ["--log", "mlflow", "--log", "tensorboard:/curves", "--log", "wandb:place"]
-    for command in (("submit", "/data/town", "-o", "/runs/a"), ("resume", "/runs/a")):
-        ended = CliRunner().invoke(app.app, ["cluster", *command, *given])
-        assert ended.exit_code == 0, ended.output
-        assert list(begun.pop()[-len(given) - 3 : -3]) == given
+    submit = ("submit", "/data/town", "-o", "/runs/a", "--config", settings)
+    for command in (submit, ("resume", "/runs/a")):
+        assert invoke(*command, *given).exit_code == 0
+        words = list(begun.pop())
+        assert words[-len(given) - 3 : -3] == given
+        assert ("iterations=10" in words) == (command == submit)
 
 
-def test_a_job_that_fails_says_why(head: Head, panolog: Panolog, tmp_path: Path) -> None:
-    root = tmp_path / "run"
-    job = shown(panolog("submit", tmp_path / "none", "-o", root, "--json"))["job"]
-    wait_until(lambda: over(head, job["id"]), "the job has failed")
-    failed = shown(panolog("status", root, "--json"))
-    assert failed["status"] == failed["job"]["status"] == "failed"
-    assert (failed["run"], failed["job"]["exit_code"]) == (str(root), 2)
-    assert "none: there is no such folder" in failed["reason"]
-    assert "no job on the cluster" in one_line(panolog("stop", root))
-    assert "is not a run folder" in one_line(panolog("status", tmp_path / "other"))
-
-
-@pytest.mark.parametrize(
-    ("token", "line", "hint"),
-    [("0" * 64, "Invalid authentication token", "~/.ray/auth_token"), ("", "RAY_AUTH_TOKEN_PATH", "")],
-)
-def test_a_wrong_token_and_none(head: Head, tmp_path: Path, token: str, line: str, hint: str) -> None:
+def test_a_wrong_token_is_one_line(head: Head, tmp_path: Path) -> None:
     command = [f"{BIN}/panolog", "cluster", "status", "/run", "--address", head.address]
-    ours = head.environment | {"RAY_AUTH_TOKEN": token, "HOME": str(tmp_path)}
-    ended = subprocess.run(command, check=False, env=ours, capture_output=True, text=True)
-    said = one_line(Ended(ended.returncode, ended.stdout, ended.stderr))
-    assert line in said
-    assert hint in said
-
-
-class _NotRay(BaseHTTPRequestHandler):
-    def do_GET(self) -> None:
-        self.send_response(200)
-        self.end_headers()
-        self.wfile.write(b"<html>")
-
-    def log_message(self, *_: object) -> None:
-        """Says nothing."""
-
-
-def refused(*arguments: object) -> str:
-    """The one line of a command that does not come as far as Ray."""
-    return one_line(invoke(*arguments))
+    ours = head.environment | {"RAY_AUTH_TOKEN": "0" * 64, "HOME": str(tmp_path)}
+    done = subprocess.run(command, check=False, env=ours, capture_output=True, text=True)
+    said = one_line(Ended(done.returncode, done.stdout, done.stderr))
+    assert "Invalid authentication token" in said and "~/.ray/auth_token" in said
 
 
 def test_no_job_server_answers() -> None:
     (port,) = free_ports(1)
-    assert "no job server" in refused("stop", "/run", "--address", f"http://127.0.0.1:{port}")
-    with HTTPServer(("127.0.0.1", 0), _NotRay) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
-        thread.start()
-        address = f"http://127.0.0.1:{server.server_port}"
-        assert "no job server" in refused("status", "/run", "--address", address)
-        server.shutdown()
-        thread.join()
+    assert "no job server" in one_line(invoke("stop", "/run", "--address", f"http://127.0.0.1:{port}"))
+    with receiver() as server:  # another one
+        assert "no job server" in one_line(invoke("status", "/run", "--address", server.url))
 
 
 def test_what_needs_no_server_to_be_refused() -> None:
-    assert "write http://HOST:8265" in refused("status", "/run", "--address", "127.0.0.1:6379")
+    assert "write http://HOST:8265" in one_line(invoke("status", "/run", "--address", "127.0.0.1:6379"))
     for command in (("submit", "/scene", "-o", "runs/a"), ("resume", "runs/a"), ("stop", "runs/a")):
-        assert "runs/a: is on the cluster's head node" in refused(*command)
-    assert "SCENE town" in refused("submit", "town", "-o", "/run")
-    assert "did you mean sky.count?" in refused("submit", "/scene", "-o", "/run", "--set", "sky.cuont=3")
+        assert "runs/a: is on the cluster's head node" in one_line(invoke(*command))
+    assert "SCENE town" in one_line(invoke("submit", "town", "-o", "/run"))
+    assert "did you mean sky.count?" in one_line(
+        invoke("submit", "/scene", "-o", "/run", "--set", "sky.cuont=3")
+    )
 
 
 def test_settings_survive_the_way_to_the_head() -> None:
@@ -301,32 +220,59 @@ def test_a_run_of_panoramas_is_submitted_with_how_its_scene_is_made(monkeypatch:
     begun = recorded(monkeypatch)
     given = ["--trajectory", "/data/walk.tum", "--nadir", "12.0", "--no-static", "--partial"]
     given += ["--depth-model", "/data/m.onnx"]
-    ended = CliRunner().invoke(app.app, ["cluster", "submit", "/data/walk.mp4", "-o", "/runs/a", *given])
-    assert ended.exit_code == 0, ended.output
+    assert invoke("submit", "/data/walk.mp4", "-o", "/runs/a", *given).exit_code == 0
     (words,) = begun
     assert list(words[:5]) == ["panolog", "run", "/data/walk.mp4", "-o", "/runs/a"]
     assert all(word in words for word in given)
-    assert "--trajectory walk.tum: is on the cluster's head node" in refused(
-        "submit", "/data/walk.mp4", "-o", "/runs/a", "--trajectory", "walk.tum"
-    )
+    elsewhere = invoke("submit", "/data/walk.mp4", "-o", "/runs/a", "--trajectory", "walk.tum")
+    assert "--trajectory walk.tum: is on the cluster's head node" in one_line(elsewhere)
+
+
+class Client:
+    """That of a job server which has had one job of /runs/a, and knows what `panolog status` says there."""
+
+    def __init__(self, status: str, message: str = "", said: str = "") -> None:
+        self.submitted: list[dict[str, Any]] = []
+        self._job = SimpleNamespace(
+            **{"submission_id": "job", "status": SimpleNamespace(value=status), "message": message},
+            **{"driver_exit_code": 2, "start_time": 1, "metadata": {RUN_KEY: "/runs/a"}},
+        )
+        self._said = b64encode(said.encode()).decode()
+
+    def list_jobs(self) -> list[object]:
+        return [self._job]
+
+    def submit_job(self, **job: Any) -> str:
+        self.submitted.append(job)
+        return "another"
+
+    def get_job_info(self, _: str) -> object:
+        return self._job
+
+    def get_job_logs(self, _: str) -> str:
+        return f"of Ray\npanolog-output {self._said}\n"
+
+    def delete_job(self, name: str) -> None:
+        assert name == "another"
+
+
+def test_a_job_that_failed_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    message = "Traceback\npanolog: /none: there is no such folder"
+    cluster = Cluster("http://head:8265", Client("FAILED", message, "panolog: is no run"), guarded=True)
+    monkeypatch.setattr("panolog.orchestrator.cluster.jobs.connect", lambda _: cluster)
+    failed, why = shown(invoke("status", "/runs/a", "--json")), "/none: there is no such folder"
+    assert (failed["status"], failed["run"], failed["reason"]) == ("failed", "/runs/a", why)
+    assert failed["job"] == {"id": "job", "status": "failed", "exit_code": 2, "reason": why}
+    assert invoke("status", "/runs/a").stdout == f"job job · failed · {why}\n"
+    assert "no job on the cluster" in one_line(invoke("stop", "/runs/a"))
+    assert "is no run" in one_line(invoke("status", "/runs/other"))
 
 
 @pytest.mark.parametrize("level", [None, "DEBUG"])
 def test_a_job_logs_as_the_command_that_starts_it(monkeypatch: pytest.MonkeyPatch, level: str | None) -> None:
-    submitted: dict[str, Any] = {}
-    info = SimpleNamespace(
-        submission_id="job", status=SimpleNamespace(value="PENDING"), driver_exit_code=None, message=""
-    )
-
-    class Recorder:
-        """The client of a job server."""
-
-        list_jobs = staticmethod(list[object])
-        submit_job = staticmethod(lambda **job: submitted.update(job) or "job")
-        get_job_info = staticmethod(lambda _: info)
-
     monkeypatch.delenv(log.VARIABLE, raising=False)
     if level:
         monkeypatch.setenv(log.VARIABLE, level)
-    Cluster("http://head:8265", Recorder(), guarded=True).begin("/runs/a", ["panolog", "run"])
-    assert submitted["runtime_env"]["env_vars"].get(log.VARIABLE) == level
+    client = Client("SUCCEEDED")
+    assert Cluster("http://head:8265", client, guarded=True).begin("/runs/a", ["panolog", "run"]).over
+    assert client.submitted[0]["runtime_env"]["env_vars"].get(log.VARIABLE) == level

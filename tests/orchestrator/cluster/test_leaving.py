@@ -22,7 +22,7 @@ from panolog.scene.errors import ClusterError
 from panolog.workers.events import Checkpoint
 from tests.metadata_service import Metadata, metadata
 from tests.orchestrator.scripted import TASK, Works
-from tests.ray_head import all_end, wait_until
+from tests.ray_head import wait_until
 
 pytestmark = pytest.mark.system
 
@@ -61,15 +61,14 @@ class Spot:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
     """A head without cores, which this process is connected to."""
-    with all_end():
-        head = {"num_cpus": 0, "include_dashboard": False}
-        found = Cluster(initialize_head=True, head_node_args=head)
-        try:
-            ray.init(address=found.address, log_to_driver=False)
-            yield found
-        finally:
-            ray.shutdown()
-            found.shutdown()  # type: ignore[no-untyped-call]
+    head = {"num_cpus": 0, "include_dashboard": False}
+    found = Cluster(initialize_head=True, head_node_args=head)
+    try:
+        ray.init(address=found.address, log_to_driver=False)
+        yield found
+    finally:
+        ray.shutdown()
+        found.shutdown()  # type: ignore[no-untyped-call]
     shutil.rmtree(Path(tempfile.gettempdir(), "ray"), ignore_errors=True)
 
 
