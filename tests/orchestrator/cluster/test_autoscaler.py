@@ -1,8 +1,6 @@
-"""Ray's own autoscaler: what it can start, and a whole run on a cluster that begins without a machine."""
+"""Ray's own autoscaler: what it can start, and machines that come and go."""
 
 import json
-import os
-import subprocess
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -18,12 +16,7 @@ from panolog.orchestrator.cluster import autoscaler
 from panolog.orchestrator.cluster.autoscaler import groups_of, read_config
 from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.resources.scaling import Group, Growth
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import TaskFailed
-from panolog.orchestrator.run.store import read_records
-from panolog.synthetic.make import make_town
 from tests.orchestrator.cluster.autoscaled import autoscaled
-from tests.ray_head import BIN
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 
@@ -125,25 +118,3 @@ def test_machines_come_as_requested_and_go_when_they_are_idle(
         f"0 of {Growth((Group('small', 2, 1),))}",
         *("2 nodes, 2 of the group", "0 nodes, 0 of the group"),
     ]
-
-
-@pytest.mark.system
-@pytest.mark.nightly  # the driver's part is proven with fakes: driver/machines/test_growth.py
-def test_a_run_begins_without_a_machine(cluster: tuple[str, dict[str, str]], tmp_path: Path) -> None:
-    """With the same bytes as on this machine."""
-    (address, variables), town, root = cluster, tmp_path / "town", tmp_path / "run"
-    make_town(town, panoramas=12, width=64, points=300)
-    settings = ["--blocks", "2x1x1", "--iterations", "60", "--width", "64", "--device", "cpu"]
-    settings += ["--set", "sky.count=100", "--set", "deliver=false", "--set", "passes.repair=0"]
-    command = [str(BIN / "panolog"), "run", str(town), *settings, "-o"]
-    env = os.environ | variables
-    done = subprocess.run(
-        [*command, str(root), "--address", address], env=env, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    records = [stored.record for stored in read_records(RunFolder(root).database)]
-    assert json.loads((root / "preflight.json").read_text())["basis"]["joined"] > 0
-    assert not [record for record in records if isinstance(record, TaskFailed) and record.final]
-    alone = tmp_path / "alone"
-    subprocess.run([*command, str(alone)], check=True, capture_output=True)
-    assert (root / "point_cloud.ply").read_bytes() == (alone / "point_cloud.ply").read_bytes()

@@ -1,4 +1,4 @@
-"""A run of one machine leaves nothing of Ray behind, however its driver ends."""
+"""A run of one machine leaves nothing of Ray behind, however its driver ends; what Ray raises is one line."""
 
 import os
 import signal
@@ -8,9 +8,11 @@ from pathlib import Path
 
 import psutil
 import pytest
+from ray.exceptions import RaySystemError
 
 from panolog.orchestrator.cluster.connection import connect
-from panolog.scene.errors import ConfigError
+from panolog.orchestrator.cluster.failures import reported
+from panolog.scene.errors import ClusterLostError, ConfigError
 from tests.ray_head import wait_until
 
 pytestmark = pytest.mark.system
@@ -34,19 +36,14 @@ with connect(None, Path(sys.argv[1]), nice=eval(sys.argv[2])):
 
 
 @pytest.mark.parametrize(
-    ("end", "code", "variables", "nice", "nicer"),
-    [
-        ("of itself", 0, {}, None, 0),  # workers have the priority of the driver
-        ("killed", -9, {"RAY_worker_niceness": "2"}, None, 2),
-        ("terminal", -2, {"RAY_worker_niceness": "2"}, 3, 3),
-    ],
+    ("end", "nice", "nicer"),
+    [(signal.SIGKILL, None, 2), (signal.SIGINT, 3, 3)],  # SIGINT: as of a terminal
 )
 def test_nothing_is_left_and_workers_have_the_priority_that_is_wanted(
-    tmp_path: Path, end: str, code: int, variables: dict[str, str], nice: int | None, nicer: int
+    tmp_path: Path, end: signal.Signals, nice: int | None, nicer: int
 ) -> None:
     command = [sys.executable, "-c", DRIVER, str(tmp_path), repr(nice)]
-    ours = {name: value for name, value in os.environ.items() if name != "RAY_worker_niceness"} | variables
-    pipe = subprocess.PIPE
+    ours, pipe = os.environ | {"RAY_worker_niceness": "2"}, subprocess.PIPE
     driver = subprocess.Popen(command, env=ours, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
     assert driver.stdout
     said, folder = driver.stdout.readline().split()
@@ -56,12 +53,12 @@ def test_nothing_is_left_and_workers_have_the_priority_that_is_wanted(
     assert len(others) > 6  # Ray's own, its agents, a worker, and the cleaner
     shared = {m.path for p in others for m in p.memory_maps() if m.path.startswith("/dev/shm/")}
     assert shared  # the object store
-    if end == "killed":
+    if end == signal.SIGKILL:
         driver.kill()
-    elif end == "terminal":
-        os.killpg(driver.pid, signal.SIGINT)
+    else:
+        os.killpg(driver.pid, end)
     driver.communicate()
-    assert driver.returncode == code
+    assert driver.returncode == -end
     _, alive = psutil.wait_procs(others, timeout=120)
     assert not alive
     wait_until(lambda: not Path(folder).exists(), "the folder of Ray is removed")
@@ -77,3 +74,12 @@ def test_a_priority_that_is_no_number_is_one_line(tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("RAY_worker_niceness", "low")
     with pytest.raises(ConfigError, match=r"^RAY_worker_niceness=low: give a number from 0 to 19"):
         connect(None, tmp_path).__enter__()
+
+
+def test_a_failure_of_ray_is_a_lost_cluster() -> None:
+    @reported
+    def fails() -> None:
+        raise RaySystemError("Ray has not been started yet.")  # type: ignore[no-untyped-call]
+
+    with pytest.raises(ClusterLostError, match=r"^Ray: System error: Ray has not been started yet\.$"):
+        fails()

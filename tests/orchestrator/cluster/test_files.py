@@ -17,6 +17,9 @@ from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.files import FileSharing, NodeFiles, RayValue, Stamp, run_remotely
 from panolog.orchestrator.resources.usage import Usage
 from panolog.scene.errors import RunError
+from panolog.scene.stores.cache import Stored
+from panolog.scene.stores.outline import stored_of
+from panolog.scene.stores.store import Version
 from panolog.workers.events import Checkpoint, Event, Preview, Progress, Transfer
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.scripted import Scripted
@@ -131,19 +134,6 @@ def test_a_large_file_comes_in_pieces(share: Share, image: Path, monkeypatch: py
     assert node_files.received_bytes() == len(CONTENT)
 
 
-def test_a_file_of_the_run_that_was_replaced_is_another_file(sharing: FileSharing, tmp_path: Path) -> None:
-    path = tmp_path / "checkpoint.safetensors"
-    path.write_bytes(b"old")
-    first = sharing.share_files([], [path])
-    path.write_bytes(b"new")
-    os.utime(path, ns=(1, 1))
-    second = sharing.share_files([], [path])
-    assert first.stamps != second.stamps
-    assert second(path) == path
-    with pytest.raises(RunError, match="has changed"):
-        first(path)
-
-
 def test_a_file_that_has_changed_or_gone_is_refused(share: Share, image: Path) -> None:
     files = share(image)
     image.write_bytes(b"shorter")
@@ -156,18 +146,27 @@ def test_a_file_that_has_changed_or_gone_is_refused(share: Share, image: Path) -
         share(image)
 
 
-def test_the_file_server_may_die(share: Share, image: Path) -> None:
-    files = share(image)
-    ray.kill(files.server, no_restart=False)
-    assert files(image).read_bytes() == CONTENT
-
-
-def test_a_file_server_that_hangs_is_ended(share: Share, sharing: FileSharing, image: Path) -> None:
+def test_a_file_server_that_hangs_is_ended_and_another_one_serves(
+    share: Share, sharing: FileSharing, image: Path
+) -> None:
     files = share(image)
     ray.get(files.server.answer.remote())
     os.kill(int(sharing._process.read_text()), signal.SIGSTOP)
     sharing.check()
     assert files(image).read_bytes() == CONTENT
+
+
+def test_a_file_of_a_scene_in_a_store_is_left_to_the_machine_itself(
+    sharing: FileSharing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "outline" / "a.jpg"
+    stored = Stored("s3://places/town", "images/a.jpg", Version(9, "tag", 0.0))
+    with monkeypatch.context() as patch:
+        patch.setattr(node_files, "stored_of", lambda _: stored)
+        files = sharing.share_files([path], [])
+    assert stored_of(path) is None  # as on another machine
+    assert files(path) == path
+    assert stored_of(path) == stored
 
 
 def test_a_value_that_the_machine_has_does_not_travel(sharing: FileSharing) -> None:

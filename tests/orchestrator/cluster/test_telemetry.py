@@ -71,17 +71,14 @@ class Fake:
     """A gauge or counter that remembers, and is as strict as Ray's."""
 
     def __init__(self, name: str, description: str, tag_keys: tuple[str, ...]) -> None:
-        assert description
-        assert tag_keys == TAGS
+        assert description and tag_keys == TAGS
         self.calls: list[tuple[tuple[str, ...], float]] = []
 
     def set(self, value: float, tags: dict[str, str]) -> None:
-        assert all(tag.isascii() for tag in tags.values())
+        assert value > 0 and all(tag.isascii() for tag in tags.values())
         self.calls.append((tuple(tags[key] for key in TAGS), value))
 
-    def inc(self, value: float, tags: dict[str, str]) -> None:
-        assert value > 0
-        self.set(value, tags)
+    inc = set
 
 
 def test_gauges_are_told_again_and_counters_once(monkeypatch: pytest.MonkeyPatch) -> None:
