@@ -8,15 +8,10 @@ from collections.abc import Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import cv2
-import numpy as np
 import psutil
 import pytest
-from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app
 from panolog.orchestrator.cluster import connection
 from panolog.orchestrator.commands import session
 from panolog.orchestrator.driver.local_pool import LocalPool, local_pool
@@ -36,6 +31,7 @@ from panolog.synthetic.make import make_town
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from tests.examples.test_examples import example
+from tests.orchestrator.cli.program import call, shown
 
 pytestmark = pytest.mark.system
 
@@ -101,10 +97,6 @@ session.Driver = driver
 app.main()
 """
 Accident = tuple[str, str, str, int]
-IN_STAGE_ONE: list[Accident] = [
-    ("CheckpointSaved", "coarse", "worker", 9),
-    ("CheckpointSaved", "coarse", "driver", 9),
-]
 OF_WORKERS: list[Accident] = [
     ("CheckpointSaved", "coarse", "worker", 9),
     ("CheckpointSaved", "block/000", "worker", 9),
@@ -229,7 +221,7 @@ def test_a_limit_delivers_what_there_is_and_without_it_the_bytes_are_the_same(
 def resumed(root: Path, *limit: object) -> str:
     """What a driver says until its end. Args: limit, of cost, unless it stays as it is."""
     words = [str(word) for it in limit for word in ("--max-cost", it)]
-    result = CliRunner().invoke(app.app, ["resume", str(root), *words])
+    result = call("resume", root, *words)
     assert result.exit_code == 0, result.output
     return result.stderr
 
@@ -249,17 +241,12 @@ def test_a_run_in_a_store_goes_on_in_an_empty_folder(
     monkeypatch.setenv("PANOLOG_STORE_CACHE", str(tmp_path / "cache"))
     calm, run = runs[0], f"file://{tmp_path}/store"
     first, second = tmp_path / "first", tmp_path / "second"
-    for words, pool, code in (
-        (
-            ["run", (calm.parent / "town").as_uri(), "-o", run, "--local", first, *SETTINGS],
-            Interrupted(),
-            130,
-        ),
-        (["resume", run, "--local", second], LocalPool(), 0),
-    ):
+    begin = ["run", (calm.parent / "town").as_uri(), "-o", run, "--local", first, *SETTINGS]
+    resume = ["resume", run, "--local", second]
+    for words, pool, code in ((begin, Interrupted(), 130), (resume, LocalPool(), 0)):
         with closing(pool):
             monkeypatch.setattr(connection, "connect", lambda *_, pool=pool: nullcontext(pool))
-            ended = CliRunner().invoke(app.app, list(map(str, words)))
+            ended = call(*words)
         assert ended.exit_code == code, ended.output
         shutil.rmtree(first, ignore_errors=True)
     records = [stored.record for stored in read_records(RunFolder(second).database)]
@@ -274,33 +261,22 @@ def test_a_run_in_a_store_goes_on_in_an_empty_folder(
     assert set(store.list(f"{OBJECTS}/coarse/model.ply")) == {manifest.files["coarse/model.ply"].key}
 
 
-def call(*arguments: object) -> Any:
-    """What a command prints as JSON."""
-    result = CliRunner().invoke(app.app, [str(argument) for argument in (*arguments, "--json")])
-    assert result.exit_code == 0, result.output
-    return json.loads(result.stdout)
-
-
-def size(path: Path) -> tuple[int, ...]:
-    return np.asarray(cv2.imread(str(path))).shape
-
-
 def test_eval_reads_what_is_known_and_measures_what_is_not(runs: tuple[Path, Ended, Path]) -> None:
     root, _, _ = runs
     stored = json.loads(RunFolder(root).metrics.read_text())
-    assert call("eval", root) == stored
+    assert shown("eval", root) == stored
     assert set(stored["views"]) == {"street_000.png", "street_008.png"}
-    cropped = call("eval", root, "--crop-bottom", "0.25")
+    cropped = shown("eval", root, "--crop-bottom", "0.25")
     assert cropped["mean"]["psnr"] != stored["mean"]["psnr"]
-    coarse = call("eval", root, "--model", root / "coarse/model.ply")
+    coarse = shown("eval", root, "--model", root / "coarse/model.ply")
     assert coarse["gaussians"] == ply_header(root / "coarse/model.ply")[0]
     assert json.loads(RunFolder(root).metrics.read_text()) == stored
     seams = RunFolder(root).seams.read_bytes()
-    assert call("eval", root, "--seams") == stored | {"seams": json.loads(seams)}
+    assert shown("eval", root, "--seams") == stored | {"seams": json.loads(seams)}
     RunFolder(root).metrics.unlink()
-    assert call("eval", root)["mean"] == pytest.approx(stored["mean"])
+    assert shown("eval", root)["mean"] == pytest.approx(stored["mean"])
     RunFolder(root).seams.unlink()
-    assert call("eval", root, "--seams")["seams"] == json.loads(seams)
+    assert shown("eval", root, "--seams")["seams"] == json.loads(seams)
     assert RunFolder(root).seams.read_bytes() == seams
     assert RunFolder(root).metrics.exists()
 
@@ -309,44 +285,19 @@ def test_a_plan_can_be_tried_without_training(runs: tuple[Path, Ended, Path], tm
     root, _, _ = runs
     before = RunFolder(root).plan.read_bytes()
     plan = json.loads(before)
-    assert call("partition", root) == plan
-    position_only = call("partition", root, "--tau", "1")
+    assert shown("partition", root) == plan
+    position_only = shown("partition", root, "--tau", "1")
     assert all(set(camera["assigned"]) == {str(camera["block"])} for camera in position_only["cameras"])
-    other = call("partition", root, "--blocks", "1x3x1", "--rho", "2", "-o", tmp_path / "what-if")
+    other = shown("partition", root, "--blocks", "1x3x1", "--rho", "2", "-o", tmp_path / "what-if")
     assert (other["grid"], other["rho_tri"], len(other["blocks"])) == ([1, 3, 1], 2, 3)
     assert {path.name for path in (tmp_path / "what-if/partition").iterdir()} == {
         "plan.json",
         "plan.png",
         "scores.npz",
     }
-    again = call("partition", root, "--blocks", "2x1x1", "--rho", "5", "--tau", str(plan["tau_grad"]))
+    again = shown("partition", root, "--blocks", "2x1x1", "--rho", "5", "--tau", str(plan["tau_grad"]))
     assert again == plan
     assert RunFolder(root).plan.read_bytes() == before
-
-
-def test_pictures_of_a_run_and_of_a_ply(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
-    root, _, _ = runs
-    result = CliRunner().invoke(app.app, ["render", str(root), "-o", str(tmp_path / "tour"), "--path", "3"])
-    assert result.exit_code == 0, result.output
-    frames = sorted((tmp_path / "tour").iterdir())
-    assert [size(frame) for frame in frames] == [(32, 64, 3)] * 3
-    poses = tmp_path / "poses.json"
-    poses.write_text(json.dumps([{"name": "a", "camera_to_world": np.eye(4).tolist()}]))
-    options = ["--poses", str(poses), "--fov", "90", "--size", "40x30"]
-    ply = str(root / "point_cloud.ply")
-    result = CliRunner().invoke(app.app, ["render", ply, "-o", str(tmp_path / "views"), *options])
-    assert result.exit_code == 0, result.output
-    assert size(tmp_path / "views/a.png") == (30, 40, 3)
-
-
-def test_a_finished_run_stays_finished(runs: tuple[Path, Ended, Path]) -> None:
-    root, _, _ = runs
-    assert call("status", root)["status"] == "done"
-    history = len(read_records(RunFolder(root).database))
-    result = CliRunner().invoke(app.app, ["resume", str(root)])
-    assert result.exit_code == 0
-    assert str(RunFolder(root).point_cloud) in result.stderr
-    assert len(read_records(RunFolder(root).database)) == history
 
 
 def test_the_example_without_ray_ends_with_the_same_bytes(
