@@ -46,7 +46,7 @@ def receiver(answers: Sequence[int] = (), *, hangs: bool = False) -> Iterator[Re
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
-            body = self.rfile.read(int(self.headers["Content-Length"]))
+            body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
             made.received.append(
                 Received(self.path, {name.lower(): value for name, value in self.headers.items()}, body)
             )
@@ -57,6 +57,8 @@ def receiver(answers: Sequence[int] = (), *, hangs: bool = False) -> Iterator[Re
                 self.send_header("Location", f"{made.url}/elsewhere")
             self.send_header("Content-Length", "0")
             self.end_headers()
+
+        do_GET = do_POST  # noqa: N815
 
         def log_message(self, *_: object) -> None:
             pass

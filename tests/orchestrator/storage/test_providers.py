@@ -1,12 +1,9 @@
 """Stores of each provider's protocol: what our code relies on holds in all of them."""
 
-import json
 import os
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +15,7 @@ from panolog.orchestrator.storage.lease import holder
 from panolog.scene.errors import StoreError
 from panolog.scene.stores.store import open_store
 from tests.cloud_stores import PROTOCOLS, SECRET, CloudStore, cloud_store
+from tests.orchestrator.follower.receivers import receiver
 from tests.orchestrator.storage.stored_runs import Driver, fetched, mirror_of, rounds
 
 pytestmark = pytest.mark.system
@@ -156,33 +154,10 @@ def test_credentials_that_azure_refuses_are_the_users_at_once(
 def test_an_answer_of_google_that_refuses_access_is_the_users_at_once(
     server: CloudStore, status: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    with refusing(status) as port:
-        monkeypatch.setenv("STORAGE_EMULATOR_HOST", f"http://127.0.0.1:{port}")
+    with receiver([status] * 9) as google:
+        monkeypatch.setenv("STORAGE_EMULATOR_HOST", google.url)
         GCSFileSystem.clear_instance_cache()
         with pytest.raises(StoreError, match=r"no access .*; set the provider's credentials"):
             open_store(server.url("refused")).list()
         GCSFileSystem.clear_instance_cache()
     assert capfd.readouterr().err == ""
-
-
-@contextmanager
-def refusing(status: int) -> Iterator[int]:
-    """A server that answers as Google does without a permission; its port."""
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            answer = json.dumps({"error": {"code": status, "message": "caller has no access"}}).encode()
-            self.send_response(status)
-            self.send_header("Content-Length", str(len(answer)))
-            self.end_headers()
-            self.wfile.write(answer)
-
-        def log_message(self, *_: Any) -> None:
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as found:
-        thread = threading.Thread(target=found.serve_forever, args=(0.05,))
-        thread.start()
-        yield found.server_port
-        found.shutdown()
-        thread.join()
