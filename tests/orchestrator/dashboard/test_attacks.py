@@ -285,8 +285,8 @@ def test_streams_that_are_not_read(tmp_path: Path) -> None:
         for _ in range(100):  # more than any pool of threads has
             deaf = stack.enter_context(socket.create_connection((host, int(port))))
             deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
-            deaf.sendall(f"GET /api/stream?run={id} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
-        with streaming(served, f"?run={id}") as messages:
+            deaf.sendall(f"GET /api/stream?run={id}&changes=1 HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        with streaming(served, f"?run={id}&changes=1") as messages:
             next(messages)
             for iteration in range(41, 44):
                 append(folder, progressed(TaskId.block(0), iteration))

@@ -60,16 +60,25 @@ def test_small_changes_are_small(tmp_path: Path) -> None:
         assert until(messages, "run")["summary"]["model"] is None
 
 
-def test_a_run_can_vanish_and_come_back(tmp_path: Path) -> None:
+def test_a_run_can_vanish_and_come_back_with_and_without_clients(tmp_path: Path) -> None:
     write_whole_run(tmp_path / "run")
-    with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}") as messages:
-        until(messages, "run")
+    with serving(tmp_path) as served:
         id = served.id("run")
-        (tmp_path / "run").rename(tmp_path / "moved")
-        assert "run: " in until(messages, "gone")["error"]
-        assert served.errors(f"/api/runs/{id}", 404)
-        write_run(tmp_path / "run", [Noticed(None, "another")])
-        assert until(messages, "run")["summary"]["notices"][0]["message"] == "another"
+        with streaming(served, f"?run={id}") as messages:
+            until(messages, "run")
+            (tmp_path / "run").rename(tmp_path / "moved")
+            assert "run: " in until(messages, "gone")["error"]
+            assert served.errors(f"/api/runs/{id}", 404)
+            write_run(tmp_path / "run", [Noticed(None, "another")])
+            while not (notices := until(messages, "run")["summary"]["notices"]):
+                pass  # it was read before its first record
+            assert notices[0]["message"] == "another"
+        (tmp_path / "run").rename(tmp_path / "again")
+        while any(row["name"] == "run" for row in served.get("/api/runs")["runs"]):
+            pass
+        write_run(tmp_path / "run")
+        while served.client.get(f"/api/runs/{id}").status_code == 404:
+            pass
 
 
 def test_a_damaged_run_says_so_and_harms_no_other(tmp_path: Path) -> None:
