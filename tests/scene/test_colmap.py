@@ -42,20 +42,34 @@ def as_sphere(folder: Path) -> None:
     (folder / "cameras.bin").write_bytes(camera)
 
 
-def as_sphere_text(folder: Path) -> None:
-    as_text(folder)
-    W = WIDTH
-    (folder / "cameras.txt").write_text(f"# SphereSfM\n1 SPHERE {W} {W // 2} 1 {W // 2} {W // 4}\n")
+def set_lines(name: str, text: str) -> Callable[[Path], None]:
+    """The model as text, with other lines in one of its files."""
+
+    def change(folder: Path) -> None:
+        as_text(folder)
+        (folder / name).write_text(text + "\n")
+
+    return change
 
 
-def as_dummy_pinhole(folder: Path) -> None:
-    as_text(folder)
-    W, H = WIDTH, WIDTH // 2
-    (folder / "cameras.txt").write_text(f"1 PINHOLE {W} {H} {W} {H} {W // 2} {H // 2}\n")
+def set_camera(line: str) -> Callable[[Path], None]:
+    return set_lines("cameras.txt", line)
+
+
+def set_image(text: str) -> Callable[[Path], None]:
+    return set_lines("images.txt", text)
 
 
 @pytest.mark.parametrize(
-    "change", [lambda _: None, as_text, without_rigs, as_sphere, as_sphere_text, as_dummy_pinhole]
+    "change",
+    [
+        lambda _: None,
+        as_text,
+        without_rigs,
+        as_sphere,
+        set_camera("# SphereSfM\n1 SPHERE 64 32 1 32 16"),
+        set_camera("1 PINHOLE 64 32 64 32 32 16"),
+    ],
 )
 def test_every_form_of_a_model_is_what_colmap_reads(folder: Path, change: Callable[[Path], None]) -> None:
     reconstruction = pycolmap.Reconstruction(str(folder))
@@ -126,22 +140,6 @@ def patch(folder: Path, name: str, at: int, data: bytes) -> None:
     content = bytearray((folder / name).read_bytes())
     content[at : at + len(data)] = data
     (folder / name).write_bytes(content)
-
-
-def set_lines(name: str, text: str) -> Callable[[Path], None]:
-    def change(folder: Path) -> None:
-        as_text(folder)
-        (folder / name).write_text(text + "\n")
-
-    return change
-
-
-def set_camera(line: str) -> Callable[[Path], None]:
-    return set_lines("cameras.txt", line)
-
-
-def set_image(text: str) -> Callable[[Path], None]:
-    return set_lines("images.txt", text)
 
 
 def append(folder: Path, name: str, text: str) -> None:
