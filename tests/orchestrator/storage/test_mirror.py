@@ -16,6 +16,7 @@ from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.storage import lease as leases
 from panolog.orchestrator.storage.fetch import bring, for_status, viewed
 from panolog.orchestrator.storage.layout import (
+    LEASES,
     MANIFESTS,
     OBJECTS,
     POINTERS,
@@ -34,6 +35,7 @@ from panolog.scene.stores.store import Store, open_store
 from panolog.workers.tasks import COARSE
 from tests.object_store import ObjectStore, object_store
 from tests.orchestrator.storage.stored_runs import Driver, Watched, fetched, mirror_of, rounds
+from tests.ray_head import wait_until
 
 
 def test_the_store_is_whole_after_every_change(tmp_path: Path) -> None:
@@ -219,9 +221,16 @@ def test_a_mirror_that_was_killed_after_its_pointer_leaves_a_folder_that_is_kept
     assert driver.folder.info.exists()
 
 
-def test_a_lease_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lease_is_written_again_until_it_ends_and_then_expires(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(leases, "_REFRESH_S", 0.01)
     store = open_store(f"file://{tmp_path}/store")
-    take(store, tmp_path / "elsewhere", force=False)
+    lease = take(store, tmp_path / "elsewhere", force=False)
+    (name,) = store.list(LEASES)
+    first = store.read(name)
+    wait_until(lambda: store.read(name) != first, "it is written again")
+    lease.end()
     monkeypatch.setattr(leases, "EXPIRES_S", 0.0)
     take(store, tmp_path / "elsewhere", force=False)
 
