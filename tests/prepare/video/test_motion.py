@@ -96,14 +96,12 @@ def test_flashes_and_black_frames_are_left_out() -> None:
 
 
 def test_sharpness_is_that_of_the_picture_not_of_its_exposure_or_orientation() -> None:
-    grey = [
-        np.asarray(cv2.cvtColor(render(shot, bearer=False), cv2.COLOR_BGR2GRAY), np.uint8)
-        for shot in (Shot(0.0), Shot(0.0, (70.0, 0.0, 0.0)), Shot(0.0, blur=1.5))
-    ]
-    here, turned, blurred = map(sharpness, grey)
+    shots = (Shot(0.0), Shot(0.0, (70.0, 0.0, 0.0)), Shot(0.0, blur=1.5))
+    pictures = [grey(render(shot, bearer=False)) for shot in shots]
+    here, turned, blurred = map(sharpness, pictures)
     assert turned == pytest.approx(here, rel=0.1)
     assert blurred < 0.5 * here
-    assert sharpness(np.asarray(grey[0] // 2, np.uint8)) == pytest.approx(here, rel=0.1)
+    assert sharpness(np.asarray(pictures[0] // 2, np.uint8)) == pytest.approx(here, rel=0.1)
     assert sharpness(np.zeros((HEIGHT, WIDTH), np.uint8)) == 0
 
 
