@@ -42,7 +42,9 @@ def test_long_work_without_a_terminal_prints_lines(
     with console.progress_bar("reading the scene") as show:
         assert spoken.wait(120)  # no call of `show` is needed
         show("masks", 1, 1_200)
+        monkeypatch.setattr(console, "_FIRST", -1.0)  # a step that ends later than that says so
         show("masks", 1_200, 1_200)
+    assert said[-1] == "masks: 1,200 of 1,200"
     assert re.fullmatch(r"reading the scene: \d+ s", said[0])
 
 
