@@ -34,17 +34,6 @@ def until(messages: Iterator[tuple[str, Any]], event: str) -> Any:
     return next(content for kind, content in messages if kind == event)
 
 
-def test_the_first_message_is_everything(tmp_path: Path) -> None:
-    write_whole_run(tmp_path / "run")
-    with serving(tmp_path) as served:
-        with streaming(served) as messages:
-            assert until(messages, "runs")["runs"][0]["name"] == "run"
-        with streaming(served, f"?run={served.id('run')}") as messages:
-            page = until(messages, "run")
-        now = served.get(f"/api/runs/{served.id('run')}")
-    assert page == now
-
-
 def test_small_changes_are_small(tmp_path: Path) -> None:
     folder = write_whole_run(tmp_path / "run")
     with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}&changes=1") as messages:

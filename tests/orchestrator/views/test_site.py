@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from panolog.export.site.page import Page
 from panolog.orchestrator.run.folder import RunFolder, model_of, write_json
 from panolog.orchestrator.views.site import build
-from panolog.orchestrator.views.site.build import Wanted, site_of_file, site_of_run, write_file, write_folder
+from panolog.orchestrator.views.site.build import Wanted, site_of_file, site_of_run, write_folder
 from panolog.orchestrator.views.site.photographs import panorama_rotations, photograph
 from panolog.orchestrator.views.site.viewpoints import read_viewpoints
 from panolog.scene.errors import InputError, RunError
@@ -162,19 +161,6 @@ def test_a_large_model_is_streamed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert json.loads((tmp_path / "web" / page["model"]).read_text())["lodLevels"] >= 1
     write_folder(site_of_file(tmp_path / "model.ply", Wanted(most=100)), tmp_path / "web")
     assert written(tmp_path / "web")["model"] == "model.sog"
-
-
-def test_a_sog_is_shown_as_it_is(tmp_path: Path) -> None:
-    write_ply(tmp_path / "model.ply", some(20))
-    write_folder(site_of_file(tmp_path / "model.ply", Wanted()), tmp_path / "web")
-    made = tmp_path / "my model.sog"
-    made.write_bytes((tmp_path / "web" / "model.sog").read_bytes())
-    shown = site_of_file(made, Wanted())
-    assert shown.page == Page("my model")
-    write_folder(shown, tmp_path / "again")
-    assert (tmp_path / "again" / "model.sog").read_bytes() == made.read_bytes()
-    write_file(shown, tmp_path / "page.html")
-    assert "<title>my model</title>" in (tmp_path / "page.html").read_text()
 
 
 def test_what_is_no_model_or_has_no_gaussians(tmp_path: Path) -> None:
