@@ -15,4 +15,4 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 @pytest.fixture(autouse=True)
 def _no_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
     """Evaluations are the same whether it is installed or not."""
-    monkeypatch.setattr("panolog.workers.evaluation.load_lpips", lambda _: (None, "no lpips here"))
+    monkeypatch.setattr("panolog.workers.evaluation.load_lpips", lambda _: (None, None))

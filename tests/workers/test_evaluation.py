@@ -18,8 +18,8 @@ from tests.workers.small import HEIGHT, WIDTH, small_scene
 from tests.workers.trainings import evaluation_of, threads
 
 
-def test_each_view_has_its_metrics_and_its_render(tmp_path: Path) -> None:
-    scene = small_scene(tmp_path)
+def test_each_view_has_its_metrics_and_its_render(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.workers.evaluation.load_lpips", lambda _: (None, "no lpips here"))
     events = list(evaluate(evaluation_of(scene, scene_gaussians(scene), (4, 0))))
     assert [type(event) for event in events] == [LpipsMissing, Evaluated, Progress, Evaluated, Progress]
     assert events[0] == LpipsMissing(EVAL, "no lpips here")
@@ -77,7 +77,7 @@ def test_a_pose_that_errs_is_fitted_and_measured_beside_its_own(tmp_path: Path) 
     before, after = psnrs(event)
     assert after > before + 8
     assert event.pose_fit is not None and event.pose_fit["pixels"] == pytest.approx(2.1, abs=0.6)
-    plain = list(evaluate(evaluation_of(scene, model)))[1]
+    plain = next(evaluate(evaluation_of(scene, model)))
     assert isinstance(plain, Evaluated)
     assert (plain.metrics, plain.png, plain.pose_fit) == (event.metrics, event.png, None)
 
