@@ -1,10 +1,8 @@
 """A run on three hosts that share nothing, and one of them loses its network in the middle of a block."""
 
-import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -26,21 +24,16 @@ from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, Stage, TaskId
+from tests.orchestrator.cli.program import shown
 from tests.orchestrator.cluster.hosts import Hosts, NoHostsError
-from tests.ray_head import BIN, cluster_environment, environment, wait_until
+from tests.ray_head import BIN, cluster_environment, wait_until
 
 pytestmark = pytest.mark.system
 
 HEAD, ADDRESS = "10.77.0.1", "10.77.0.1:6379"
 WORKERS = {"one": "10.77.0.2", "two": "10.77.0.3"}
-SETS: tuple[str, ...] = (
-    "sky.count=100",
-    "checkpoint.every=5",
-    "checkpoint.share=1",
-    "densify.start=10",
-    "iterations=20",
-)
-SETS += ("device=cpu", "densify.every_floor=5")
+SETS: tuple[str, ...] = ("iterations=20", "sky.count=100", "checkpoint.every=5", "checkpoint.share=1")
+SETS += ("device=cpu", "densify.start=10", "densify.every_floor=5")
 SETTINGS = tuple(word for setting in SETS for word in ("--set", setting))
 
 # The driver waits for the test to cut a cable after the first checkpoint of a block on the host "two", before
@@ -105,10 +98,6 @@ class Cluster:
         """What Ray says there."""
         return self.folder / f"{host}.log"
 
-    def copies(self, host: str) -> list[Path]:
-        """Copies of the driver's files there."""
-        return [path for path in (self.folder / host).glob("panolog/*/*/*") if path.name != "lock"]
-
     def drive(self, *arguments: object, errors: Path) -> int:
         """Runs PanoLOG on the head; plugs the cable of "two" as it requests. Returns its exit code."""
         with errors.open("w") as stderr:
@@ -136,11 +125,11 @@ class Cluster:
             self.hosts.launch(host, *command, env=self.environment, stdout=output, stderr=output)
 
 
-@contextmanager
-def three_hosts(hidden: Path) -> Iterator[Cluster]:
-    """A cluster that is not started yet, or the test skips. Args: hidden, a folder that its workers lack."""
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    """A cluster that is not started yet; its workers lack the test's folder."""
     try:
-        hosts = Hosts({"head": None, "one": hidden, "two": hidden})
+        hosts = Hosts({"head": None, "one": tmp_path, "two": tmp_path})
     except NoHostsError as error:
         pytest.skip(f"hosts of their own cannot be made here: {error}")
     with TemporaryDirectory(prefix="panolog-", dir="/tmp") as folder:  # short: Ray has its sockets there
@@ -148,12 +137,6 @@ def three_hosts(hidden: Path) -> Iterator[Cluster]:
             yield Cluster(hosts, Path(folder))
         finally:
             hosts.close()
-
-
-@pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[Cluster]:
-    with three_hosts(tmp_path) as found:
-        yield found
 
 
 def test_a_host_loses_its_network_and_gets_it_back(cluster: Cluster, tmp_path: Path) -> None:
@@ -172,7 +155,7 @@ def test_a_host_loses_its_network_and_gets_it_back(cluster: Cluster, tmp_path: P
     history = read_records(RunFolder(run).database)
     check_the_cut(history)
     check_what_moved(history, run)
-    assert not cluster.copies("one")
+    assert not [it for it in (cluster.folder / "one").glob("panolog/*/*/*") if it.name != "lock"]  # copies
     wait_until(lambda: cluster.starts("two") == 2, "the return of the lost host")
 
 
@@ -203,12 +186,6 @@ def check_what_moved(history: list[Stored], run: Path) -> None:
     assert received[COARSE] > 0
     model = (run / "coarse" / "model.ply").stat().st_size
     assert sum(count for task, count in received.items() if task.stage is Stage.SCORE) > model
-    status = subprocess.run(
-        [BIN / "panolog", "status", run, "--json"], stdout=subprocess.PIPE, check=True, env=environment()
-    )
-    report = json.loads(status.stdout)
-    assert report["moved"]["received"] == sum(received.values())
-    assert {task["name"]: task["received"] for task in report["tasks"] if task["received"]} == {
-        str(task): count for task, count in received.items() if count
-    }
-    assert report["moved"]["sent"] > (run / "point_cloud.ply").stat().st_size
+    moved = shown("status", run)["moved"]
+    assert moved["received"] == sum(received.values())
+    assert moved["sent"] > (run / "point_cloud.ply").stat().st_size
