@@ -132,6 +132,19 @@ def test_zip_bombs(whole: Path, tmp_path: Path) -> None:
     assert line and bytes_taken < 2**24
 
 
+@pytest.mark.parametrize(
+    ("record", "at", "value", "line"),
+    [(b"PK\5\6", 12, 2**31, "directory does not fit"), (b"PK\1\2", 20, 1, "states sizes that cannot be")],
+)
+def test_wrong_directories(
+    whole: Path, tmp_path: Path, record: bytes, at: int, value: int, line: str
+) -> None:
+    data = bytearray((whole / "a.sog").read_bytes())
+    struct.pack_into("<I", data, data.index(record) + at, value)
+    (tmp_path / "a.sog").write_bytes(data)
+    assert line in line_of(tmp_path / "a.sog")
+
+
 def test_image_bombs(whole: Path, tmp_path: Path) -> None:
     flat = io.BytesIO()
     Image.new("RGB", (8000, 8000)).save(flat, "WEBP", lossless=True)
