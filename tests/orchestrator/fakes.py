@@ -252,6 +252,7 @@ class Harness:
         """The same job in another run folder."""
         other = copy(self)
         other.folder = RunFolder(root)
+        root.mkdir(exist_ok=True)
         other.job = replace(self.job, folder=other.folder)
         return other
 

@@ -91,7 +91,6 @@ def test_a_limit_merges_what_there_is_and_a_higher_one_completes_the_run_with_th
 ) -> None:
     harness = Limited(tmp_path, BudgetSet(max_cost=100.0, prices=PRICES))
     whole = harness.at(tmp_path / "whole")
-    whole.folder.root.mkdir()
     whole.drive()
     state = harness.drive(slow(harness, {COARSE: 20, BLOCK: 500, EVAL: 10}))
     assert (state.outcome, state.status(BLOCK)) == (Outcome.LIMITED, Status.WAITING)

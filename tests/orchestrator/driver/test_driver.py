@@ -86,7 +86,6 @@ def test_a_block_that_keeps_failing_keeps_its_stage_one_gaussians_until_it_is_re
     assert harness.drive(resumed=True).outcome == "done"
     assert harness.tasks == [TaskId.block(1), EVAL]
     undisturbed = harness.at(tmp_path / "other")
-    undisturbed.folder.root.mkdir()
     undisturbed.drive()
     assert harness.folder.point_cloud.read_bytes() == undisturbed.folder.point_cloud.read_bytes()
 

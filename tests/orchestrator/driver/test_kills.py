@@ -176,7 +176,6 @@ def test_every_worker_is_killed(calm: tuple[Harness, list[Path]], pool: LocalPoo
     """Those that train when they have saved a checkpoint; none does anything more before its end."""
     harness, _ = calm
     killed, left = harness.at(tmp_path / "run"), {COARSE, SHARD, BLOCK, EVAL}
-    killed.folder.root.mkdir()
     workers: dict[TaskId, int] = {}
 
     def stall(spec: WorkerSpec) -> TaskSpec:

@@ -4,7 +4,6 @@ import pytest
 
 from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
 from panolog.orchestrator.resources.placement import Demand, Running, largest, place
-from panolog.workers.tasks import TaskId
 
 GIB = 2**30
 FAST, SLOW = Gpu("fast", 24 * GIB, "GPU-f"), Gpu("slow", 16 * GIB, "GPU-s")
@@ -14,41 +13,33 @@ def node(name: str = "a", *gpus: Gpu, cpus: int = 8, memory: int = 100 * GIB) ->
     return Node(name, f"host-{name}", cpus, memory, gpus)
 
 
-NAMES: list[str] = []
-
-
-def named(name: str) -> TaskId:
-    """A task for a name; the same one each time."""
-    if name not in NAMES:
-        NAMES.append(name)
-    return TaskId.block(NAMES.index(name))
-
-
-def name_of(task: TaskId) -> str:
-    return NAMES[task.number]
-
-
 def lasting(seconds: float, slowness: float = 1.0) -> Callable[[str], float]:
     """Seconds by kind of place."""
     return lambda kind: seconds * (slowness if "slow" in kind else 1.0)
 
 
 def block(name: str, seconds: float = 1.0, gib: float = 13, slowness: float = 1.0, **rest: object) -> Demand:
-    return Demand(named(name), int(gib * GIB), lasting(seconds, slowness), **rest)  # type: ignore[arg-type]
+    """Args: name, which takes the place of a task; rest, as the fields of `Demand`."""
+    return Demand(name, int(gib * GIB), lasting(seconds, slowness), **rest)  # type: ignore[arg-type]
 
 
 def on_gpu(node: str, gpu: int, left: float = 1.0, gpus: float = 1.0, gib: float = 20) -> Running:
     return Running(Placement(node, 1.0, int(gib * GIB), gpus, gpu), left)
 
 
+def placed(
+    requests: list[Demand], nodes: list[Node], *running: Running, cuda: bool = True
+) -> dict[str, Placement]:
+    return {str(task): where for task, where in place(requests, nodes, running, cuda=cuda)}
+
+
 def where(requests: list[Demand], nodes: list[Node], *running: Running) -> dict[str, tuple[str, int | None]]:
-    placed = place(requests, nodes, running, cuda=True)
-    return {name_of(task): (place.node, place.gpu) for task, place in placed}
+    return {task: (at.node, at.gpu) for task, at in placed(requests, nodes, *running).items()}
 
 
 def cores(requests: list[Demand], nodes: list[Node], *running: Running) -> dict[str, tuple[str, int]]:
-    placed = place(requests, nodes, running, cuda=False)
-    return {name_of(task): (place.node, place.threads) for task, place in placed}
+    found = placed(requests, nodes, *running, cuda=False)
+    return {task: (place.node, place.threads) for task, place in found.items()}
 
 
 def on_cpu(node: str, cpus: int, gib: float = 1) -> Running:
@@ -90,13 +81,13 @@ def test_a_block_goes_where_it_fits_or_where_memory_is_unknown() -> None:
 
 def test_small_blocks_share_a_gpu_once_each_gpu_has_one() -> None:
     small = [block(f"{i}", 10 - i, gib=6) for i in range(9)]
-    placed = place(small, [node("a", FAST, FAST)], [], cuda=True)
-    assert [(name_of(task), p.gpu, p.gpus, p.memory, p.cpus) for task, p in placed] == [
+    found = placed(small, [node("a", FAST, FAST)])
+    assert [(task, p.gpu, p.gpus, p.memory, p.cpus) for task, p in found.items()] == [
         (str(i), i % 2, 0.25, 6 * GIB, 1.0) for i in range(8)
     ]
-    assert {p.kind for _, p in placed} == {"1/4 fast"}
+    assert {p.kind for p in found.values()} == {"1/4 fast"}
     tiny = [block(str(i), gib=0.5) for i in range(9)]
-    assert len(place(tiny, [node("a", FAST)], [], cuda=True)) == 4  # no more share one
+    assert len(placed(tiny, [node("a", FAST)])) == 4  # no more share one
 
 
 def test_a_gpu_that_has_room_for_one_more_takes_one_more() -> None:
@@ -109,9 +100,9 @@ def test_a_gpu_that_has_room_for_one_more_takes_one_more() -> None:
 def test_what_seems_too_large_for_all_gets_the_largest_to_itself(cuda: bool) -> None:
     nodes = [node("a", SLOW, memory=10 * GIB), node("b", FAST, memory=20 * GIB)]
     requests = [block("huge", gib=99), block("other", gib=5)]
-    placed = dict(place(requests, nodes, [], cuda=cuda))
-    assert {name_of(task): place.node for task, place in placed.items()} == {"huge": "b", "other": "a"}
-    assert placed[named("huge")].memory == largest(nodes, cuda=cuda)
+    found = placed(requests, nodes, cuda=cuda)
+    assert {task: place.node for task, place in found.items()} == {"huge": "b", "other": "a"}
+    assert found["huge"].memory == largest(nodes, cuda=cuda)
 
 
 def test_who_ran_out_of_memory_gets_a_gpu_to_itself_and_others_keep_off_it() -> None:
@@ -120,7 +111,7 @@ def test_who_ran_out_of_memory_gets_a_gpu_to_itself_and_others_keep_off_it() -> 
     quarter = on_gpu("a", 0, left=5, gpus=0.25), on_gpu("b", 0, left=3, gpus=0.25)
     assert where([*others, hungry], nodes, *quarter) == {"x": ("a", 0), "y": ("a", 0)}  # b is being emptied
     assert where([hungry], nodes, quarter[0]) == {"hungry": ("b", 0)}
-    assert dict(place([hungry], nodes, quarter[:1], cuda=True))[named("hungry")].gpus == 1
+    assert placed([hungry], nodes, quarter[0])["hungry"].gpus == 1
 
 
 def test_who_ran_out_of_memory_again_gets_a_larger_gpu() -> None:
@@ -132,16 +123,15 @@ def test_who_ran_out_of_memory_again_gets_a_larger_gpu() -> None:
 
 
 def test_cuda_is_told_which_gpu_only_where_they_differ() -> None:
-    unequal = place([block("x")], [node("a", SLOW, FAST)], [], cuda=True)
-    equal = place([block("x")], [node("a", FAST, FAST)], [], cuda=True)
-    assert (unequal[0][1].uuid, equal[0][1].uuid) == ("GPU-s", "")
+    unequal, equal = (placed([block("x")], [node("a", gpu, FAST)]) for gpu in (SLOW, FAST))
+    assert (unequal["x"].uuid, equal["x"].uuid) == ("GPU-s", "")
 
 
 def test_cores_go_with_gpus() -> None:
     many = [block(str(i), gib=20) for i in range(3)]
-    assert [p.cpus for _, p in place(many, [node("a", FAST, FAST, FAST, cpus=8)], [], cuda=True)] == [2.0] * 3
-    few = place(many, [node("a", FAST, FAST, FAST, cpus=2)], [], cuda=True)
-    assert [(p.cpus, p.threads) for _, p in few] == [(0.6666, 1)] * 3
+    assert [p.cpus for p in placed(many, [node("a", FAST, FAST, FAST, cpus=8)]).values()] == [2.0] * 3
+    few = placed(many, [node("a", FAST, FAST, FAST, cpus=2)])
+    assert [(p.cpus, p.threads) for p in few.values()] == [(0.6666, 1)] * 3
 
 
 # On CPUs
@@ -161,9 +151,8 @@ def test_cores_go_with_gpus() -> None:
 )
 def test_cores_are_shared_as_far_as_memory_goes(tasks: int, cpus: int, fit: int, threads: list[int]) -> None:
     machine = node("a", cpus=cpus, memory=int(fit * GIB / 0.9) + 1)
-    placed = place([block(str(i), gib=1) for i in range(tasks)], [machine], [], cuda=False)
-    assert [place.threads for _, place in placed] == threads
-    assert [name_of(task) for task, _ in placed] == [str(i) for i in range(len(threads))]
+    found = cores([block(str(i), gib=1) for i in range(tasks)], [machine])
+    assert found == {str(i): ("a", count) for i, count in enumerate(threads)}
 
 
 def test_tasks_spread_over_the_nodes() -> None:

@@ -25,6 +25,12 @@ def truth(tmp_path: Path) -> Scene:
     return read_scene(write_scene(tmp_path / "scene", points=400))
 
 
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    (tmp_path / "run").mkdir()
+    return RunFolder(tmp_path / "run")
+
+
 def shaken(scene: Scene) -> Scene:
     """The scene with all cameras moved, as if its files had them so."""
     rng, panoramas = np.random.default_rng(0), []
@@ -41,9 +47,8 @@ def measured(scene: Scene, refine: bool | str) -> tuple[Measured, list[str]]:
     return Measuring(scene, config, lines.append, lines.append).found(), lines
 
 
-def test_poses_that_do_not_fit_their_tracks_are_adjusted(truth: Scene, tmp_path: Path) -> None:
-    wrong, folder = shaken(truth), RunFolder(tmp_path / "run")
-    folder.root.mkdir()
+def test_poses_that_do_not_fit_their_tracks_are_adjusted(truth: Scene, folder: RunFolder) -> None:
+    wrong = shaken(truth)
     found, lines = measured(wrong, "auto")
     assert found.adjusted is not None
     assert any("bundle adjustment has brought the median to" in line for line in lines)
@@ -59,9 +64,8 @@ def test_poses_that_do_not_fit_their_tracks_are_adjusted(truth: Scene, tmp_path:
     assert folder.sparse.is_dir()
 
 
-def test_stage_one_adds_to_the_moves_of_the_adjustment(truth: Scene, tmp_path: Path) -> None:
-    wrong, folder = shaken(truth), RunFolder(tmp_path / "run")
-    folder.root.mkdir()
+def test_stage_one_adds_to_the_moves_of_the_adjustment(truth: Scene, folder: RunFolder) -> None:
+    wrong = shaken(truth)
     found, _ = measured(wrong, True)
     save_measured(folder, found, wrong)
     scene = measured_scene(folder, wrong)
@@ -88,15 +92,13 @@ def test_poses_that_fit_or_are_not_to_be_refined_stay(truth: Scene) -> None:
     assert found == Measured(None, None) and not any("poses" in line for line in lines)
 
 
-def test_poses_and_their_model_are_written(tmp_path: Path) -> None:
-    scene = replace(read_scene(write_scene(tmp_path / "scene")), offset=(100.0, -20.0, 3.0))
+def test_poses_and_their_model_are_written(folder: RunFolder, truth: Scene) -> None:
+    scene = replace(truth, offset=(100.0, -20.0, 3.0))
     rows = np.array(scene.train)
     motion = np.array([0.02, 0, 0, 0, np.radians(0.5), 0])
     new = [moved(scene.panoramas[row].rotation, scene.panoramas[row].translation, motion) for row in rows]
     at_bound = np.arange(len(rows)) == 1
     captured = Captured(rows=rows, poses=np.stack([np.column_stack(pose) for pose in new]), at_bound=at_bound)
-    folder = RunFolder(tmp_path / "run")
-    folder.root.mkdir()
     save_captured(folder, captured, scene)
 
     table = json.loads(folder.poses.read_text())["panoramas"]
