@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from panolog.orchestrator.estimates import calibration
 from panolog.orchestrator.estimates.calibration import Basis, calibrate
 from panolog.orchestrator.estimates.estimate import Estimator
 from panolog.orchestrator.estimates.preflight import Preflight, choose_blocks, examine
@@ -14,7 +15,6 @@ from panolog.orchestrator.estimates.suggestions import DETAIL, problem
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import NONE, Failed
 from panolog.orchestrator.run.config import RunConfig, change
-from panolog.orchestrator.run.machines.config import DeadlinesConfig
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
@@ -22,7 +22,7 @@ from panolog.workers.events import Calibration, IterationCost, Notice
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import CALIBRATE, Stage, TaskId
 from tests.orchestrator.calibrated import MEBI, calibrated, says
-from tests.orchestrator.fakes import FakePool, fails
+from tests.orchestrator.fakes import FakePool, SetClock, fails
 from tests.workers.small import small_scene
 
 PLENTY = 2**50
@@ -230,28 +230,27 @@ def test_a_calibration_that_fails_leaves_assumptions_or_finds_the_input_wrong(sc
 class SilentPool(FakePool):
     """Its worker hangs, at once or after so many messages."""
 
-    def __init__(self, messages: int) -> None:
+    def __init__(self, messages: int, clock: SetClock) -> None:
         super().__init__(says, [node(PLENTY)])
-        self.left = messages
-        self.cancelled: list[TaskId] = []
+        self.left, self.clock = messages, clock
 
     def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
         self.left -= 1
-        return super().ready(seconds) if self.left >= 0 else []
-
-    def cancel(self, task: TaskId) -> None:
-        super().cancel(task)
-        self.cancelled.append(task)
+        if self.left >= 0:
+            return super().ready(seconds)
+        self.clock.sleep(seconds)
+        return []
 
 
 @pytest.mark.parametrize(("messages", "timed"), [(0, False), (1, False), (2, True)])
-def test_a_calibration_that_hangs_is_ended(scene: Scene, messages: int, *, timed: bool) -> None:
+def test_a_calibration_that_hangs_is_ended(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, messages: int, timed: bool
+) -> None:
     """What it has measured before counts."""
-    pool = SilentPool(messages)
-    deadlines = DeadlinesConfig(hello=0.01, message=0.01)
-    config = RunConfig(width=scene.width, device="cpu", deadlines=deadlines)
-    assert calibrate(pool, scene, config).timed == timed
-    assert pool.cancelled == [CALIBRATE]
+    pool = SilentPool(messages, clock := SetClock())
+    monkeypatch.setattr(calibration, "time", clock)
+    assert calibrate(pool, scene, RunConfig(width=scene.width, device="cpu")).timed == timed
+    assert clock.now - 1e9 > RunConfig().deadlines.message and not pool.running
 
 
 def test_auto_takes_as_few_blocks_as_memory_allows_and_as_keep_the_machines_busy(scene: Scene) -> None:
