@@ -1,5 +1,6 @@
 import os
 import signal
+from collections.abc import Iterator
 
 import pytest
 
@@ -10,12 +11,20 @@ from tests.orchestrator.fakes import SetClock
 ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """None but the system's, also where this process began with some that are ignored."""
+    before = [(number, signal.signal(number, signal.SIG_DFL)) for number in ENDS]
+    yield
+    for number, handler in before:
+        signal.signal(number, handler)
+
+
 @pytest.mark.parametrize("number", ENDS)
 def test_the_first_signal_requests_and_the_second_interrupts(
     monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    clock, before = SetClock(), [signal.getsignal(number) for number in ENDS]
-    monkeypatch.setattr(requests, "time", clock)
+    monkeypatch.setattr(requests, "time", clock := SetClock())
     with on_signals() as stop:
         assert not stop.requested
         os.kill(os.getpid(), number)
@@ -25,7 +34,7 @@ def test_the_first_signal_requests_and_the_second_interrupts(
         clock.now += 0.2
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), number)
-    assert [signal.getsignal(number) for number in ENDS] == before
+    assert [signal.getsignal(number) for number in ENDS] == [signal.SIG_DFL] * 3
 
 
 def test_a_second_signal_does_not_interrupt_what_clears_up_after_the_first() -> None:
@@ -55,11 +64,8 @@ def test_what_can_be_thrown_away_is_interrupted_at_once() -> None:
 
 
 def test_a_signal_that_is_ignored_stays_so() -> None:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with on_signals() as stop:
-            os.kill(os.getpid(), signal.SIGINT)
-            assert not stop.requested
-        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with on_signals() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert not stop.requested
+    assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN

@@ -33,6 +33,7 @@ MAINTENANCE = "/computeMetadata/v1/instance/maintenance-event"
 def served(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Metadata]:
     with metadata(request.param) as known:
         monkeypatch.setenv(VARIABLE, known.url)
+        monkeypatch.setattr(module, "TIMEOUT_S", 60.0)
         yield known
 
 
@@ -89,7 +90,7 @@ def test_amazon_announces_an_interruption_with_its_time_and_before_that_recommen
     notice = provider.notice()
     assert notice is not None
     assert notice.kind == Leaving.PREEMPTION
-    assert notice.seconds == pytest.approx(120, abs=5)
+    assert notice.seconds is not None and 60 < notice.seconds <= 120
     served.expired = True
     again = provider.notice()
     assert again is not None and again.kind == Leaving.PREEMPTION
@@ -130,12 +131,12 @@ def test_azure_schedules_events_for_this_machine_alone(
     provider = detected()
     served.event(event, resources=("worker-4",))
     assert provider.notice() is None
-    soon = time.strftime("%a, %d %b %Y %H:%M:%S GMT", time.gmtime(time.time() + 40))
+    soon = time.strftime("%a, %d %b %Y %H:%M:%S GMT", time.gmtime(time.time() + 100))
     served.event(event, resources=(NAME, "worker-4"), before=soon)
     notice = provider.notice()
     assert (notice.kind if notice else None) == kind
     if notice is not None:
-        assert notice.seconds == pytest.approx(40, abs=5)
+        assert notice.seconds is not None and 40 < notice.seconds <= 100
     assert provider.withdraws(Leaving.PREEMPTION)
 
 
@@ -153,8 +154,8 @@ def test_what_no_service_would_say_is_no_answer(served: Metadata, text: str) -> 
 
 @amazon
 def test_an_answer_that_never_ends_is_cut(served: Metadata, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "TIMEOUT_S", 0.3)
     provider = detected()
+    monkeypatch.setattr(module, "TIMEOUT_S", 0.3)
     served.slow = True
     with pytest.raises(NoAnswerError, match=r"it ends after \d{1,3} bytes"):
         provider.notice()
