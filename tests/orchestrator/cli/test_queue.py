@@ -39,8 +39,9 @@ def test_the_words_of_a_run_come_back_with_absolute_paths(here: Path, scene: Pat
     settings.write_text("iterations: 70\n")
     words = ["--config", os.path.relpath(settings), "--set", "sky.count=9", "--set", "seed=3", "--nice", "5"]
     more = ["--address", "auto", "--max-resumes", "4", "--supervise", "--log", "tensorboard", "--dashboard"]
+    limits = ["--prices", os.path.relpath(PRICES), "--max-cost", "9", "--deadline", "3h"]
     run = os.path.relpath(here / "run")
-    assert call("queue", "add", "town", "-o", run, *words, *more).stdout == "1\n"
+    assert call("queue", "add", "town", "-o", run, *words, *more, *limits).stdout == "1\n"
     with opened(here / "queue", make=False) as queue:
         command = queue.entry(1).command
     assert (command.run, command.folder) == (here / "run", scene.parent)
@@ -48,11 +49,14 @@ def test_the_words_of_a_run_come_back_with_absolute_paths(here: Path, scene: Pat
     assert config.is_absolute() and config.samefile(settings)
     assert [word for word in command.first if word not in ("--config", str(config))] == [
         *(str(scene), "--output", str(here / "run"), "--set", "sky.count=9", "--set", "seed=3"),
-        *("--address", "auto", "--nice", "5", "--dashboard", "--max-resumes", "4", "--log", "tensorboard"),
+        *command.later,
+        *("--prices", str(PRICES), "--max-cost", "9", "--deadline", "3h"),  # the run itself has them then
     ]
     assert list(command.later) == [
         *("--address", "auto", "--nice", "5", "--dashboard", "--max-resumes", "4", "--log", "tensorboard")
     ]
+    said = " ".join(call("queue", "add", "--help").stdout.replace("│", " ").split())
+    assert "so long from the start of the run, not from now" in said
 
 
 def test_run_and_resume_take_the_words_of_a_queue(
@@ -77,16 +81,6 @@ def test_run_and_resume_take_the_words_of_a_queue(
     assert (Path(str(source)), root, address, nice) == (scene, here / "run", "auto", 5)
     assert (config.sky.count, config.iterations) == (9, 70)
     assert (given[1][0], given[1][1], given[1][4]) == (here / "run", "auto", 5)
-
-
-def test_limits_are_given_to_the_start_alone(here: Path) -> None:
-    add(here, "run", "--prices", os.path.relpath(PRICES), "--max-cost", "9", "--deadline", "3h")
-    with opened(here / "queue", make=False) as queue:
-        command = queue.entry(1).command
-    assert command.first[-6:] == ("--prices", str(PRICES), "--max-cost", "9", "--deadline", "3h")
-    assert command.later == ()  # the run itself has them
-    said = " ".join(call("queue", "add", "--help").stdout.replace("│", " ").split())
-    assert "so long from the start of the run, not from now" in said
 
 
 def test_a_share_is_given_or_follows_from_the_device(here: Path) -> None:

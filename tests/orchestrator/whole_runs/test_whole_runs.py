@@ -39,56 +39,49 @@ SETS: tuple[str, ...] = ("iterations=60", "sky.count=100", "checkpoint.every=20"
 SETS += ("device=cpu", "densify.start=10", "densify.every_floor=5")
 SETTINGS = tuple(word for setting in SETS for word in ("--set", setting))
 
-# A driver with accidents: after the first record of a kind and task it, or the worker, gets a signal.
-# A worker that is to get one waits for it, however quick it is.
+# A driver whose workers have accidents: after the first record of a kind and task its worker is killed. It
+# waits for that, however quick it is.
 SCRIPT = """
-import json, os, sys, time
+import json, os, sys
 from dataclasses import dataclass, replace
+from threading import Event
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import session
 from panolog.orchestrator.driver.driver import Driver
-from panolog.workers import stopping
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.training.trainer import TrainSpec
 
 accidents, workers = json.loads(sys.argv.pop(1)), {}
 
-def strike(stored):
-    for record in (item.record for item in stored):
-        name, task = type(record).__name__, str(record.task)
-        if name == "TaskStarted":
-            workers[task] = record.pid
-        if accidents and accidents[0][:2] == [name, task]:
-            *_, victim, number = accidents.pop(0)
-            os.kill(workers[task] if victim == "worker" else os.getpid(), number)
-
 def waiting(kind):
     @dataclass(frozen=True, eq=False, kw_only=True)
     class Waiting(kind):
-        awaited: str
-
         def run(self):
             for event in kind.run(self):
                 yield event
-                while type(event).__name__.startswith(self.awaited) and not stopping.requested():
-                    time.sleep(0.01)
+                if type(event).__name__.startswith(("Checkpoint", "Evaluated")):
+                    Event().wait()
 
     return Waiting
 
 WAITING = {kind: waiting(kind) for kind in (TrainSpec, EvaluateSpec)}
 
 def wait(spec):
-    kinds = {"CheckpointSaved": "Checkpoint", "ViewEvaluated": "Evaluated"}
-    of_task = [(kind, victim) for kind, task, victim, _ in accidents if task == str(spec.task)]
-    awaited = [kinds[kind] for kind, victim in of_task if victim != "driver"]
-    return WAITING[type(spec)](**vars(spec), awaited=awaited[0]) if awaited else spec
+    doomed = str(spec.task) in [task for _, task in accidents]
+    return WAITING[type(spec)](**vars(spec)) if doomed else spec
 
 def driver(job, journal, pool, hooks, stop):
     show = journal.on_change
 
     def on_change(state, stored):
         show(state, stored)
-        strike(stored)
+        for record in (item.record for item in stored):
+            name, task = type(record).__name__, str(record.task)
+            if name == "TaskStarted":
+                workers[task] = record.pid
+            if accidents[:1] == [[name, task]]:
+                del accidents[0]
+                os.kill(workers[task], 9)
 
     journal.on_change = on_change
     return Driver(job, journal, pool, replace(hooks, on_start=wait), stop)
@@ -96,16 +89,11 @@ def driver(job, journal, pool, hooks, stop):
 session.Driver = driver
 app.main()
 """
-Accident = tuple[str, str, str, int]
-OF_WORKERS: list[Accident] = [
-    ("CheckpointSaved", "coarse", "worker", 9),
-    ("CheckpointSaved", "block/000", "worker", 9),
-    ("ViewEvaluated", "eval", "worker", 9),
-]
+ACCIDENTS = (("CheckpointSaved", "coarse"), ("CheckpointSaved", "block/000"), ("ViewEvaluated", "eval"))
 
 
-def launch(*arguments: object, accidents: list[Accident] | None = None) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", SCRIPT, json.dumps(accidents or []), *map(str, arguments)]
+def launch(*arguments: object, accidents: Sequence[tuple[str, str]] = ()) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", SCRIPT, json.dumps(accidents), *map(str, arguments)]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
@@ -142,7 +130,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended, Path]:
     calm, killed = folder / "calm", folder / "killed"
     processes = [
         launch("run", scene, "-o", calm, *SETTINGS),
-        launch("run", scene, "-o", killed, *SETTINGS, accidents=OF_WORKERS),
+        launch("run", scene, "-o", killed, *SETTINGS, accidents=ACCIDENTS),
     ]
     calm_end, killed_end = map(end_of, processes)
     assert (killed_end.code, killed_end.stdout) == (0, ""), killed_end.stderr
