@@ -16,7 +16,7 @@ from panolog.workers.events import Event
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.trainer import TrainSpec
-from tests.orchestrator.fakes import DIED, Harness, fails, well
+from tests.orchestrator.fakes import DIED, CrashError, Harness, begins, fails, well
 
 ROUNDS = [TaskId.round(0), TaskId.round(1)]
 REPAIR = TaskId.repair(0)
@@ -75,7 +75,7 @@ def test_a_block_that_is_tried_again_is_in_all_that_follows(tmp_path: Path) -> N
     harness, whole = (passing(tmp_path / name, stage2=stage2) for name in ("failed", "whole"))
     whole.drive()
     with pytest.raises(Exception, match="block 1 failed"):
-        harness.drive(fails(TaskId.block(1), DIED, 9))
+        harness.drive(begins(REPAIR, CrashError(DIED), times=9, rest=fails(TaskId.block(1), DIED, 9)))
     left = harness.folder.checkpoint(REPAIR)
     left.write_bytes(harness.folder.model(COARSE).read_bytes())
     assert harness.drive(resumed=True).outcome == "done"
