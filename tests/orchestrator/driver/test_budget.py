@@ -22,7 +22,7 @@ from panolog.orchestrator.run.money.records import (
     WorkLost,
 )
 from panolog.orchestrator.run.records import Outcome, PreflightSaved, Record, RunBegan, Stored
-from panolog.orchestrator.run.state import RunState, Status, replay
+from panolog.orchestrator.run.state import Status, replay
 from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import ConfigError
 from panolog.scene.ply import read_ply
@@ -82,10 +82,6 @@ def saved(spec: TrainSpec, iteration: int = 20_000) -> Checkpoint:
     return Checkpoint(spec.task, iteration, ModelState.start(darker).tensors())
 
 
-def cost(state: RunState) -> float:
-    return state.money.used.cost
-
-
 def test_a_limit_merges_what_there_is_and_a_higher_one_completes_the_run_with_the_same_bytes(
     tmp_path: Path,
 ) -> None:
@@ -95,7 +91,7 @@ def test_a_limit_merges_what_there_is_and_a_higher_one_completes_the_run_with_th
     state = harness.drive(slow(harness, {COARSE: 20, BLOCK: 500, EVAL: 10}))
     assert (state.outcome, state.status(BLOCK)) == (Outcome.LIMITED, Status.WAITING)
     assert "the limit of 100 USD is reached" in state.reason
-    assert 95 <= cost(state) <= 100
+    assert 95 <= state.money.used.cost <= 100
     assert state.task(BLOCK).checkpoint == 20_000
     assert state.merged is not None
     assert state.metrics == {"psnr": 24.0, "lpips": None}
@@ -115,7 +111,7 @@ def test_a_limit_merges_what_there_is_and_a_higher_one_completes_the_run_with_th
     assert harness.folder.point_cloud.read_bytes() == whole.folder.point_cloud.read_bytes()
     assert not list(harness.folder.root.rglob("early.ply"))
     assert not list(harness.folder.root.rglob("checkpoint.safetensors"))
-    assert cost(state) < 200
+    assert state.money.used.cost < 200
 
 
 def test_a_block_that_has_hardly_begun_keeps_its_stage_one_gaussians(tmp_path: Path) -> None:

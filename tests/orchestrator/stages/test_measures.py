@@ -46,10 +46,6 @@ def outcome(harness: Harness) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
-def specs(harness: Harness) -> list[EvaluateSpec]:
-    return [spec for _, spec in harness.pool.started if isinstance(spec, EvaluateSpec)]
-
-
 def truly(spec: TaskSpec) -> Iterator[Event]:
     """What is evaluated is rendered; all else goes well."""
     yield from spec.run() if isinstance(spec, EvaluateSpec) else well(spec)
@@ -59,8 +55,8 @@ def test_the_driver_joins_what_shards_have_measured(tmp_path: Path) -> None:
     harness, one = measuring(tmp_path / "shards"), measuring(tmp_path / "one", stage2={"exterior": "frozen"})
     assert harness.drive().outcome == one.drive().outcome == "done"
     assert harness.tasks[-3:] == SHARDS and one.tasks[-1] == EVAL
-    assert [spec.views for spec in specs(harness)] == [(0, 1), (2, 3, 4), ()]
-    assert [len(spec.faces) for spec in specs(harness)] == [0, 0, 1]
+    specs = [spec for _, spec in harness.pool.started if isinstance(spec, EvaluateSpec)]
+    assert [(spec.views, len(spec.faces)) for spec in specs] == [((0, 1), 0), ((2, 3, 4), 0), ((), 1)]
     files, expected = outcome(harness), outcome(one)
     shards = [f"shards/{number:03d}.json" for number in range(3)]
     assert sorted(files) == sorted([*expected, *shards])

@@ -17,9 +17,9 @@ GROUP = Group("small", most=3, cpus=1, memory=2**40)
 class GrowingPool(FakePool):
     """One machine joins each time that the driver waits, if it has requested some."""
 
-    def __init__(self, clock: SetClock, startup: float, most: int = GROUP.most) -> None:
+    def __init__(self, clock: SetClock, startup: float) -> None:
         super().__init__(self._work, [])
-        self._clock, self._startup, self._most = clock, startup, most
+        self._clock, self._startup = clock, startup
         self.wanted: dict[str, int] = {}
         self.requests: list[dict[str, int]] = []
         self.trouble = ""
@@ -31,7 +31,7 @@ class GrowingPool(FakePool):
 
     def _join(self) -> None:
         self._clock.now += self._startup
-        if self.wanted.get("small") and len(self.nodes()) < self._most:
+        if self.wanted.get("small") and len(self.nodes()) < GROUP.most:
             self.join(GROUP.node(len(self.nodes())))
 
     def growth(self) -> Growth:
