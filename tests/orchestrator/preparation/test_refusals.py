@@ -186,6 +186,9 @@ def test_files_of_the_preparation_that_are_none_are_not_believed(content: bytes,
         path.write_bytes(content)
     assert notes.read_progress(folder) is None
     assert notes.read_result(folder, Step.SFM) is None
+    of_another = notes.StepResult(step=Step.MASKS, settings={}, seconds=1, lines=())
+    notes.write_note(notes.result_path(folder, Step.SFM), of_another)
+    assert notes.read_result(folder, Step.SFM) is None
 
 
 def test_long_results_are_shortened() -> None:
