@@ -1,8 +1,6 @@
 """A mail server for tests: plain, or encrypting with a certificate of a test's authority."""
 
-import asyncio
 import ssl
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,6 +9,7 @@ from email.message import Message
 from typing import Any, Literal
 
 import trustme
+from aiosmtpd.controller import Controller
 from aiosmtpd.smtp import SMTP, AuthResult, Envelope, LoginPassword, Session
 
 HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"  # both of this machine; the other is no name of it to `sending`
@@ -63,37 +62,32 @@ def mailbox(
 
     Args: refuse, its answer to recipients; authority, of its certificate; name, for which that is.
     """
-    box, loop, context = Mailbox(refuse), asyncio.new_event_loop(), None
-    loop.set_exception_handler(lambda _, what: None)  # a client that ends a handshake is what tests want
+    box, context = Mailbox(refuse), None
     if authority is not None:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         authority.issue_cert(name).configure_cert(context)
-    options: dict[str, Any] = {"hostname": "test", "authenticator": box.login, "loop": loop}
-    if how == "starttls":
-        options |= {"tls_context": context, "require_starttls": True}
-    options["auth_require_tls"] = how == "starttls"  # TLS from the start is none to aiosmtpd
-
-    async def begin() -> asyncio.Server:
-        def connected() -> SMTP:
-            return SMTP(box, **options)
-
-        return await loop.create_server(connected, host, 0, ssl=context if how == "tls" else None)
-
-    async def end() -> None:
-        server.close()
-        tasks = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-
-    thread = threading.Thread(target=loop.run_forever, daemon=True)
-    thread.start()
-    server = asyncio.run_coroutine_threadsafe(begin(), loop).result(30)
-    box.port = server.sockets[0].getsockname()[1]
+    server = _Server(
+        box,
+        hostname=host,
+        port=0,
+        ready_timeout=120.0,
+        authenticator=box.login,
+        auth_require_tls=how == "starttls",  # TLS from the start is none to aiosmtpd
+        require_starttls=how == "starttls",
+        tls_context=context if how == "starttls" else None,
+        ssl_context=context if how == "tls" else None,
+    )
+    server.start()
+    box.port = server.port
     try:
         yield box
     finally:
-        asyncio.run_coroutine_threadsafe(end(), loop).result(30)
-        loop.call_soon_threadsafe(loop.stop)
-        thread.join(30)
-        loop.close()
+        server.stop()
+
+
+class _Server(Controller):
+    """A server at a free port."""
+
+    def _trigger_server(self) -> None:
+        self.port = self.server.sockets[0].getsockname()[1]  # type: ignore[union-attr]
+        super()._trigger_server()  # type: ignore[no-untyped-call]
