@@ -79,7 +79,7 @@ def test_far_from_the_origin(tmp_path: Path) -> None:
             row[3] += shift
     path.write_text(json.dumps(content))
     write_ply(tmp_path / "source" / "sparse_pc.ply", known.points + utm, known.colors)
-    report = import_scene(source, tmp_path / "scene")
+    report = import_scene(source, tmp_path / "scene", format="nerfstudio")
     assert "moved to the origin" in report.notes[0]
     scene = read_scene(tmp_path / "scene")
     offset = np.array(json.loads((tmp_path / "scene" / "offset.json").read_text())["offset"])

@@ -1,5 +1,6 @@
 """GPS and gravity of a video's telemetry, at the times of its frames, and as its frames carry them."""
 
+import struct
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -188,22 +189,38 @@ def test_damaged_payloads_hold_nothing_or_something(seed: int) -> None:
     assert len(parse_payload(bytes(whole)).places) == 40
 
 
+@pytest.mark.parametrize(
+    "key", [b"GPSF", b"GPSP", b"SCAL", b"GPS5", b"ORIN", b"ACCL", b"STRM", b"TYPE", b"GPS9"]
+)
+def test_entries_with_other_types_and_sizes(key: bytes) -> None:
+    ups, places = np.stack([up(0.0)] * 3), np.stack([place(0.0)] * 3)
+    whole = payload(gps5(places), gps9(places), accl(ups, "zxY"))
+    at = whole.index(key) + 4
+    for head in ("\0", "L", "c", "?", "d", "J", "x"):
+        for size in (0, 1, 2, 8, 255):
+            for count in (0, 1, 0xFFFF):
+                changed = whole[:at] + struct.pack(">cBH", head.encode(), size, count) + whole[at + 4 :]
+                parse_payload(changed)
+
+
 def test_a_stamp_is_read_as_it_was_written(tmp_path: Path) -> None:
     jpeg = bytes(cv2.imencode(".jpg", np.zeros((64, 128, 3), np.uint8))[1])
-    path, taken = tmp_path / "a.jpg", datetime(2024, 5, 1, 12, 0, 3, 41_667)
+    path, now = tmp_path / "a.jpg", datetime(2024, 5, 1, 12, 0, 3, 41_667)
     attitude = Attitude(None, -12.3456, 170.5)
-    for fix in (
-        GpsFix(-33.123456789, -70.987654321, -12.345),
-        GpsFix(0.5, 179.9999999, None),
-        GpsFix(89.0, 0.0, 0.0),
+    for fix, taken, light in (
+        (GpsFix(-33.123456789, -70.987654321, -12.345), now, None),
+        (GpsFix(0.5, 179.9999999, None), None, (0.01, 200)),
+        (GpsFix(89.0, 0.0, 0.0), now, (0.01, 200)),
+        (None, now, (0.01, 200)),
     ):
-        path.write_bytes(stamped(jpeg, fix=fix, attitude=attitude, taken=taken, exposure=(0.01, 200)))
+        path.write_bytes(stamped(jpeg, fix=fix, attitude=attitude, taken=taken, exposure=light))
         found = read_exif(path)
-        assert found.fix is not None
-        written = (fix.latitude, fix.longitude)
-        assert (found.fix.latitude, found.fix.longitude) == pytest.approx(written, abs=1e-9)
-        assert (found.fix.altitude, found.attitude, found.time) == (fix.altitude, attitude, taken)
-        assert found.exposure_stops == pytest.approx(np.log2(0.02), abs=1e-4)
+        assert (found.attitude, found.time, found.fix is None) == (attitude, taken, fix is None)
+        assert found.exposure_stops == (light and pytest.approx(np.log2(0.02), abs=1e-4))
+        if fix is not None and found.fix is not None:
+            written = (fix.latitude, fix.longitude)
+            assert (found.fix.latitude, found.fix.longitude) == pytest.approx(written, abs=1e-9)
+            assert found.fix.altitude == fix.altitude
         assert decode(path, cv2.IMREAD_COLOR).shape == (64, 128, 3)
     assert stamped(jpeg, fix=None, attitude=None, taken=None) == jpeg
 

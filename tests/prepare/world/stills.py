@@ -68,7 +68,7 @@ def write_still(
     place: Mapping[int, object] | None = PLACE,
     panorama: Mapping[str, float | str] | bytes | None = None,
     orientation: int | None = None,
-    changed: str = "2025:01:01 00:00:00",
+    changed: str | None = "2025:01:01 00:00:00",
 ) -> Path:
     """Writes (H, W, 3 or 4) RGB in the format of the suffix, lossless where that can be.
 
@@ -76,7 +76,8 @@ def write_still(
     """
     tags = Image.Exif()
     tags[BASE.Make] = "RICOH"
-    tags[BASE.DateTime] = changed
+    if changed is not None:
+        tags[BASE.DateTime] = changed
     tags[ExifTags.IFD.Exif] = {
         tag: IFDRational(value) if isinstance(value, Fraction) else value for tag, value in camera.items()
     }

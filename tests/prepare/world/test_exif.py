@@ -91,7 +91,7 @@ def test_numbers_without_denominator(tmp_path: Path) -> None:
 
 def test_time_of_the_file_where_the_camera_wrote_none(tmp_path: Path) -> None:
     for changed, wanted in (
-        ("", None),
+        (None, None),
         ("0000:00:00 00:00:00", None),
         ("2025:01:02 03:04:05", datetime(2025, 1, 2, 3, 4, 5)),
     ):

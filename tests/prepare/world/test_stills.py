@@ -51,7 +51,9 @@ def test_a_cropped_panorama_is_completed(tmp_path: Path, suffix: str) -> None:
 
 
 def test_a_crop_that_was_scaled_is_completed_at_its_scale(tmp_path: Path) -> None:
-    path = write_still(tmp_path / "a.png", noise(PART), panorama=crop((255, 128), 32, 15, (191, 80)))
+    path = write_still(
+        tmp_path / "a.png", noise(PART), panorama=crop((255, 128), 32, 15, (191, 80)), changed=None
+    )
     found, used = decode_with_alpha(completed(path, tmp_path / "whole"))
     assert used is not None and found.shape == (64, 128, 3)
     rows, columns = np.flatnonzero(used.any(axis=1)), np.flatnonzero(used.any(axis=0))
