@@ -192,12 +192,10 @@ def test_the_unit_of_length_does_not_matter(coarse: TrainSpec, scene: Scene) -> 
     assert torch.allclose(one.opacities, other.opacities, atol=1e-3)
 
 
-def test_a_checkpoint_of_another_task_is_refused(coarse: TrainSpec) -> None:
+def test_what_is_no_task_is_refused(coarse: TrainSpec, events: list[Event]) -> None:
+    """A checkpoint of another one, half of a block, and nothing to see."""
     with pytest.raises(RunError, match="does not continue coarse"):
         next(train(replace(coarse, checkpoint=Value(Checkpoint(TaskId.block(0), 5, {})))))
-
-
-def test_neither_half_a_block_nor_nothing_to_see_is_a_task(coarse: TrainSpec, events: list[Event]) -> None:
     block = block_of(coarse, trained(events))
     with pytest.raises(ValueError, match="needs both"):
         replace(coarse, cell=block.cell)
