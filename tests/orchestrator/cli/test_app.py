@@ -65,22 +65,6 @@ def test_wrong_options(scene: Path, tmp_path: Path, arguments: tuple[str, ...], 
     assert not (tmp_path / "run").exists()
 
 
-def test_an_output_of_another_scene_stays_untouched(scene: Path, run: Path) -> None:
-    before = {path: path.read_bytes() for path in run.iterdir()}
-    assert "another scene" in one_line(call("run", scene, "-o", run))
-    assert {path: path.read_bytes() for path in run.iterdir()} == before
-
-
-def test_no_disk_space_for_checkpoints(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Full:
-        free = 1000
-
-    monkeypatch.setattr("shutil.disk_usage", lambda _: Full)
-    calibrated(monkeypatch, memory=2**40)
-    assert "of its disk are free" in one_line(call("run", scene, "-o", tmp_path / "run"))
-    assert not (tmp_path / "run").exists()
-
-
 def test_folders_that_are_no_run_and_no_scene(tmp_path: Path) -> None:
     for command in ("status", "resume", "events", "eval", "partition"):
         assert "is not a run folder" in one_line(call(command, tmp_path))

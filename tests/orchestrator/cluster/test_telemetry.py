@@ -39,32 +39,30 @@ def standing(*records: Record) -> dict[str, float]:
     return {sample.metric: sample.value for sample in found}
 
 
-def counted(*records: Record) -> list[tuple[str, float]]:
-    """What the last record adds."""
-    return [(sample.metric, sample.value) for sample in counts(after(*records)[0], records[-1])]
-
-
-def test_progress_is_every_gauge_that_is_known() -> None:
+def test_progress_is_every_gauge_that_is_known_and_speed_and_memory_are_those_of_a_worker() -> None:
     values = standing(STARTED, PROGRESS)
     assert set(values) == set(GAUGES)
     assert (values["panolog_iteration"], values["panolog_memory_bytes"]) == (5, 2**20)
     known = standing(STARTED, Progressed(BLOCK, 5, 10, 2.5))
     assert set(known) == {"panolog_iteration", "panolog_iterations", "panolog_iterations_per_second"}
     assert standing(STARTED) == {}
+    for end in (ModelSaved(BLOCK, "model.ply", 9, 100, 10, 4.0), TaskFailed(BLOCK, 1, "died", final=False)):
+        assert set(standing(STARTED, PROGRESS, end)) == set(GAUGES) - WHILE_RUNNING
 
 
-def test_a_task_without_a_worker_has_neither_speed_nor_memory() -> None:
-    done = standing(STARTED, PROGRESS, ModelSaved(BLOCK, "model.ply", 9, 100, 10, 4.0))
-    assert set(done) == set(GAUGES) - WHILE_RUNNING
-    assert set(standing(STARTED, PROGRESS, TaskFailed(BLOCK, 1, "died", final=False))) == set(done)
-
-
-def test_retries_and_bytes_are_counted() -> None:
-    assert counted(STARTED, TaskFailed(BLOCK, 1, "died", final=False)) == [("panolog_retries_total", 1)]
-    assert counted(STARTED, TaskFailed(BLOCK, 3, "died", final=True)) == []
-    assert counted(STARTED, Transferred(BLOCK, 2, 3)) == [("panolog_moved_bytes_total", 5)]
-    assert counted(STARTED, Transferred(BLOCK, 0, 0)) == []
-    assert counted(STARTED, Noticed(BLOCK, "a.jpg is left out")) == []
+@pytest.mark.parametrize(
+    ("record", "added"),
+    [
+        (TaskFailed(BLOCK, 1, "died", final=False), [("panolog_retries_total", 1)]),
+        (TaskFailed(BLOCK, 3, "died", final=True), []),
+        (Transferred(BLOCK, 2, 3), [("panolog_moved_bytes_total", 5)]),
+        (Transferred(BLOCK, 0, 0), []),
+        (Noticed(BLOCK, "a.jpg is left out"), []),
+    ],
+)
+def test_retries_and_bytes_are_counted(record: Record, added: list[tuple[str, float]]) -> None:
+    state, _ = after(STARTED, record)
+    assert [(sample.metric, sample.value) for sample in counts(state, record)] == added
 
 
 class Fake:
