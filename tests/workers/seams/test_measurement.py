@@ -1,7 +1,7 @@
 """The seams of a small model of two blocks, without and with a known step between them."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,11 +17,11 @@ from panolog.renderer.render import render_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import exposed, exposure_affine
 from panolog.scene.model import Panorama, Scene
-from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import Evaluated, Progress, SeamMeasured
+from panolog.workers.events import Evaluated, Event, SeamMeasured
 from panolog.workers.seams.measurement import Seams, block_in_coarse
 from panolog.workers.specs import Value
 from panolog.workers.training.initialise import isotropic
+from tests.workers.trainings import evaluation_of, progress_of
 
 WIDTH, CAMERAS = 128, 16
 PICTURES = ("truth", "merged", "below", "above")
@@ -73,16 +73,21 @@ def models(step: float) -> tuple[Gaussians, Gaussians]:
     return with_color(ground(), noise / 2 + step * above), with_color(ground(), noise)
 
 
-def spec_of(scene: Scene, plan: Plan, step: float) -> EvaluateSpec:
+def events_of(scene: Scene, plan: Plan, step: float) -> list[Event]:
     merged, coarse = models(step)
     seams = Seams(seams_of(plan), Value(plan), Value(coarse))
-    return EvaluateSpec(
-        scene=Value(scene), views=(0,), width=WIDTH, model=Value(merged), near=0.01, seams=seams
-    )
+    return list(evaluation_of(scene, merged, (0,), width=WIDTH, seams=seams).run())
 
 
-def measured(scene: Scene, plan: Plan, step: float) -> Iterator[SeamMeasured]:
-    return (event for event in spec_of(scene, plan, step).run() if isinstance(event, SeamMeasured))
+def measured(events: Iterable[Event]) -> SeamMeasured:
+    (event,) = (event for event in events if isinstance(event, SeamMeasured))
+    return event
+
+
+@pytest.fixture(scope="module")
+def flat(scene: Scene, plan: Plan) -> list[Event]:
+    """The events where there is no step."""
+    return events_of(scene, plan, 0.0)
 
 
 def known(value: float | None) -> float:
@@ -90,8 +95,13 @@ def known(value: float | None) -> float:
     return value
 
 
-def test_without_a_step_a_face_is_as_any_other_place(scene: Scene, plan: Plan) -> None:
-    (event,) = measured(scene, plan, 0.0)
+def test_without_a_step_a_face_is_as_any_other_place(plan: Plan, flat: list[Event]) -> None:
+    """Progress counts the renders of seams too."""
+    event, progress = measured(flat), progress_of(flat)
+    assert (progress[0].iteration, progress[-1].iteration) == (1, progress[-1].iterations)
+    assert progress[-1].iterations > 50
+    kinds = [type(event) for event in flat if isinstance(event, Evaluated | SeamMeasured)]
+    assert kinds == [Evaluated, SeamMeasured]
     assert event.seam.blocks == (0, 1)
     assert event.seam.at == pytest.approx(plan.aabb.center[0])
     assert event.seam.seam == pytest.approx(1.0, abs=0.1)
@@ -99,7 +109,9 @@ def test_without_a_step_a_face_is_as_any_other_place(scene: Scene, plan: Plan) -
     assert event.seam.merged.error == pytest.approx(known(event.seam.coarse.error) / 2, rel=0.1)
 
 
-def test_exposures_of_panoramas_are_no_errors(scene: Scene, plan: Plan, tmp_path: Path) -> None:
+def test_exposures_of_panoramas_are_no_errors(
+    scene: Scene, plan: Plan, flat: list[Event], tmp_path: Path
+) -> None:
     """Neither in what is measured nor in the pictures, where the models are as the photograph has it."""
     panoramas = []
     for row, panorama in enumerate(scene.panoramas):
@@ -110,8 +122,8 @@ def test_exposures_of_panoramas_are_no_errors(scene: Scene, plan: Plan, tmp_path
         path = tmp_path / panorama.name
         cv2.imwrite(str(path), shown.numpy())
         panoramas.append(replace(panorama, image=path, exposure=exposure))
-    (event,) = measured(replace(scene, panoramas=tuple(panoramas)), plan, 0.0)
-    (without,) = measured(scene, plan, 0.0)
+    without = measured(flat)
+    event = measured(events_of(replace(scene, panoramas=tuple(panoramas)), plan, 0.0))
     for name in ("error", "step"):
         ours, theirs = (known(getattr(each.seam.merged, name)) for each in (event, without))
         assert ours == pytest.approx(theirs, rel=0.25)
@@ -122,8 +134,8 @@ def test_exposures_of_panoramas_are_no_errors(scene: Scene, plan: Plan, tmp_path
     assert [means[name] for name in PICTURES[1:]] == pytest.approx([means["truth"]] * 3, rel=0.03)
 
 
-def test_a_step_of_a_known_size_is_found(scene: Scene, plan: Plan) -> None:
-    (event,), (without,) = measured(scene, plan, 0.1), measured(scene, plan, 0.0)
+def test_a_step_of_a_known_size_is_found(scene: Scene, plan: Plan, flat: list[Event]) -> None:
+    event, without = measured(events_of(scene, plan, 0.1)), measured(flat)
     assert event.seam.merged.step == pytest.approx(0.1, rel=0.2)
     assert event.seam.merged.step_floor == pytest.approx(without.seam.merged.step_floor, rel=0.1)
     assert known(event.seam.seam) > 5 * known(without.seam.seam)
@@ -147,7 +159,7 @@ def test_a_block_shows_stage_one_elsewhere(plan: Plan) -> None:
 
 
 def test_its_pictures_show_the_face(scene: Scene, plan: Plan) -> None:
-    (event,) = measured(scene, plan, 0.3)
+    event = measured(events_of(scene, plan, 0.3))
     assert set(event.pictures) == {"truth.jpg", "merged.jpg", "below.jpg", "above.jpg", "face.png"}
     decoded = {
         name: np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), float)
@@ -167,21 +179,10 @@ def test_its_pictures_show_the_face(scene: Scene, plan: Plan) -> None:
     assert (apart["below"] > 40).mean() < 0.01
 
 
-def test_progress_counts_the_renders_of_seams_too(scene: Scene, plan: Plan) -> None:
-    events = [*spec_of(scene, plan, 0.0).run()]
-    progress = [event for event in events if isinstance(event, Progress)]
-    assert (progress[0].iteration, progress[-1].iteration) == (1, progress[-1].iterations)
-    assert progress[-1].iterations > 50
-    assert [type(event) for event in events if isinstance(event, Evaluated | SeamMeasured)] == [
-        Evaluated,
-        SeamMeasured,
-    ]
-
-
 def test_a_damaged_panorama_does_not_end_the_measurement(scene: Scene, plan: Plan, tmp_path: Path) -> None:
     broken = tmp_path / "07.png"
     broken.write_bytes(b"no picture")
     panoramas = list(scene.panoramas)
     panoramas[7] = replace(panoramas[7], image=broken)
-    (event,) = measured(replace(scene, panoramas=tuple(panoramas)), plan, 0.1)
+    event = measured(events_of(replace(scene, panoramas=tuple(panoramas)), plan, 0.1))
     assert event.seam.merged.step == pytest.approx(0.1, rel=0.25)
