@@ -1,7 +1,8 @@
 """`panolog demo`: what it makes, where, and where it cannot go. Nothing is made or trained here."""
 
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -9,32 +10,26 @@ from panolog.orchestrator.run.info import SceneRef
 from tests.orchestrator.cli.program import begun, call, one_line
 
 
-class Demo:
+class Demo(NamedTuple):
     """What the command would have made and started."""
 
-    def __init__(self) -> None:
-        self.made: list[tuple[Any, ...]] = []  # what, where, with which options
-        self.started: list[tuple[Path, Path, str]] = []  # scene, run, recipe and blocks
-
-    def make(self, kind: str, folder: Path, **options: Any) -> None:
-        """In place of `make_town` and the like."""
-        self.made.append((kind, folder, options.get("panoramas"), options.get("flight")))
-
-    def start(self, scene: Path, root: Path, config: Any, *_: object) -> None:
-        """In place of `session.start`."""
-        self.started.append((scene, root, f"{config.recipe} {config.blocks}"))
+    made: list[tuple[Any, ...]]  # what, where, with which options
+    started: list[tuple[Path, Path, str]]  # scene, run, recipe and blocks
 
 
 @pytest.fixture
 def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Demo:
-    found = Demo()
-    commands = "panolog.orchestrator.commands"
+    found = Demo([], [])
+
+    def make(kind: str, folder: Path, **options: Any) -> None:
+        found.made.append((kind, folder, options.get("panoramas"), options.get("flight")))
+
+    def start(scene: Path, root: Path, config: Any, *_: object) -> None:
+        found.started.append((scene, root, f"{config.recipe} {config.blocks}"))
+
     for kind in ("town", "flight", "city"):
-        monkeypatch.setattr(
-            f"{commands}.demo.make_{kind}",
-            lambda folder, kind=kind, **options: found.make(kind, folder, **options),
-        )
-    monkeypatch.setattr(f"{commands}.session.start", found.start)
+        monkeypatch.setattr(f"panolog.orchestrator.commands.demo.make_{kind}", partial(make, kind))
+    monkeypatch.setattr("panolog.orchestrator.commands.session.start", start)
     monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
     monkeypatch.chdir(tmp_path)
     return found
@@ -48,7 +43,7 @@ def test_where_a_demo_cannot_go(demo: Demo, tmp_path: Path) -> None:
     for options in (("--flight",), ("--city", "9")):
         assert "a run of another scene" in one_line(call("demo", *options, "-o", tmp_path / "run"))
     assert call("demo", "--city", "1").exit_code == 2
-    assert (demo.made, demo.started) == ([], [])
+    assert demo == ([], [])
     assert {path.name for path in tmp_path.iterdir()} == {"thesis.txt", "run"}
 
 

@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 from typer.testing import Result
 
 from panolog.export.reading import read_model
-from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.info import SceneRef
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import read_ply, write_ply
 from panolog.scene.read import read_scene
 from panolog.scene.write import Offset, Origin, write_offset
 from panolog.workers.training.initialise import scene_gaussians
+from tests.orchestrator.cli.program import begun, one_line, shown
 from tests.orchestrator.cli.program import call as panolog
-from tests.orchestrator.cli.program import one_line, shown
 from tests.scenes import write_scene
 
 MODELS = ("sog", "spz", "compressed-ply")
@@ -60,10 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     folder = tmp_path_factory.mktemp("place")
     root = write_scene(folder / "scene", points=300)
     write_offset(root, Offset(offset=(1, 2, 3), frame="ENU", origin=PLACE))
-    scene, found = read_scene(root), RunFolder(folder / "place")
-    found.root.mkdir()
-    config = RunConfig.model_validate({"width": scene.width, "device": "cpu"})
-    write_info(found, make_info(SceneRef(path=str(root), fingerprint=scene.fingerprint), config))
+    found = begun(folder / "place", SceneRef(path=str(root), fingerprint=read_scene(root).fingerprint))
     write_ply(found.point_cloud, model(root))
     return found
 
