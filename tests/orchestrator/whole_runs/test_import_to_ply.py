@@ -1,6 +1,5 @@
 """From another program's files to a model: import, run, PLY."""
 
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -10,32 +9,14 @@ import torch
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.resources.nodes import Placement
-from panolog.orchestrator.resources.pool import Ended, Hello, Message
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.store import Database
 from panolog.prepare.importers.import_scene import import_scene
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
-from panolog.workers.specs import TaskSpec
-from tests.orchestrator.fakes import MACHINE, FakePool, well
+from tests.orchestrator.fakes import MACHINE, FakePool
 from tests.prepare.importers.writers import WRITERS
-
-
-class WorkingPool(FakePool):
-    """Does the real work in this thread: whole runs without Ray."""
-
-    def start(self, placement: Placement, spec: TaskSpec) -> None:
-        super().start(placement, spec)
-        self._running[spec.task] = _messages(spec)
-
-
-def _messages(spec: TaskSpec) -> Iterator[Message]:
-    yield Hello("node", 1)
-    yield from spec.run()
-    yield Ended()
-
 
 # All formats give the same scene (tests/prepare/importers/test_same_scene.py); these differ in tracks, split
 # and layout.
@@ -53,7 +34,7 @@ def test_run_after_import(case: str, tmp_path: Path, caplog: pytest.LogCaptureFi
         {"width": scene.width, "device": "cpu", "iterations": 4, "blocks": "2x1x1", "sky": {"count": 10}}
     )
     with closing(Database(folder.database)) as database:
-        job, pool = Job(folder, scene, config), WorkingPool(well, [MACHINE])
+        job, pool = Job(folder, scene, config), FakePool(lambda spec: spec.run(), [MACHINE])
         state = Driver(job, Journal(database), pool).run()
     assert state.outcome == "done"
     assert "coarse: attempt 1 from iteration 0 on node" in caplog.text
