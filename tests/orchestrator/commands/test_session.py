@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from panolog.orchestrator.commands import preparing, session
-from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run.config import RunConfig, load_config
 from panolog.orchestrator.run.folder import RunFolder
@@ -36,29 +35,23 @@ SETTINGS = {"width": 64, "iterations": 2, "blocks": "2x1x1", "sky.count": 2}
 CONFIG = load_config(flags=SETTINGS)
 
 
-def works(spec: TaskSpec) -> Iterator[Event | Calibration]:
-    yield from says(spec) if isinstance(spec, CalibrateSpec) else well(spec)
+def calibrating(action: Callable[[], object] = ignore) -> FakePool:
+    """A pool that does something when the calibration begins."""
 
-
-class CalibratingPool(FakePool):
-    """Does something when the calibration is to start."""
-
-    def __init__(self, action: Callable[[], object] = ignore) -> None:
-        super().__init__(works, [MACHINE])
-        self._action = action
-
-    def start(self, placement: Placement, spec: TaskSpec) -> None:
+    def work(spec: TaskSpec) -> Iterator[Event | Calibration]:
         if isinstance(spec, CalibrateSpec):
-            self._action()
-        super().start(placement, spec)
+            action()
+        yield from says(spec) if isinstance(spec, CalibrateSpec) else well(spec)
+
+    return FakePool(work, [MACHINE])
 
 
 def start(scene: Path, root: Path, action: Callable[[], object] = ignore, config: RunConfig = CONFIG) -> None:
-    session.start(scene, root, config, None, ignore, CalibratingPool(action))
+    session.start(scene, root, config, None, ignore, calibrating(action))
 
 
 def resume(root: Path, action: Callable[[], object] = ignore) -> None:
-    session.resume(root, None, ignore, CalibratingPool(action))
+    session.resume(root, None, ignore, calibrating(action))
 
 
 def status(root: Path) -> Any:
@@ -217,7 +210,7 @@ def test_two_drivers_of_one_folder(scene: Path, tmp_path: Path) -> None:
 def test_an_unforeseen_error_is_one_line_and_recorded(
     killed: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, line: str
 ) -> None:
-    monkeypatch.setattr(session, "_workers", lambda *_: nullcontext(CalibratingPool(fails(error))))
+    monkeypatch.setattr(session, "_workers", lambda *_: nullcontext(calibrating(fails(error))))
     monkeypatch.setattr(session, "_exported", lambda _, on_change: on_change)
     answer = call("resume", killed, "--resumed-after", "killed by signal 9")
     assert (answer.exit_code, answer.stdout) == (1, "")
