@@ -1,4 +1,4 @@
-"""SOG, version 2, written: a folder of lossless WebP images with their meta.json, or both in one ZIP.
+"""SOG, version 2, written: lossless WebP images with their meta.json, all in one ZIP.
 
 Equal Gaussians give equal bytes: times in the ZIP are fixed, and no sum depends on the order of threads.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from panolog.export.sog.folder import GENERATOR, META, new_folder, save
+from panolog.export.sog.folder import GENERATOR, META
 from panolog.export.sog.layers import Layers, make_layers
 from panolog.export.splats import SplatSource
 from panolog.scene.errors import FormatError
@@ -45,17 +45,6 @@ def write_sog(path: StrPath, source: SplatSource) -> None:
                 entry = zipfile.ZipInfo(name, _EPOCH)
                 entry.create_system, entry.external_attr = 3, 0o644 << 16  # on every system
                 archive.writestr(entry, data)
-
-
-def write_sog_folder(folder: StrPath, source: SplatSource) -> None:
-    """Writes Gaussians as a folder, which appears whole; one that this function wrote is replaced.
-
-    Raises:
-        FormatError: as `write_sog`, or the folder has something else in it.
-        OSError: the folder cannot be written.
-    """
-    with new_folder(Path(folder)) as temporary, threads() as pool:
-        save(temporary, encode(source, pool))
 
 
 @contextmanager

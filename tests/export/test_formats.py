@@ -13,11 +13,12 @@ from panolog.export.gltf.glb import write_glb
 from panolog.export.gltf.tiles import write_tiles
 from panolog.export.reading import read_model
 from panolog.export.sog.streamed import write_streamed
-from panolog.export.sog.write import write_sog, write_sog_folder
+from panolog.export.sog.write import write_sog
 from panolog.export.splats import InMemory
 from panolog.export.spz import write_spz
 from panolog.scene.errors import FormatError
 from tests.export.gaussians import line_of, mutated, scattered
+from tests.export.sog.models import write_unpacked
 
 MORE_THAN_A_PIECE = 70_000
 PLACE = enu_to_ecef(48, 11, 500)
@@ -26,7 +27,7 @@ READABLE: dict[str, tuple[Callable[[Path, InMemory], object], int]] = {  # with 
     "SPZ 4": (partial(write_spz, version=4), MORE_THAN_A_PIECE),
     "compressed PLY": (write_compressed_ply, MORE_THAN_A_PIECE),
     "SOG": (write_sog, 3000),
-    "folder": (write_sog_folder, 3000),
+    "SOG as a folder": (write_unpacked, 3000),
 }
 WRITERS = READABLE | {
     "GLB": (partial(write_glb, compression="spz"), 1000),

@@ -11,14 +11,14 @@ from panolog.export.gltf.glb import write_glb
 from panolog.export.order import morton_order
 from panolog.export.sog.read import read_sog
 from panolog.export.sog.streamed import write_streamed
-from panolog.export.sog.write import write_sog, write_sog_folder
+from panolog.export.sog.write import write_sog
 from panolog.export.splats import InMemory, Splats
 from panolog.export.spz import Version, read_spz, write_spz
 from panolog.scene.ply import read_ply, write_ply
 from tests.export.gaussians import scattered, turn_between
 from tests.export.gltf.reading import read_glb
 from tests.export.peers import node, peer
-from tests.export.sog.models import source, splats
+from tests.export.sog.models import source, splats, write_unpacked
 
 pytestmark = [pytest.mark.system, pytest.mark.nightly]
 
@@ -90,7 +90,7 @@ def test_sog(tmp_path: Path, count: int, degree: int) -> None:
 
 @pytest.mark.parametrize("name", ["a.sog", "meta.json"])
 def test_sog_of_theirs_and_in_a_folder(tmp_path: Path, name: str) -> None:
-    write_sog_folder(tmp_path / "ours", source(800))
+    write_unpacked(tmp_path / "ours", source(800))
     assert_equal(read_sog(tmp_path / "ours"), as_read(tmp_path / "ours/meta.json"))
     write_ply(tmp_path / "model.ply", splats(3000).gaussians())
     transformed("-g", "cpu", tmp_path / "model.ply", tmp_path / name)

@@ -1,8 +1,12 @@
 """Models for the tests of SOG."""
 
+import zipfile
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.export.sog.write import write_sog
 from panolog.export.splats import REST, InMemory, Splats
 
 Quats = NDArray[np.float32]
@@ -33,3 +37,11 @@ def source(count: int, degree: int = 3, seed: int = 1) -> InMemory:
 def turned_alike(quats: Quats, as_these: Quats) -> Quats:
     """(N, 4) quaternions (N, 4), each with the sign of its counterpart: q and −q are the same rotation."""
     return np.asarray(quats * np.sign((quats * as_these).sum(axis=1, keepdims=True)), np.float32)
+
+
+def write_unpacked(folder: Path, source: InMemory) -> None:
+    """A SOG as the folder that is in its file."""
+    write_sog(packed := folder.with_suffix(".sog"), source)
+    with zipfile.ZipFile(packed) as archive:
+        archive.extractall(folder)
+    packed.unlink()

@@ -15,10 +15,10 @@ import pytest
 from PIL import Image
 
 from panolog.export.sog.read import read_sog
-from panolog.export.sog.write import write_sog, write_sog_folder
+from panolog.export.sog.write import write_sog
 from panolog.scene.errors import FormatError
 from tests.export.gaussians import line_of
-from tests.export.sog.models import source
+from tests.export.sog.models import source, write_unpacked
 
 Change = Callable[[dict[str, Any]], object]
 
@@ -27,7 +27,7 @@ Change = Callable[[dict[str, Any]], object]
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sog")
     write_sog(folder / "a.sog", source(300))
-    write_sog_folder(folder / "files", source(300))
+    write_unpacked(folder / "files", source(300))
     return folder
 
 

@@ -12,10 +12,9 @@ from PIL import Image
 
 from panolog.export.order import morton_order
 from panolog.export.sog.read import read_sog
-from panolog.export.sog.write import encode, write_sog, write_sog_folder
+from panolog.export.sog.write import encode, write_sog
 from panolog.export.splats import REST, InMemory, Splats
-from panolog.scene.errors import FormatError
-from tests.export.sog.models import source, splats, turned_alike
+from tests.export.sog.models import source, splats, turned_alike, write_unpacked
 
 
 def assert_alike(found: Splats, wanted: Splats, palette_error: float = 0.03) -> None:
@@ -56,7 +55,7 @@ def test_gaussians_in_one_place(tmp_path: Path) -> None:
 
 def test_numbers_are_where_the_format_has_them(tmp_path: Path) -> None:
     """By hand, from PlayCanvas's description; nothing of the reader is used."""
-    write_sog_folder(tmp_path, source(700))
+    write_unpacked(tmp_path, source(700))
     meta, found = json.loads((tmp_path / "meta.json").read_text()), read_sog(tmp_path)
 
     def pixels(part: str, number: int = 0) -> np.ndarray:
@@ -90,13 +89,11 @@ def test_what_is_transparent_keeps_its_colour(tmp_path: Path) -> None:
 
 def test_folder_and_file_hold_the_same(tmp_path: Path) -> None:
     write_sog(tmp_path / "a.sog", source(700))
-    write_sog_folder(tmp_path / "folder", source(700))
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         assert archive.testzip() is None
-        packed = {name: archive.read(name) for name in archive.namelist()}
+        archive.extractall(tmp_path / "folder")
         assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
         assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
-    assert packed == {path.name: path.read_bytes() for path in (tmp_path / "folder").iterdir()}
     for path in (tmp_path / "folder", tmp_path / "folder/meta.json"):
         np.testing.assert_array_equal(read_sog(path).means, read_sog(tmp_path / "a.sog").means)
 
@@ -116,24 +113,6 @@ def test_bytes_do_not_depend_on_threads_or_pieces() -> None:
         with ThreadPoolExecutor(threads) as pool:
             made.append(encode(source(70_000, 1), pool))
     assert made[0] == made[1]
-
-
-def test_a_folder_is_replaced_only_if_it_is_ours(tmp_path: Path) -> None:
-    folder = tmp_path / "place"
-    folder.mkdir()
-    write_sog_folder(folder, source(50))
-    write_sog_folder(folder, source(60, degree=0))
-    assert len(read_sog(folder)) == 60 and not (folder / "shN_labels.webp").exists()
-    (folder / "notes.txt").write_text("mine")
-    with pytest.raises(FormatError, match=r"notes\.txt: not written as a SOG by panolog"):
-        write_sog_folder(folder, source(50))
-    (folder / "notes.txt").unlink()
-    meta = json.loads((folder / "meta.json").read_text())
-    (folder / "meta.json").write_text(json.dumps(meta | {"asset": {"generator": "other"}}))
-    with pytest.raises(FormatError, match="choose another folder"):
-        write_sog_folder(folder, source(50))
-    assert len(read_sog(folder)) == 60
-    assert [path.name for path in tmp_path.iterdir()] == ["place"]
 
 
 def test_version_1(tmp_path: Path) -> None:

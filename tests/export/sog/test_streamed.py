@@ -67,6 +67,11 @@ def test_it_replaces_its_own_only(tmp_path: Path) -> None:
     write_streamed(folder, source(10, 0))
     assert sorted(path.name for path in folder.iterdir()) == ["0_0", "lod-meta.json"]
     assert json.loads((folder / "lod-meta.json").read_text())["counts"] == [10]
+    index = (folder / "lod-meta.json").read_text()
+    (folder / "lod-meta.json").write_text(index.replace('"panolog"', '"other"'))
+    with pytest.raises(FormatError, match="choose another folder"):
+        write_streamed(folder, source(10))
+    (folder / "lod-meta.json").write_text(index)
     (folder / "0_0" / "photo.jpg").write_text("mine")
     with pytest.raises(FormatError, match=r"photo\.jpg: not written as a SOG"):
         write_streamed(folder, source(10))
