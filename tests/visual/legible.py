@@ -1,7 +1,7 @@
 """What makes a page hard to read: text with too little contrast, text over text, and sideways scrolling."""
 
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any, get_args
 
@@ -62,14 +62,16 @@ def low_contrast(page: Page, shown: Picture | None = None, *, whole: bool = True
     return lines
 
 
-def low_contrast_in_both_themes(page: Page) -> list[str]:
-    """`low_contrast` of all of an open page, in one theme after the other."""
+def hard_to_read(page: Page, *widths: int) -> list[str]:
+    """What makes an open page hard to read, at widths in pixels and in one theme after the other."""
     page.evaluate("scrollTo(0, 0)")  # else the head of the page is over some text
     found = []
-    for theme in get_args(Theme):
+    for width, theme in product(widths, get_args(Theme)):
+        page.set_viewport_size({"width": width, "height": 900})
         page.emulate_media(color_scheme=theme)
         wait_until_quiet(page)
-        found += [f"{theme}: {line}" for line in low_contrast(page)]
+        lines = [*sideways(page), *overlapping(page), *low_contrast(page)]
+        found += [f"{width} pixels, {theme}: {line}" for line in lines]
     return found
 
 

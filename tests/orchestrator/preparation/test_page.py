@@ -165,7 +165,7 @@ def test_the_page_has_steps_numbers_pictures_and_then_exposures(
         ]
         write_json(folder.root / "exposure.json", {"panoramas": known})
         expect(page.locator("#exposure-plot .scatterlayer .trace")).to_have_count(4)
-        assert legible.sideways(page) == legible.low_contrast_in_both_themes(page) == []
+        assert legible.hard_to_read(page, PHONE) == []
 
 
 def test_the_progress_of_a_run_grows_with_each_part_of_the_preparation(tmp_path: Path) -> None:

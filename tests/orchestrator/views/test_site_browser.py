@@ -17,6 +17,7 @@ from tests.orchestrator.views.models import make_run, save_plan
 from tests.orchestrator.views.pictures import layers, psnr, ready, rendered, shown, until
 from tests.orchestrator.views.sites import COUNT, SIZE, cloud, run_with, serving, viewpoints_of
 from tests.visual import legible
+from tests.visual.browser import wait_until_quiet
 
 pytestmark = pytest.mark.system
 
@@ -265,6 +266,7 @@ def test_the_page_is_legible_fits_and_needs_no_mouse(browser: Browser, site: str
             if page.locator(f"#{opener}").get_attribute("aria-expanded") != "true":
                 page.locator(f"#{opener}").focus()
                 page.keyboard.press("Enter")
+            wait_until_quiet(page)
             assert legible.low_contrast(page, whole=False) == []
             assert page.evaluate("document.documentElement.scrollWidth") <= width
             for part in ("panel", "walk"):

@@ -207,7 +207,4 @@ def test_it_can_be_read_and_names_are_text(browser: Browser, tmp_path: Path) -> 
         expect(page.locator("#queue-entries .pill[data-status=failed]")).to_be_visible()
         assert evil in page.locator("#queue-entries .run-name").all_inner_texts()
         assert page.evaluate(SMALL) == []
-        for width in (PHONE, DESK):
-            page.set_viewport_size({"width": width, "height": 900})
-            assert legible.sideways(page) == legible.low_contrast_in_both_themes(page) == []
-            assert legible.overlapping(page) == []
+        assert legible.hard_to_read(page, PHONE, DESK) == []
