@@ -84,11 +84,16 @@ def assert_map(scene: Path, wanted: Floats, name: str = NAMES[0]) -> None:
 
 
 @pytest.mark.parametrize("seam", ["turn", "none", "wrap"])
-@pytest.mark.parametrize("layout, axis", [("NCHW", 1), ("NHWC", 3)])
-def test_depth_becomes_inverse_depth(scene: Path, layout: str, axis: int, seam: str) -> None:
+@pytest.mark.parametrize(
+    ("layout", "batch", "fixed"),
+    [("NCHW", 2, "N"), ("NHWC", 2, "N"), ("NCHW", 1, "N"), ("NCHW", 5, "N"), ("NHWC", 2, 1), ("NHWC", 2, 4)],
+)
+def test_depth_becomes_inverse_depth(
+    scene: Path, layout: str, batch: int, fixed: int | str, seam: str
+) -> None:
     put = given(HEIGHT, layout=layout, seam=seam, wrap=8 if seam == "wrap" else 0)
-    model = red_depth(scene.parent, manifest(input=put), axis=axis)
-    made(scene, model)
+    axis = 1 if layout == "NCHW" else 3
+    made(scene, red_depth(scene.parent, manifest(input=put), batch=fixed, axis=axis), batch=batch)
     for name in NAMES:
         assert_map(scene, expected(1 / rgb(scene, name)[0]), name)
     assert not (scene / "skymasks").exists()
@@ -167,13 +172,6 @@ def test_nothing_that_is_no_depth_becomes_one(scene: Path) -> None:
     made(scene, red_depth(scene.parent, manifest()))
     depth = pixels(scene / "depths" / NAMES[0])
     assert (depth[:4] == 0).all() and (depth[4:] > 0).all()
-
-
-@pytest.mark.parametrize("batch, fixed", [(1, "N"), (5, "N"), (2, 1), (2, 4)])
-def test_batches_change_nothing(scene: Path, batch: int, fixed: int | str) -> None:
-    made(scene, red_depth(scene.parent, manifest(), batch=fixed), batch=batch)
-    for name in NAMES:
-        assert_map(scene, expected(1 / rgb(scene, name)[0]), name)
 
 
 @pytest.mark.parametrize("seam, wrap, smooth", [("none", 0, False), ("turn", 0, True), ("wrap", 16, True)])

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
-import numpy as np
 import onnxruntime
 import pytest
 
 from panolog.prepare.networks.manifest import DepthManifest, read_manifest
 from panolog.prepare.networks.network import Network, digest, providers
-from panolog.scene.errors import InputError, RunError
+from panolog.scene.errors import InputError
 from tests.prepare.networks.networks import given, red_depth
 
 CPU, CUDA, TENSORRT = (f"{name}ExecutionProvider" for name in ("CPU", "CUDA", "Tensorrt"))
@@ -135,13 +134,3 @@ def test_mutated_networks_are_refused_or_run(model: Path) -> None:
     assert found.returncode == 0, found.stderr
     assert found.stderr == ""  # onnxruntime's own lines would repeat ours
     assert int(found.stdout) < 2**20  # KiB
-
-
-def test_a_batch_is_what_the_network_gets(model: Path) -> None:
-    network = opened(model)
-    images = np.random.default_rng(0).integers(0, 256, (3, 16, 32, 3), np.uint8)
-    found = network.run(images)["depth"]
-    assert (network.batch, network.device, str(found.dtype)) == (0, "cpu", "float32")
-    np.testing.assert_allclose(found[:, 0], images[..., 0] / 255, atol=1e-6)
-    with pytest.raises(RunError, match="the network failed"):
-        network.run(images[:, :7])
