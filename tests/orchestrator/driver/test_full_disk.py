@@ -117,12 +117,11 @@ def test_a_database_without_room_keeps_no_record_and_loses_none(
 def test_what_landed_is_recorded_before_the_run_ends(quick: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
     """The write of one block fails for good while another block's is done in the same turn."""
 
-    def save(folder: Any, event: Event, *rest: Any) -> Record:
-        if isinstance(event, Trained) and event.task == TaskId.block(0):
-            raise PermissionError(13, "Permission denied")
-        return saving.save(folder, event, *rest)
+    def of_block(_: object, event: Event, *__: object) -> bool:
+        return isinstance(event, Trained) and event.task == TaskId.block(0)
 
-    monkeypatch.setattr(driver_module, "save", save)
+    error = PermissionError(13, "Permission denied")
+    monkeypatch.setattr(driver_module, "save", Refusing(saving.save, error, 1, of_block))
     with pytest.raises(RunError, match="Permission denied"):
         quick.drive()
     landed = {m.task for m in quick.records(ModelSaved)}
