@@ -17,7 +17,7 @@ from panolog.orchestrator.run.state import ignore
 from panolog.prepare.sfm.pipeline import SfmSettings, WithMasks, panoramas_in_folder, workspace_folder
 from panolog.scene.files import write_bytes
 from panolog.scene.write import StageProgress
-from tests.orchestrator.commands.test_session import CalibratingPool
+from tests.orchestrator.commands.test_session import calibrating
 
 CONFIG = load_config(flags={"width": 64, "iterations": 2, "blocks": "2x1x1", "sky.count": 2})
 REPORT = {
@@ -83,11 +83,11 @@ class FakeSfm:
 
 
 def start(source: Path, root: Path, *, action: Callable[[], object] = ignore, **options: Any) -> None:
-    session.start(source, root, CONFIG, None, ignore, CalibratingPool(action), None, Options(**options))
+    session.start(source, root, CONFIG, None, ignore, calibrating(action), None, Options(**options))
 
 
 def resume(root: Path) -> None:
-    session.resume(root, None, ignore, CalibratingPool())
+    session.resume(root, None, ignore, calibrating())
 
 
 class Killed(BaseException):
