@@ -19,7 +19,7 @@ from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.nodes import describe
 from panolog.orchestrator.cluster.places import Places
 from panolog.orchestrator.cluster.pool import RayPool
-from panolog.orchestrator.resources.machine import memory, oom_kills
+from panolog.orchestrator.resources.machine import oom_kills
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
 from panolog.orchestrator.resources.usage import Usage
@@ -135,14 +135,15 @@ def test_a_worker_whose_message_is_lost_is_ended(pool: RayPool, monkeypatch: pyt
     assert psutil.wait_procs([process], timeout=60)[0]
 
 
-def test_what_workers_of_the_run_hold_counts_as_free(pool: RayPool) -> None:
+def test_what_workers_of_the_run_hold_counts_as_free(pool: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A driver that comes after a kill finds workers of the last one, which end."""
+    monkeypatch.setattr("panolog.orchestrator.cluster.nodes.memory", lambda: 0)  # whatever others do here
     running = messages(pool, Holds(size=2**29))
     hello, _ = next(running), next(running)
     assert isinstance(hello, Hello)
     name = psutil.Process(hello.pid).cmdline()[0].removeprefix("ray::")
     usable, *_ = describe(0, name)
-    assert usable > memory() + 2**28
+    assert usable >= 2**29
     pool.cancel(TASK)
 
 
