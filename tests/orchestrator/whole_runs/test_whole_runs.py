@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from contextlib import closing, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
@@ -99,16 +98,12 @@ def launch(*arguments: object, accidents: Sequence[tuple[str, str]] = ()) -> sub
     )
 
 
-@dataclass
-class Ended:
-    code: int
-    stdout: str
-    stderr: str
+Ended = subprocess.CompletedProcess[str]
 
 
 def end_of(process: subprocess.Popen[str]) -> Ended:
     stdout, stderr = process.communicate(timeout=300)
-    return Ended(process.returncode, stdout, stderr)
+    return Ended(process.args, process.returncode, stdout, stderr)
 
 
 def state_of(root: Path) -> RunState:
@@ -133,13 +128,13 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended, Path]:
         launch("run", scene, "-o", killed, *SETTINGS, accidents=ACCIDENTS),
     ]
     calm_end, killed_end = map(end_of, processes)
-    assert (killed_end.code, killed_end.stdout) == (0, ""), killed_end.stderr
+    assert (killed_end.returncode, killed_end.stdout) == (0, ""), killed_end.stderr
     return calm, calm_end, killed
 
 
 def test_a_run_says_where_everything_is_and_leaves_nothing_behind(runs: tuple[Path, Ended, Path]) -> None:
     root, end, _ = runs
-    assert (end.code, end.stdout) == (0, ""), end.stderr
+    assert (end.returncode, end.stdout) == (0, ""), end.stderr
     assert "Traceback" not in end.stderr
     folder = RunFolder(root)
     for path in (folder.point_cloud, folder.metrics, folder.images, folder.plan_picture, folder.report):
