@@ -11,7 +11,7 @@ from panolog.scene.errors import ConfigError, StoreError, StoreLostError
 from panolog.scene.stores.cache import BOUND, FOLDER, Cache, Stored
 from panolog.scene.stores.store import open_store
 from panolog.scene.stores.url import is_url, parse_url
-from tests.object_store import ObjectStore, object_store
+from tests.object_store import Fault, ObjectStore, object_store
 
 pytestmark = pytest.mark.system
 
@@ -33,16 +33,20 @@ def credentials(server: ObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv(FOLDER, str(tmp_path / "cache"))
 
 
+WRITING: tuple[Fault, ...] = ("throttled", "reset", "lost answer", "error")
+READING: tuple[Fault, ...] = ("truncated", "throttled", "reset", "error")
+
+
 def test_faults_are_tried_again_and_nothing_is_lost(server: ObjectStore) -> None:
     store = open_store(server.url("faults"))
     content = {f"{number}": os.urandom(50_000 + number) for number in range(4)}
-    server.faults += ["throttled", "reset", "lost answer", "error"]
-    for name, data in content.items():
+    for (name, data), fault in zip(content.items(), WRITING, strict=True):
+        server.faults.append(fault)
         store.write(name, data)
-    server.faults += ["truncated", "throttled", "reset", "error"]
     listed = store.list()
     assert set(listed) == set(content)
-    for name, data in content.items():
+    for (name, data), fault in zip(content.items(), READING, strict=True):
+        server.faults.append(fault)
         assert store.read_whole(name, listed[name]) == data
     assert not server.faults
 
