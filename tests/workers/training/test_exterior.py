@@ -30,24 +30,26 @@ from panolog.workers.training.loss import Loss, loss_of
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
-from tests.workers.trainings import block_of, coarse_of, notices, same, settings, trained
+from tests.workers.trainings import block_of, coarse_of, notices, same, trained
 
 USUAL: dict[str, Any] = {
     "projection": "exact",
-    "densify": {"method": "relocate", "until": 24_000, "every_floor": 5, "max_gaussians": 0},
-    "checkpoint": {"every": 7},
+    "sky": {"count": 60},
+    "densify": {"method": "relocate", "until": 24_000, "every_floor": 5},
+    "checkpoint": {"every": 7, "share": 1},
     "preview": {"every": 12},
 }
 
 
 def block(scene: Scene, initial: Gaussians, kind: str = "baked", **groups: Any) -> TrainSpec:
     """With an exterior of that kind."""
-    return block_of(coarse_of(scene), initial, **USUAL | {"stage2": {"exterior": kind}} | groups)
+    config = TrainConfig.model_validate(USUAL | {"stage2": {"exterior": kind}} | groups)
+    return block_of(coarse_of(scene, config), initial)
 
 
 @pytest.fixture(scope="module")
 def initial(scene: Scene) -> Gaussians:
-    return trained(coarse_of(scene, settings(**USUAL)))
+    return trained(coarse_of(scene, TrainConfig.model_validate(USUAL)))
 
 
 def test_a_block_ends_as_with_a_frozen_exterior(scene: Scene, initial: Gaussians) -> None:
