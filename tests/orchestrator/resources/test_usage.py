@@ -2,10 +2,11 @@
 
 import json
 import secrets
+import shutil
 import socket
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from subprocess import PIPE, Popen
 
@@ -62,14 +63,16 @@ def test_measurements_come_between_the_events_of_a_task() -> None:
 def measuring(spec: TaskSpec) -> Iterator[Event]:
     for event in well(spec):
         yield event
-        yield HERE  # type: ignore[misc]
+        yield from (HERE, replace(HERE, node=socket.gethostname()))  # type: ignore[misc]
 
 
 def test_the_driver_keeps_one_measurement_of_each_machine(harness: Harness) -> None:
     harness.drive(measuring)
     database = harness.folder.database
     kept = queries.usages(database)
-    assert set(kept) == {"node"}
+    disk = shutil.disk_usage(harness.folder.root).total  # here that of the run counts
+    sizes = {node: usage["disk_total"] for node, usage in kept.items()}
+    assert sizes == {"node": HERE.disk_total, socket.gethostname(): disk}
     records = read_milestones(database)
     assert not any("Usage" in type(item.record).__name__ for item in records)
     live = view_run(History.of(records), {}, running=True, usages=kept)
