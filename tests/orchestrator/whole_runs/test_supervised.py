@@ -15,11 +15,11 @@ from panolog.orchestrator.driver.local_pool import local_pool
 from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Noticed, Outcome, RunBegan, RunEnded, TaskYielded
-from panolog.orchestrator.run.state import RunState, ignore, replay
-from panolog.orchestrator.run.store import read_milestones, read_records
+from panolog.orchestrator.run.state import RunState, ignore
+from panolog.orchestrator.run.store import read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
-from tests.orchestrator.whole_runs.test_whole_runs import SETS
+from tests.orchestrator.whole_runs.test_whole_runs import SETS, state_of
 from tests.ray_head import environment, wait_until
 
 pytestmark = pytest.mark.system
@@ -45,11 +45,6 @@ def supervise(scene: Path, root: Path, *more: str) -> subprocess.Popen[str]:
         env=environment() | {"RAY_gcs_rpc_server_reconnect_timeout_s": "2"},
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
     )
-
-
-def state_of(root: Path) -> RunState:
-    database = RunFolder(root).database
-    return replay(read_milestones(database)) if database.exists() else RunState()
 
 
 def driver_with(root: Path, holds: Callable[[RunState], object], but: list[int]) -> psutil.Process:

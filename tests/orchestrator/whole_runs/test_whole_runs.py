@@ -107,7 +107,9 @@ def end_of(process: subprocess.Popen[str]) -> Ended:
 
 
 def state_of(root: Path) -> RunState:
-    return replay(read_milestones(RunFolder(root).database))
+    """That of a run now; an empty one while it has no database."""
+    database = RunFolder(root).database
+    return replay(read_milestones(database)) if database.exists() else RunState()
 
 
 def wait_for_workers(root: Path) -> None:
