@@ -162,7 +162,7 @@ def _report(state: str, *views: str) -> Shot:
 SHOTS = (
     Shot("runs", lambda site: site.served.url, _chosen),
     Shot("compare", lambda site: site.compare_url, _compared),
-    _run("finished", _camera_around, "desk-light", "phone-light"),
+    _run("finished", _camera_around),
     _run("live", _failed_block),
     _run("failed", _charts, "desk-light", "desk-dark"),
     _run("preparing", _prepared, "desk-light", "phone-light"),
