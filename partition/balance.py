@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from panolog.partition.bounds import aabb
+from panolog.partition.bounds import Aabb
 from panolog.partition.cells import MOST_BLOCKS, Axis, Cut, Cuts
 from panolog.partition.contraction import contract
 
@@ -54,18 +54,17 @@ class _Part:
         return float(values[order[max(i - 1, 0) : i + 1]].mean())
 
 
-def balance(centers: ArrayLike, points: ArrayLike, rho_tri: float, blocks: int, fewest: int = 1) -> Cuts:
+def balance(centers: ArrayLike, points: ArrayLike, box: Aabb, blocks: int, fewest: int = 1) -> Cuts:
     """So many blocks, or as many as can be, of which each costs about the same and has `fewest` cameras.
 
     What a block costs is expected to follow its share of the cameras and its share of the sparse points, half
     each. A part is cut across the axis along which its cameras spread most; the axis of least spread, such as
     the height above a street, is never cut, so that from above each block is seen.
 
-    Args: centers (K, 3) of the training cameras and points (N, 3), world units; rho_tri of eq. 7.
-    Raises InputError as `aabb`, ValueError on values that are not finite.
+    Args: centers (K, 3) of the training cameras and points (N, 3), world units; box, the cameras' AABB.
+    Raises ValueError on values that are not finite.
     """
     cameras, cloud = np.asarray(centers, np.float64), np.asarray(points, np.float64)
-    box = aabb(cameras, rho_tri)
     cloud = contract(cloud[:: -(-len(cloud) // _MOST_POINTS) or 1], box)
     spread = np.ptp(cameras, axis=0)
     axes = [axis for axis in np.argsort(-spread, kind="stable")[:2] if spread[axis] >= _FLAT * spread.max()]
@@ -78,7 +77,7 @@ def balance(centers: ArrayLike, points: ArrayLike, rho_tri: float, blocks: int, 
 def fewest_blocks(
     centers: ArrayLike,
     points: ArrayLike,
-    rho_tri: float,
+    box: Aabb,
     budget: Budget,
     *,
     least: int = 1,
@@ -89,13 +88,12 @@ def fewest_blocks(
     If none are, as when all points lie in one place, that number whose fullest block is least above it.
     """
     cameras, cloud = np.asarray(centers, np.float64), np.asarray(points, np.float64)
-    box = aabb(cameras, rho_tri)
     standing, seen = contract(cameras, box), contract(cloud, box)
     first = max(least, int(np.ceil(len(cameras) / budget.cameras)), int(np.ceil(1 / budget.share)))
     first = min(first, MOST_BLOCKS)
     best, lowest = 1, np.inf
     for blocks in range(first, min(2 * first + 16, MOST_BLOCKS + 1)):
-        cuts = balance(cameras, cloud, rho_tri, blocks, fewest)
+        cuts = balance(cameras, cloud, box, blocks, fewest)
         share = np.bincount(cuts.block_of(seen)).max(initial=0) / max(len(cloud), 1)
         load = max(np.bincount(cuts.block_of(standing)).max() / budget.cameras, share / budget.share)
         if load < lowest:

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from panolog.scene.errors import InputError
 
-_ASPECT = 0.5  # of the box: its shortest axis over its longest is at least this
+_LEAST = 1e-6  # of an axis over the longest one: contraction divides by it
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +61,16 @@ def margin(centers: ArrayLike, rho_tri: float) -> float:
     return baseline(centers) * rho_tri
 
 
-def aabb(centers: ArrayLike, rho_tri: float) -> Aabb:
+def aabb(centers: ArrayLike, rho_tri: float, aspect: float = 0.0) -> Aabb:
     """The effective reconstruction volume: the trajectory about its centroid, widened by the margin (eq. 9).
 
-    No axis of the box is shorter than half the longest one, our deviation from eq. 7. Above a thin box the
-    contraction's maximum norm follows the thin axis alone and draws everything towards the middle: of a house
-    at the rim of a level walk, upper storeys would be in another cell than the ground floor. So a line along
-    any axis through the box stays in one column of cells at least as far as a quarter of the longest axis on
-    both sides of the centroid.
+    Above a thin box the contraction's maximum norm follows the thin axis alone and draws everything towards
+    the middle: of a house at the rim of a level walk, the upper storeys are in another cell than the others.
+    With an aspect of a half, which eq. 9 does not have, a line along any axis through the box stays in one
+    column of cells at least as far as a quarter of the longest axis on both sides of the centroid.
 
-    Args: centers (K, 3) training camera centres in world units. Raises InputError with fewer than two cameras
+    Args: centers (K, 3) training camera centres in world units; aspect, how long each axis of the box is at
+    least, over the longest one. Raises InputError with fewer than two cameras
     or if all are at one position, ValueError if a centre is not finite.
     """
     points = _checked(centers)
@@ -81,7 +81,7 @@ def aabb(centers: ArrayLike, rho_tri: float) -> Aabb:
         raise InputError(
             "all cameras of the scene are at one position: without a baseline it cannot be split"
         )
-    half = np.maximum(half, _ASPECT * largest)
+    half = np.maximum(half, max(aspect, _LEAST) * largest)
     return Aabb(centroid - half, centroid + half)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from panolog.partition.balance import balance
-from panolog.partition.bounds import Aabb, aabb, margin
+from panolog.partition.bounds import Aabb, margin
 from panolog.partition.cells import Cell, Cuts
 
 
@@ -49,16 +49,15 @@ class Districts:
 def make_districts(
     centers: ArrayLike,
     points: ArrayLike,
-    rho_tri: float,
+    box: Aabb,
     count: int,
     fewest: int = 1,
-    overlap: float | None = None,
+    *,
+    overlap: float,
 ) -> Districts:
     """So many districts, or as many as there are cameras for; other arguments and errors as `balance`.
 
-    Args: overlap, their margin in median camera distances; None = that of eq. 7.
+    Args: overlap, their margin in median camera distances.
     """
     cameras = np.asarray(centers, np.float64)
-    cuts = balance(cameras, points, rho_tri, count, fewest)
-    away = margin(cameras, rho_tri if overlap is None else overlap)
-    return Districts(cuts, aabb(cameras, rho_tri), away, cameras)
+    return Districts(balance(cameras, points, box, count, fewest), box, margin(cameras, overlap), cameras)

@@ -30,6 +30,13 @@ class PartitionConfig(BaseModel):
         description="Triangulation range factor: the AABB reaches this many median camera distances past the "
         "trajectory (eq. 7; the paper's value for all scenes).",
     )
+    aspect: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="How long each axis of the AABB is at least, over the longest one: 0.5 keeps the storeys "
+        "of a house along a level walk in one block; 0 = eq. 9 as it is.",
+    )
     tau_grad: float = Field(
         default=0.8,
         ge=0.0,
@@ -54,6 +61,10 @@ class PartitionConfig(BaseModel):
         description="Cameras a block needs to be trained; with fewer it keeps its Stage I Gaussians. Two "
         "place a surface and only a third can contradict them: with fewer, training overfits.",
     )
+
+    def box(self, centers: ArrayLike) -> Aabb:
+        """The AABB (eq. 9) of training cameras at centers (K, 3), world units. Raises as `aabb`."""
+        return aabb(centers, self.rho_tri, self.aspect)
 
     @field_validator("cuts")
     @classmethod
@@ -123,6 +134,7 @@ class Plan:
         """The content of plan.json: plain values, readable without this program (`plan_json.PlanFile`)."""
         return plan_json.PlanFile(
             rho_tri=self.config.rho_tri,
+            aspect=self.config.aspect,
             tau_grad=self.config.tau_grad,
             min_cameras=self.config.min_cameras,
             grid=self.grid.shape if isinstance(self.grid, Grid) else None,
@@ -184,6 +196,7 @@ class Plan:
             return Plan(
                 config=PartitionConfig(
                     rho_tri=file.rho_tri,
+                    aspect=file.aspect,
                     tau_grad=file.tau_grad,
                     min_cameras=file.min_cameras,
                     cells=file.cells,
@@ -222,12 +235,12 @@ def make_plan(
     """Bounds, cells and assignment in one (eqs. 7-9 and 11).
 
     Args: centers (K, 3) training camera centres and means (N, 3) scene Gaussians without sky, world units;
-    scores (K, B) of eq. 10 for the blocks of `grid` over `aabb(centers, config.rho_tri)`; rows (K,) of
+    scores (K, B) of eq. 10 for the blocks of `grid` over `config.box(centers)`; rows (K,) of
     Scene.panoramas and names (K,) of the cameras.
     Raises InputError as `aabb`, ValueError on shapes that disagree or values that are not finite.
     """
     points = np.asarray(centers, np.float64)
-    box = aabb(points, config.rho_tri)
+    box = config.box(points)
     plan = Plan(
         config=config,
         grid=grid,

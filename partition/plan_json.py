@@ -49,6 +49,7 @@ class PlanFile(_Strict):
 
     version: Literal[1] = 1
     rho_tri: float
+    aspect: float = 0.5  # before there was such a setting, it was this
     tau_grad: float
     min_cameras: int = 1  # before there was such a setting, one was enough
     grid: tuple[int, int, int] | None  # (B_x, B_y, B_z); None where blocks are balanced

@@ -25,6 +25,7 @@ from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import near_distance
+from panolog.workers.training.loss import loss_rows
 
 _MOST, _MOST_NEAR = 64, 16  # cameras of a shard
 T = TypeVar("T")
@@ -152,8 +153,7 @@ def _gradient(
     panorama = scene.panoramas[view.row]
     camera = Camera.of(panorama.rotation, panorama.translation, spec.width, spec.width // 2)
     color = render(model, camera, sh_degree=spec.config.sh.degree, near=near).color
-    loss = photometric_loss(
-        color, view.image, view.mask, spec.config.loss.lambda_ssim, exposure=view.exposure
-    )
+    rows, weight = loss_rows(spec.config.loss, view), spec.config.loss.lambda_ssim
+    loss = photometric_loss(color, view.image, view.mask, weight, rows, view.exposure)
     (gradient,) = torch.autograd.grad(loss.loss, model.means)
     return loss, gradient[model.scene]

@@ -13,7 +13,6 @@ from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import NONE, Ended, Hello, InProcess, Message
 from panolog.orchestrator.run.config import RunConfig
-from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
 from panolog.partition.contraction import expand
 from panolog.scene.gaussians import Gaussians
@@ -158,7 +157,7 @@ def coarse_model(spec: TrainSpec, counts: Sequence[int] | None = None) -> Gaussi
     config, scene = spec.config, spec.scene.load()
     if not isinstance(config, RunConfig):
         raise TypeError(f"{spec.task} is not of a run")
-    box = aabb(scene.centers[list(scene.train)], config.partition.rho_tri)
+    box = config.partition.box(scene.centers[list(scene.train)])
     return middles([Cell(box, config.grid, block) for block in range(config.grid.count)], counts)
 
 

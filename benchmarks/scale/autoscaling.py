@@ -40,7 +40,6 @@ from panolog.orchestrator.resources.scaling import IDLE_S, Group, Growth, Work
 from panolog.orchestrator.run.config import change
 from panolog.orchestrator.run.machines.config import ScalingConfig
 from panolog.orchestrator.stages.partitioning import block_labels
-from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
 from panolog.workers.tasks import EVAL, Stage, TaskId
 
@@ -243,7 +242,7 @@ def city_case(panoramas: int, seed: int = 0) -> Case:
     config = change(config, balanced(scene, config, max(2, round(panoramas / PER_BLOCK))))
     estimator = Estimator(scene, config, basis_on(scene, config, RTX_4090), ())
     estimate, train = estimator.estimate(), np.array(scene.train)
-    box = aabb(scene.centers[train], config.partition.rho_tri)
+    box = config.partition.box(scene.centers[train])
     cameras = np.bincount(
         config.grid.block_of(contract(scene.centers[train], box)), minlength=config.grid.count
     )

@@ -15,7 +15,6 @@ from benchmarks.scale.places import city
 from panolog.orchestrator.estimates.suggestions import balanced
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.stages.surroundings import Surroundings
-from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
 from panolog.renderer.process import release_memory
 from panolog.scene.model import Scene
@@ -109,7 +108,7 @@ def _write_model(path: Path, scene: Scene, each: int) -> int:
 def _cameras(scene: Scene, config: RunConfig, block: int) -> list[int]:
     """The training panoramas that stand in a block."""
     train = np.array(scene.train)
-    box = aabb(scene.centers[train], config.partition.rho_tri)
+    box = config.partition.box(scene.centers[train])
     rows: list[int] = train[config.grid.block_of(contract(scene.centers[train], box)) == block].tolist()
     return rows
 

@@ -22,7 +22,6 @@ from panolog.orchestrator.stages.partitioning import decide_plan, write_plan
 from panolog.orchestrator.stages.scenes import learnt_scene, scene_of
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.partition.audit import audit
-from panolog.partition.bounds import aabb
 from panolog.partition.plan import Plan, read_plan
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
@@ -106,7 +105,7 @@ def _scores_of(folder: RunFolder, config: RunConfig) -> NDArray[np.float64] | No
     if not folder.plan.exists():
         return None
     plan = read_plan(folder.plan)
-    box = aabb(plan.centers, config.partition.rho_tri)  # an older run may have bounded its own otherwise
+    box = config.partition.box(plan.centers)  # an older run may have bounded its own otherwise
     same = plan.grid == config.grid and np.array_equal(plan.aabb.half, box.half)
     return plan.scores if same else None
 

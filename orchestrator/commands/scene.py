@@ -5,8 +5,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from panolog.partition.bounds import aabb, baseline
-from panolog.partition.plan import PartitionConfig
+from panolog.orchestrator.run.config import RunConfig
+from panolog.partition.bounds import baseline
 from panolog.prepare.networks.depth_maps import make_depth, plan_depth
 from panolog.prepare.networks.depth_report import DepthReport, align_depth_maps, report_depth
 from panolog.prepare.networks.masks import MaskJob, find_nadir, find_static, make_masks, masks_as_json
@@ -21,7 +21,7 @@ from panolog.scene.write import StageProgress
 def describe(scene: Scene) -> dict[str, Any]:
     """What `panolog scene info --json` prints. Lengths are in world units."""
     centers = scene.centers[list(scene.train)]
-    box = aabb(centers, PartitionConfig().rho_tri)
+    box = RunConfig().partition.box(centers)
     panoramas = scene.panoramas
     return {
         "path": url_of(scene.root) or str(scene.root),

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.run.config import RunConfig
 from panolog.partition.assignment import OVERLAP
-from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
 from panolog.partition.districts import Districts, make_districts
 from panolog.partition.levels import expected_cut
@@ -27,14 +26,14 @@ _AROUND = 1 + FACES  # blocks around the faces of a shard
 
 def districts_of(scene: Scene, config: RunConfig) -> Districts:
     """The districts of a job, or as many as there are cameras for. Raises as `make_districts`."""
-    partition = config.partition
+    partition, centers = config.partition, scene.centers[list(scene.train)]
     return make_districts(
-        scene.centers[list(scene.train)],
+        centers,
         scene.points,
-        partition.rho_tri,
+        partition.box(centers),
         config.districts,
         partition.min_cameras,
-        config.overlap,
+        overlap=partition.rho_tri if config.overlap is None else config.overlap,
     )
 
 
@@ -162,5 +161,5 @@ class Parts:
         return self._cells(self.scene.points)
 
     def _cells(self, places: NDArray[np.float64]) -> NDArray[np.int64]:
-        box = aabb(self.scene.centers[list(self.scene.train)], self.config.partition.rho_tri)
+        box = self.config.partition.box(self.scene.centers[list(self.scene.train)])
         return self.config.grid.block_of(contract(places, box))

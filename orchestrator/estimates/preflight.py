@@ -221,8 +221,9 @@ def choose_blocks(estimator: Estimator) -> int:
     cameras = images / view / OVERLAP
     budget = Budget(max(1.0, cameras), max(1e-3, room))
     least = max(1, min(estimator.slots(estimator.host(coarse, len(train))), len(train) // _CAMERAS))
-    rho_tri, fewest = config.partition.rho_tri, config.partition.min_cameras
-    return fewest_blocks(scene.centers[train], scene.points, rho_tri, budget, least=least, fewest=fewest)
+    centers, fewest = scene.centers[train], config.partition.min_cameras
+    box = config.partition.box(centers)
+    return fewest_blocks(centers, scene.points, box, budget, least=least, fewest=fewest)
 
 
 def free_disk(root: Path) -> int:

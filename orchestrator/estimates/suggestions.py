@@ -38,7 +38,7 @@ Settings: TypeAlias = dict[str, object]  # by dotted key
 def balanced(scene: Scene, config: RunConfig, blocks: int) -> Settings:
     """The settings of so many balanced blocks, or of as many as there are cameras for."""
     centers, partition = scene.centers[list(scene.train)], config.partition
-    cells = balance(centers, scene.points, partition.rho_tri, blocks, partition.min_cameras)
+    cells = balance(centers, scene.points, partition.box(centers), blocks, partition.min_cameras)
     return {"blocks": str(cells.count), "partition.cuts": cells.cuts}
 
 

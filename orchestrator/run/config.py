@@ -93,6 +93,15 @@ class DiskConfig(Group):
 
 
 _MEASURED = 1.0  # pixels: renders of a city were 87 to 101 dB from those of the whole model, with 2 71 to 78
+# What runs did before there was a setting for it, by dotted key.
+_FORMER = {
+    "recipe": "paper",
+    "overlap": None,
+    "partition.aspect": 0.5,
+    "depth.unit": "baseline",
+    "depth.sky": True,
+    "densify.prune_scale": 0.0,
+}
 _FORMER_EXTERIOR = {"train": "full", "fixed": "frozen"}  # of stage2.exterior
 
 
@@ -171,13 +180,16 @@ class RunConfig(TrainConfig):
     def _follow_recipe(cls, given: Any, info: ValidationInfo) -> Any:
         """Adds the settings of the recipe where none are given; those of a run are complete.
 
-        Runs of before there were recipes followed the paper, and districts overlapped by the margin of eq. 7.
+        A run of before there was a setting continues as it began.
         """
         if not isinstance(given, dict):
             return given
         given = _canonical(given)
         if info.context == RESOLVED:
-            return {"recipe": "paper", "overlap": None, **given}
+            for key, value in _FORMER.items():
+                if not _given(given, key):
+                    _put(given, key, value)
+            return given
         recipe = given.get("recipe", cls.model_fields["recipe"].default)
         if not isinstance(recipe, str) or recipe not in RECIPES:
             return given

@@ -10,7 +10,6 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.records import BlockPlan, Noticed, PlanSaved, Record
 from panolog.partition.audit import audit
-from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
 from panolog.partition.plan import Plan, make_plan
 from panolog.scene.errors import RunError
@@ -23,7 +22,7 @@ _ROWS = 2**18  # Gaussians in a step
 
 def block_labels(scene: Scene, means: NDArray[np.float32], config: RunConfig) -> NDArray[np.int64]:
     """(N,) the block of each of the scene Gaussians at means (N, 3) (eqs. 7-9)."""
-    box, grid = aabb(scene.centers[list(scene.train)], config.partition.rho_tri), config.grid
+    box, grid = config.partition.box(scene.centers[list(scene.train)]), config.grid
     labels = np.empty(len(means), np.int64)
     for start in range(0, len(means), _ROWS):  # which bounds what contraction needs
         rows = slice(start, start + _ROWS)

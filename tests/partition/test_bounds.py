@@ -25,11 +25,13 @@ def test_aabb_is_the_trajectory_about_its_centroid_plus_the_margin() -> None:
     np.testing.assert_allclose(box.upper, [2.5 + 3.5 + 7.5, 7.5, 7.5])
 
 
-def test_no_axis_is_shorter_than_half_the_longest() -> None:
-    np.testing.assert_allclose(aabb(LINE, 0.0).half, [3.5, 1.75, 1.75])
+def test_no_axis_is_shorter_than_its_share_of_the_longest() -> None:
+    np.testing.assert_allclose(aabb(LINE, 0.0, aspect=0.5).half, [3.5, 1.75, 1.75])
+    np.testing.assert_allclose(aabb(LINE, 0.0).half, [3.5, 3.5e-6, 3.5e-6])
     centers = np.stack([np.zeros(1000), np.arange(1000.0), np.linspace(0, 800, 1000)], axis=1)
     rho = 5.0 / baseline(centers)
-    np.testing.assert_allclose(aabb(centers, rho).half, [252.25, 504.5, 405.0])
+    np.testing.assert_allclose(aabb(centers, rho, aspect=0.5).half, [252.25, 504.5, 405.0])
+    np.testing.assert_allclose(aabb(centers, rho).half, [5.0, 504.5, 405.0])
 
 
 @settings(max_examples=200, deadline=None)
@@ -46,7 +48,7 @@ def test_a_vertical_line_in_the_footprint_stays_in_one_column(
     """Level walks, any axis vertical; lines reach up and down half the footprint's half width."""
     random = np.random.default_rng(seed)
     walk = random.uniform(-100, 100, (40, 3)) * (1, narrow, 0.002)
-    box = aabb(walk[:, axes], rho_tri)
+    box = aabb(walk[:, axes], rho_tri, aspect=0.5)
     footprint, up = [axes.index(0), axes.index(1)], axes.index(2)
     height = box.half[footprint].max() / 2
     feet = box.center + random.uniform(-1, 1, (20, 3)) * box.half

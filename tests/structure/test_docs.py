@@ -1,4 +1,4 @@
-"""What the documents name exists: files of the repository, and the targets of links."""
+"""What the documents name exists: files of the repository, names in them, and the targets of links."""
 
 import re
 from pathlib import Path
@@ -10,6 +10,7 @@ from tests.structure.rules import ROOT, text, tracked
 DOCUMENTS = [file for file in tracked() if file.suffix == ".md"]
 _NAMED = re.compile(r"`([\w./-]+/[\w.-]*\.(?:py|pyi|h|cu|cpp|md|yaml|toml|txt|js|ts)|[\w-]+(?:/[\w-]+)*/)`")
 _LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
+_DEFINED = re.compile(r"((?:`[\w.]+`, )*`[\w.]+`) (?:in|of) `([\w/.-]+\.py)`")  # names, and their file
 # Folders of a scene or a run, not of the repository; and files of other projects.
 _ELSEWHERE = re.compile(
     r"(RUN|test|images|imgs|masks|skymasks|depths|sparse|control|dist|runs|eval|coarse|blocks|partition)/"
@@ -25,4 +26,8 @@ def test_paths_and_links_exist(document: Path) -> None:
         path for path in named if not (ROOT / path).exists() and not (ROOT / document.parent / path).exists()
     ]
     missing += [path for path in linked if not (ROOT / document.parent / path).exists()]
+    for names, path in _DEFINED.findall(content):
+        defined = text(Path(path)) if (ROOT / path).exists() else ""
+        last = [name.rpartition(".")[2] for name in re.findall(r"`([\w.]+)`", names)]
+        missing += [f"{name} in {path}" for name in last if not re.search(rf"\b{name}\b", defined)]
     assert not missing

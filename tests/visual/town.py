@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from panolog.partition.bounds import aabb
 from panolog.partition.cells import Grid
 from panolog.partition.contraction import contract
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
@@ -76,9 +75,10 @@ def write_model(path: Path) -> None:
 def plan(grid: str, count: int) -> Plan:
     """A partition of the town for that many training cameras: scores fall with the distance to a block."""
     cells, centers, where = Grid.parse(grid), cameras(count), points()
-    block = cells.block_of(contract(where, aabb(centers, PartitionConfig().rho_tri)))
+    config = PartitionConfig(aspect=0.5)
+    block = cells.block_of(contract(where, config.box(centers)))
     distance = np.linalg.norm(centers[:, None] - where[::10], axis=2)  # (K, P / 10)
     seen = np.exp(-distance / 50) @ np.eye(cells.count)[block[::10]]
     scores = seen / seen.max() * np.random.default_rng(3).uniform(0.7, 1, seen.shape)
     names = [f"street_{row:03d}.jpg" for row in range(count)]
-    return make_plan(centers, where, scores, cells, PartitionConfig(), rows=range(count), names=names)
+    return make_plan(centers, where, scores, cells, config, rows=range(count), names=names)

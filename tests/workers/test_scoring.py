@@ -8,7 +8,7 @@ import torch
 
 from panolog.partition.bounds import baseline
 from panolog.renderer.camera import Camera
-from panolog.renderer.losses import photometric_loss
+from panolog.renderer.losses import photometric_loss, sphere_rows
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians, concatenate
@@ -17,6 +17,7 @@ from panolog.scene.model import Scene
 from panolog.workers.events import Progress, Scored
 from panolog.workers.scoring import ScoreSpec, _gradient, in_shards, score
 from panolog.workers.specs import Value
+from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
 from tests.renderer.cuda.stubbed import stubbed, without_pairs
 from tests.renderer.cuda.waits import counted
@@ -46,7 +47,8 @@ def by_definition(spec: ScoreSpec, row: int) -> list[float]:
     near = config.near * baseline(scene.centers[:4])
     color = render(replace(gaussians, means=means), camera, near=near).color
     view = load_view(panorama, row, WIDTH)
-    photometric_loss(color, view.image, view.mask, config.loss.lambda_ssim).loss.backward()  # type: ignore[no-untyped-call]
+    rows = sphere_rows(WIDTH // 2, view.mask, "cpu") if config.loss.sphere else None
+    photometric_loss(color, view.image, view.mask, config.loss.lambda_ssim, rows).loss.backward()  # type: ignore[no-untyped-call]
     assert means.grad is not None
     norms = means.grad[gaussians.scene].double().abs().sum(1)
     return [
@@ -54,8 +56,10 @@ def by_definition(spec: ScoreSpec, row: int) -> list[float]:
     ]
 
 
-def test_scores_are_those_of_the_definition(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sphere", [False, True])
+def test_scores_are_those_of_the_definition(tmp_path: Path, sphere: bool) -> None:
     spec = spec_of(small_scene(tmp_path))
+    spec = replace(spec, config=TrainConfig.model_validate({"loss": {"sphere": sphere}}))
     means = spec.model.load().means
     before = means.clone()
     *progress, scored = score(spec)

@@ -18,9 +18,7 @@ from panolog.workers.settings import Group
 class LossConfig(Group):
     """The photometric part of eq. 6."""
 
-    lambda_ssim: float = Field(
-        default=0.2, ge=0, le=1, description="weight of D-SSIM against L1, no unit; eq. 6, 3DGS"
-    )
+    lambda_ssim: float = Field(default=0.2, ge=0, le=1, description="weight of D-SSIM, not L1; eq. 6, 3DGS")
     sphere: bool = Field(
         default=False,
         description="true = pixels count by their area on the sphere, as WS-PSNR measures them, in L1, D-SSIM"
@@ -52,13 +50,16 @@ class DepthConfig(Group):
     w0: float = Field(
         default=0.5,
         ge=0,
-        description="weight at the first iteration for inverse depths in units of 1 / b̂ (eq. 8), 0 = no"
-        " depth loss; app. C, which leaves the unit open",
+        description="weight at the first iteration, 0 = no depth loss; app. C",
     )
     wT: float = Field(default=0.01, gt=0, description="weight at the last iteration; app. C")  # noqa: N815
+    unit: Literal["world", "baseline"] = Field(
+        default="world",
+        description="unit of depths in the loss: that of the poses, as in eq. 5, or b̂ (eq. 8)",
+    )
+    sky: bool = Field(default=False, description="whether the sky is in the Ω of eq. 5, as infinitely far")
     kind: Literal["inverse", "depth"] = Field(
-        default="inverse",
-        description="what the depth images hold, radial inverse depth or radial depth; eq. 4 has inverse",
+        default="inverse", description="radial inverse depth or radial depth in depth images; eq. 4: inverse"
     )
     min_points: int = Field(
         default=20,
@@ -134,6 +135,7 @@ class DensifyConfig(Group):
     prune_opacity: float = Field(
         default=0.005, ge=0, lt=1, description="opacity below which they are removed, o_min of eq. 12; 3DGS"
     )
+    prune_scale: float = Field(default=0.1, ge=0, description="largest scale, in extents, 0 = any; 3DGS")
     max_gaussians: int = Field(
         default=0,
         ge=0,

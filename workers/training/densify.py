@@ -204,7 +204,16 @@ def drop_unrisen(state: ModelState, ceiling: float) -> None:
 
     No view gave them, since the last reset, a gradient that made them visible: left in, they would be haze.
     """
-    kept = state.gaussians.opacities > logit(ceiling)  # as logits, see `_sources`
+    _keep(state, state.gaussians.opacities > logit(ceiling))  # as logits, see `_sources`
+
+
+def drop_large(state: ModelState, bound: float) -> None:
+    """Remove the scene Gaussians with a scale above the bound, in world units (3DGS)."""
+    _keep(state, state.gaussians.scales.amax(1) <= math.log(bound))
+
+
+def _keep(state: ModelState, kept: Tensor) -> None:
+    """Remove the other scene Gaussians. Args: kept (N,) bool; of the sky all stay."""
     kept[state.gaussians.scene.stop :] = True
     source = kept.nonzero()[:, 0]
     state.rearrange(source, torch.zeros_like(source, dtype=torch.bool), state.gaussians.sky)

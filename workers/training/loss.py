@@ -13,7 +13,7 @@ from panolog.renderer.render import Render
 from panolog.scene.depth_alignment import Alignment, AlignmentError, align_depth, inverse_prior
 from panolog.scene.images import View
 from panolog.scene.model import Scene
-from panolog.workers.training.config import DepthConfig, TrainConfig
+from panolog.workers.training.config import DepthConfig, LossConfig, TrainConfig
 from panolog.workers.training.initialise import scene_length
 from panolog.workers.training.schedule import Schedule
 
@@ -32,15 +32,15 @@ class DepthTargets:
     def target(self, view: View) -> tuple[Tensor, Tensor] | None:
         """Target (H, W) inverse radial depth and validity (H, W) bool of a view; None without usable depth.
 
-        Sky is a valid 0: it is where the sky mask says so, without one where the prior is 0. A prior of 0
-        that a sky mask calls foreground is a hole; holes and masked pixels are not valid.
+        Sky is where the sky mask says so, without one where the prior is 0; it is a valid 0 if the config has
+        it. A prior of 0 that a sky mask calls foreground is a hole; holes and masked pixels are not valid.
         """
         if view.inverse_depth is None or (alignment := self.align(view)) is None:
             return None
         prior = inverse_prior(view.inverse_depth, self.config.kind)
         sky = prior <= 0 if view.sky is None else view.sky
         target = torch.where(sky, 0, (alignment.scale * prior + alignment.offset).clamp(min=0))
-        valid = sky | (prior > 0)
+        valid = sky | (prior > 0) if self.config.sky else ~sky & (prior > 0)
         return target, valid if view.mask is None else valid & view.mask
 
     def _align(self, view: View) -> Alignment:
@@ -111,7 +111,7 @@ class Loss:
     def __init__(self, scene: Scene, config: TrainConfig, seed: int, schedule: Schedule) -> None:
         self._config, self._schedule = config.loss, schedule
         self.depth = DepthTargets(scene, config.depth, seed)
-        self.unit = scene_length(scene)  # b̂ (eq. 8), world units
+        self.unit = scene_length(scene) if config.depth.unit == "baseline" else 1.0  # world units
 
     def targets(self, view: View, depth_weight: float, around: Baked | None = None) -> Targets:
         """What counts: of a view that is rendered with an exterior the active pixels.
@@ -136,17 +136,17 @@ class Loss:
         return view
 
     def depth_weight(self, iteration: int) -> float:
-        """w(t) for inverse depths in units of 1 / b̂ (eq. 8): parallaxes γ = b̂ / z, in radians.
-
-        The paper has none: w_0 would then mean something else for every unit of length of a scene.
-        """
+        """w(t) of eq. 5; for inverse depths in units of 1 / b̂ they are parallaxes γ = b̂ / z, in radians."""
         return self._schedule.depth_weight(iteration) * self.unit
 
     def rows(self, view: View) -> Tensor | None:
         """Weights of the rows of a view."""
-        if not self._config.sphere:
-            return None
-        return sphere_rows(len(view.image), view.mask, view.image.device)
+        return loss_rows(self._config, view)
+
+
+def loss_rows(config: LossConfig, view: View) -> Tensor | None:
+    """(H,) weights of the rows of a view in the photometric part of eq. 6; None: all 1."""
+    return sphere_rows(len(view.image), view.mask, view.image.device) if config.sphere else None
 
 
 def _active_part(mask: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,8 +1,8 @@
 """Recipes: presets of ordinary settings. A run's own settings win over those of its recipe.
 
-`paper` is the paper to the letter, and 3DGS where it is silent: each setting's own default. `panolog`
-changes what has proven better: `python -m benchmarks.paper` measures each change alone and with the
-rest (docs/quality.md).
+`paper` is the paper to the letter, and 3DGS where it is silent (docs/fidelity.md): each setting's own
+default. `panolog` changes what has proven better: `python -m benchmarks.paper` measures each change alone
+and with the rest (docs/quality.md).
 They are separate from the settings because they cover those of the whole run.
 """
 
@@ -16,6 +16,9 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
     "panolog": {
         "projection": "exact",  # an affine splat is another shape where a Gaussian is near or at a pole
         "partition.tau_grad": 0.1,
+        "partition.aspect": 0.5,  # the storeys of a house are in one block
+        "depth.unit": "baseline",  # a weight that means the same whatever the unit of a reconstruction
+        "depth.sky": True,  # nothing near may hide in the sky
         "densify.method": "relocate",  # as many Gaussians as the paper, where they are needed; no resets
         "densify.growth": 0.75,  # so that a street has no more than in the paper's recipe
         "densify.filled": 0.25,  # early: a Gaussian needs time to learn

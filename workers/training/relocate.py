@@ -23,6 +23,7 @@ from panolog.workers.training.densify import (
     Statistics,
     camera_distances,
     densify,
+    drop_large,
     opacities_of,
     rotate,
     stretch_apart,
@@ -77,6 +78,8 @@ def grow(
             apart = config.large == "distance"
             extent = camera_distances(means, place.centers) if apart else schedule.extent
             densify(state, statistics, config, extent, random)
+            if schedule.prunes_large(iteration):
+                drop_large(state, config.prune_scale * schedule.extent)
         case "relocate":
             target = schedule.budget(iteration, place.start, place.pixels)
             room = Room(target, inside(state.gaussians, place.cell), schedule.cooling(iteration))

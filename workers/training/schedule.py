@@ -75,6 +75,11 @@ class Schedule:
         started = iteration > self.point(self.config.densify.start) and not self.recovers(iteration)
         return started and self.collects(iteration) and self.ends_interval(iteration)
 
+    def prunes_large(self, iteration: int) -> bool:
+        """Whether densification removes large Gaussians: when the first reset has been due (3DGS)."""
+        reset, scale = self.config.reset, self.config.densify.prune_scale
+        return scale > 0 and iteration > self.interval(reset.every, reset.every_floor)
+
     def turns(self) -> list[int]:
         """The iterations after which Gaussians may densify or opacities be reset, and no others."""
         densify, reset = self.config.densify, self.config.reset

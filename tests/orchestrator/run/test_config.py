@@ -9,10 +9,8 @@ from panolog.workers.training.recipes import RECIPES
 
 def test_recipe_paper_has_the_papers_values() -> None:
     config = load_config(flags={"recipe": "paper"})
-    assert config.model_dump(exclude={"recipe", "overlap"}) == RunConfig.model_validate(
-        {}, context=RESOLVED
-    ).model_dump(exclude={"recipe", "overlap"})
-    assert (config.partition.rho_tri, config.partition.tau_grad) == (5, 0.8)
+    assert (config.partition.rho_tri, config.partition.tau_grad, config.partition.aspect) == (5, 0.8, 0)
+    assert (config.depth.unit, config.depth.sky, config.densify.prune_scale) == ("world", False, 0.1)
     assert (config.sky.kappa, config.sky.count) == (10, 100_000)
     assert (config.depth.w0, config.depth.wT) == (0.5, 0.01)
     assert (config.loss.lambda_ssim, config.iterations, config.blocks) == (0.2, 30_000, "2x1x1")
@@ -129,6 +127,8 @@ def test_the_settings_of_a_run_are_complete() -> None:
     assert RunConfig.model_validate(run, context=RESOLVED).partition.tau_grad == 0.8
     older = RunConfig.model_validate({"partition": {"rho_tri": 5.0}}, context=RESOLVED)  # knew no recipes
     assert older.recipe == "paper" and older.overlap is None
+    assert (older.partition.aspect, older.depth.unit, older.depth.sky) == (0.5, "baseline", True)
+    assert older.densify.prune_scale == 0
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,13 @@ from panolog.renderer.cuda.iteration import Found, Problem
 from panolog.renderer.render import render
 from panolog.scene.gaussians import logit
 from panolog.workers.training.config import DensifyConfig
-from panolog.workers.training.densify import Statistics, camera_distances, densify, reset_opacities
+from panolog.workers.training.densify import (
+    Statistics,
+    camera_distances,
+    densify,
+    drop_large,
+    reset_opacities,
+)
 from panolog.workers.training.initialise import isotropic
 from panolog.workers.training.optimizer import ModelState, finite_loss
 from tests.renderer.cuda.emulation import EmulatedLaunch
@@ -192,6 +198,14 @@ def test_halves_along_the_longest_axis_keep_the_mass() -> None:
     assert halves[0][:, 1].tolist() == pytest.approx([-0.8 / math.sqrt(2), 0.8 / math.sqrt(2)])
     assert torch.allclose(halves[1], torch.tensor([0.1, 0.8 / math.sqrt(2), 0.2]))
     assert halves[2].tolist() == pytest.approx([0.5 / math.sqrt(2)] * 2)
+
+
+def test_large_ones_go_but_for_the_sky() -> None:
+    state = state_of([0.9, 1.1, 0.5, 50.0], [0.5] * 4, sky=1)
+    state.gaussians.scales[2, 1] = math.log(1.2)
+    drop_large(state, 1.0)
+    assert state.gaussians.means[:, 0].tolist() == [0, 300]
+    assert state.gaussians.sky == 1 and len(state.exp_avg["means"]) == 2
 
 
 @pytest.mark.parametrize("rows", [[True, True, True], [False, True, True]])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from panolog.partition.bounds import baseline
 from panolog.scene.images import View, load_view
 from panolog.scene.model import Scene
 from panolog.workers.training.config import DepthConfig, TrainConfig
@@ -59,12 +60,15 @@ def test_each_width_has_an_alignment_of_its_own(scene: Scene) -> None:
     assert found is not None and expected is not None and torch.equal(found[0], expected[0])
 
 
-def test_target_is_inverse_depth_and_zero_in_the_sky(scene: Scene) -> None:
+def test_target_is_inverse_depth_and_zero_in_the_sky_if_that_counts(scene: Scene) -> None:
     view = view_of(scene, 0)  # 0.3 from the middle of the sphere
     panoramas = tuple(replace(panorama, depth_affine=AFFINE) for panorama in scene.panoramas)
-    found = DepthTargets(replace(scene, panoramas=panoramas), DepthConfig(), 0).target(view)
-    assert found is not None and view.sky is not None and view.mask is not None
+    counting = DepthTargets(replace(scene, panoramas=panoramas), DepthConfig(sky=True), 0)
+    found, ground = counting.target(view), DepthTargets(counting.scene, DepthConfig(), 0).target(view)
+    assert found is not None and ground is not None and view.sky is not None and view.mask is not None
     target, valid = found
+    assert torch.equal(ground[1], view.mask & ~view.sky)
+    assert torch.equal(target[ground[1]], ground[0][ground[1]])
     assert (target[view.sky] == 0).all()
     distance = 1 / target[~view.sky]
     assert distance.amin().item() == pytest.approx(RADIUS - 0.3, rel=0.01)
@@ -83,6 +87,14 @@ def test_a_hole_of_the_prior_is_not_sky_where_a_sky_mask_says_so(scene: Scene) -
     with_mask, without = targets.target(view), targets.target(replace(view, sky=None))
     assert with_mask is not None and not with_mask[1][ground[0], ground[1]]
     assert without is not None and without[0][ground[0], ground[1]] == 0
+
+
+def test_the_weight_is_that_of_the_paper_or_in_units_of_the_baseline(scene: Scene) -> None:
+    length = baseline(scene.centers[list(scene.train)])
+    for unit, factor in (("world", 1.0), ("baseline", length)):
+        config = TrainConfig.model_validate({"depth": {"unit": unit}})
+        loss = Loss(scene, config, 0, Schedule(config, 100, extent=1.0, refine=False))
+        assert loss.depth_weight(100) == pytest.approx(0.01 * factor)
 
 
 def test_a_view_without_depth_has_no_target(tmp_path: Path) -> None:
