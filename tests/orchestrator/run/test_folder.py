@@ -69,9 +69,11 @@ def test_an_occupied_folder_is_refused_and_untouched(folder: RunFolder, tmp_path
         check_output(folder.info / "below", "f")
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_an_unwritable_folder_is_refused(tmp_path: Path) -> None:
-    tmp_path.chmod(0o555)
+def test_an_unwritable_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written, because .*file is not a folder"):
+        check_output(tmp_path / "file" / "run", "f")
+    monkeypatch.setattr(os, "access", lambda *_: False)  # as for users other than root
     with pytest.raises(InputError, match="cannot be written"):
         check_output(tmp_path / "run", "f")
 

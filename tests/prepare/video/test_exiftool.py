@@ -24,9 +24,10 @@ from tests.prepare.video.sensors import camm, camm_gps, exposure, gps5, payload
 
 PLACE = np.array([-47.1234567, 8.7654321, 400.125])
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("exiftool") is None, reason="exiftool is not installed (libimage-exiftool-perl)"
-)
+pytestmark = [
+    pytest.mark.nightly,
+    pytest.mark.skipif(shutil.which("exiftool") is None, reason="no exiftool: libimage-exiftool-perl"),
+]
 
 
 def tags(path: Path) -> dict[str, object]:

@@ -111,6 +111,6 @@ def exiftool(path: Path, *options: str) -> Path:
     """Writes tags with exiftool; skips the test where it is not installed."""
     program = shutil.which("exiftool")
     if program is None:
-        pytest.skip("exiftool is not installed (Debian: libimage-exiftool-perl)")
+        pytest.skip("no exiftool: libimage-exiftool-perl")
     subprocess.run([program, "-q", "-overwrite_original", *options, str(path)], check=True)
     return path

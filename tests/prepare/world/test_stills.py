@@ -130,6 +130,7 @@ def test_sfm_reads_the_metadata_first(tmp_path: Path) -> None:
         make_scene(tmp_path / "place", tmp_path / "scene", SfmSettings(), lambda *_: None)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_what_exiftool_writes(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
