@@ -71,7 +71,7 @@ def test_an_occupied_folder_is_refused_and_untouched(folder: RunFolder, tmp_path
 
 def test_an_unwritable_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="cannot be written, because .*file is not a folder"):
+    with pytest.raises(InputError, match=r"cannot be written, because .*file is not a folder"):
         check_output(tmp_path / "file" / "run", "f")
     monkeypatch.setattr(os, "access", lambda *_: False)  # as for users other than root
     with pytest.raises(InputError, match="cannot be written"):
