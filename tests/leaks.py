@@ -196,7 +196,7 @@ def _command(pid: int) -> str:
 
 
 def _parent(pid: int) -> int:
-    """Its parent; 0 of one that is gone."""
+    """The parent of a process; 0 of one that is gone."""
     fields = _bytes(_PROC / str(pid) / "stat").rpartition(b")")[2].split()
     return int(fields[1]) if fields else 0
 

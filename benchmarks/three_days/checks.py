@@ -89,7 +89,7 @@ def wrong(sent: Sequence[Sent], records: Sequence[Stored], lives: Sequence[Life]
 
 
 def _wrong_of(task: TaskId, sent: Sequence[Sent], records: Sequence[Record], life: Life) -> Iterator[str]:
-    """The same of one task with one driver: both are read side by side.
+    """What is wrong with the records of one task under one driver; messages and records are read in step.
 
     A driver records what it has taken before the simulated clock goes on. So a kill can lose the messages of
     the last moment alone, and nothing of the task is recorded after them; its next attempt sends them again.

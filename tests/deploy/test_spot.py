@@ -84,7 +84,7 @@ print(parse_apply_configuration(yaml.safe_load(open(sys.argv[1]))).nodes)
     ids=["skypilot", "dstack"],
 )
 def test_the_launcher_itself_reads_its_task(program: str, file: str, found: str, tmp_path: Path) -> None:
-    """They have an environment of their own, because they pin versions that PanoLOG uses others of."""
+    """SkyPilot and dstack have an environment of their own: they pin other versions than PanoLOG does."""
     python = ROOT / "build" / "peers" / "bin" / "python"
     if not python.exists():
         pytest.skip("skypilot and dstack are not installed: make nightly")

@@ -111,7 +111,7 @@ def test_levels_of_a_streamed_sog(tmp_path: Path) -> None:
 
 
 def test_glb(tmp_path: Path) -> None:
-    """The same attributes from the same model, whose y splat-transform takes to be down in a PLY."""
+    """Attributes that two writers give one model, whose y splat-transform takes to be down in a PLY."""
     model = scattered(1000)
     write_ply(tmp_path / "a.ply", model.gaussians())
     transformed("-q", tmp_path / "a.ply", tmp_path / "theirs.glb")

@@ -62,7 +62,7 @@ def test_the_words_of_a_run_come_back_with_absolute_paths(here: Path, scene: Pat
 def test_run_and_resume_take_the_words_of_a_queue(
     here: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a run that was added elsewhere, as the runner gives them to `panolog`."""
+    """`run` and `resume` get the words that the runner passes on for a run that was added elsewhere."""
     given: list[tuple[object, ...]] = []
     monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
     for name in ("start", "resume"):
