@@ -107,6 +107,18 @@ def test_the_map_fills_its_card_and_all_is_reached_by_keyboard(browser: Browser,
         assert unreachable(page) == []
 
 
+# Entries of legends that reach out of their charts.
+CUT = """() => [...document.querySelectorAll("#charts .legendtext")].filter((node) =>
+  node.getBoundingClientRect().right > node.closest("svg").getBoundingClientRect().right)"""
+
+
+def test_the_legend_fits_a_window_that_was_made_narrow(browser: Browser, shown: Served) -> None:
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}", width=DESK) as page:
+        expect(page.locator("#charts .legendtext").first).to_be_attached()
+        page.set_viewport_size({"width": PHONE, "height": 850})
+        page.wait_for_function(f"() => innerWidth < 400 && !({CUT})().length", timeout=PATIENCE_MS)
+
+
 def test_runs_are_found_and_sorted_in_a_theme_that_stays(browser: Browser, shown: Served) -> None:
     background = "getComputedStyle(document.body).backgroundColor"
     with opened(browser, shown.url) as page:

@@ -5,7 +5,7 @@
 /** @import { BlockTable } from "./blocks.js" */
 /** @import { Row } from "./rows.js" */
 import { get, statusOf } from "../shared/api.js";
-import { CHARTS, chartLayout, chartTitle, chartTraces } from "../shared/charts.js";
+import { CHARTS, chartLayout, chartTitle, chartTraces, narrow } from "../shared/charts.js";
 import { byId, el, replaceIfChanged, throttled, token } from "../shared/dom.js";
 import { taskLabel } from "../shared/format.js";
 import { draw, themed } from "./plot.js";
@@ -77,6 +77,7 @@ export function curves(path, table) {
   }
 
   document.addEventListener("themechange", () => { chips(); render(); });
+  narrow.addEventListener("change", render);
 
   return {
     toggle,

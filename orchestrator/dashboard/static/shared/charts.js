@@ -7,6 +7,8 @@
 /** A task with curves. @typedef {{label: string, color: string, series: TaskSeries}} Curve */
 /** @typedef {{key: string, title: string, unit: string, size?: number}} ChartKind */
 
+/** Whether the page is as narrow as a phone's. */
+export const narrow = matchMedia("(max-width: 720px)");
 const RATES = "rate/"; // and the name of a parameter
 /** `size` is the unit in what the records hold. @type {ChartKind[]} */
 export const CHARTS = [
@@ -53,7 +55,7 @@ export function chartLayout({ key }) {
   const log = key === RATES;
   return {
     margin: { l: 8, r: 10, t: 6, b: 8 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", showlegend: log,
-    legend: { orientation: "h", x: 0, y: 1, yanchor: "bottom", font: { size: 11 }, itemclick: false, itemdoubleclick: false, itemwidth: 30, entrywidth: matchMedia("(max-width: 720px)").matches ? 0.5 : 0.33, entrywidthmode: "fraction" },
+    legend: { orientation: "h", x: 0, y: 1, yanchor: "bottom", font: { size: 11 }, itemclick: false, itemdoubleclick: false, itemwidth: 30, entrywidth: narrow.matches ? 0.5 : 0.33, entrywidthmode: "fraction" },
     hovermode: "x unified", dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom", uirevision: "curves",
     font: { family: "system-ui, sans-serif", size: 11.5 },
     xaxis: { automargin: true, rangemode: "tozero", zeroline: false, nticks: 6, title: { text: "iteration", standoff: 6, font: { size: 11.5 } } },
