@@ -18,6 +18,8 @@ from panolog.synthetic.noise import Floats
 from panolog.synthetic.shapes import Convex
 from panolog.synthetic.trace import CitySun, PanoramaRays, PointRays, Scenery, cast
 
+pytestmark = pytest.mark.system
+
 STREETS = plan(300)
 UP = np.array([[0.0], [0.0], [1.0]], np.float32)
 

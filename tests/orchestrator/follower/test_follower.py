@@ -21,6 +21,8 @@ from tests.orchestrator.follower import histories
 from tests.orchestrator.follower.receivers import Receiver, receiver
 from tests.ray_head import living, wait_until
 
+pytestmark = pytest.mark.system
+
 FOLLOWER = "panolog.orchestrator.follower"
 # A command of a run that is killed: it starts the follower and waits.
 KILLED = """

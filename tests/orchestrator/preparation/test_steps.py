@@ -26,6 +26,8 @@ from tests.orchestrator.cli.program import call, shown
 from tests.orchestrator.preparation.fake_sfm import FakeSfm, Killed, resume, start
 from tests.prepare.networks.networks import given, red_depth
 
+pytestmark = pytest.mark.system
+
 
 def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> None:
     assert calm.point_cloud.exists()

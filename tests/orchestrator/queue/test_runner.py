@@ -23,6 +23,8 @@ from tests.orchestrator.queue.queues import RUNNER, Scripted
 from tests.orchestrator.queue.stand_in import STEPS
 from tests.ray_head import wait_until
 
+pytestmark = pytest.mark.system
+
 RESULT = "\n".join(str(step + 1) for step in range(STEPS))
 
 

@@ -18,6 +18,8 @@ from panolog.synthetic import make_town
 from tests.data import shared
 from tests.scenes import write_image
 
+pytestmark = pytest.mark.system
+
 Array = NDArray[np.float64]
 
 
