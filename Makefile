@@ -50,7 +50,7 @@ test: $(READY)  ## run the tests
 check: lint  ## lint, and run the unit tests: those without Ray, browser and whole runs
 	$(PYTEST) -m "not system and not nightly"
 
-nightly: $(READY) $(if $(FILES),$(if $(findstring tests/deploy,$(FILES)),$(PEERS)),$(PEERS))  ## run the heavy tests that `make test` leaves out (FILES=... some of them)
+nightly: $(READY) $(if $(findstring tests/deploy,$(or $(FILES),tests/deploy)),$(PEERS))  ## run the heavy tests that `make test` leaves out (FILES=... some of them)
 	@$(PIP) --group nightly
 	$(PYTEST) -m nightly $(OPTIONS) $(FILES)
 

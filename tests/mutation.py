@@ -22,18 +22,8 @@ def finds(mutant: dict[str, str], tests: Sequence[str]) -> bool:
     text = path.read_text()
     if text.count(mutant["old"]) != 1:
         raise ValueError(f"{mutant['file']}: contains {text.count(mutant['old'])} times: {mutant['old']}")
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-x",
-        "-q",
-        "-m",
-        "not nightly",
-        "-p",
-        "no:cacheprovider",
-        *tests,
-    ]
+    options = ("-x", "-q", "-m", "not nightly", "-p", "no:cacheprovider")
+    command = [sys.executable, "-m", "pytest", *options, *tests]
     path.write_text(text.replace(mutant["old"], mutant["new"]))
     try:
         ended = subprocess.run(

@@ -3,13 +3,15 @@
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from subprocess import DEVNULL, PIPE
 from threading import Thread
 
 from panolog.orchestrator.follower.follower import END, LAST_S
 from panolog.orchestrator.follower.plan import Plan, to_json
+from panolog.orchestrator.resources.children import send_line, start_companion
 
 _TIMEOUT_S = 8.0  # for the process to send its pages the last state of the run, and to end
 _FOLLOWER_S = LAST_S + 5.0  # for the follower to end
@@ -62,13 +64,14 @@ def companion_follower(run: Path, plan: Plan, say: Callable[[str], None]) -> Ite
     if not plan:
         yield
         return
-    process = _follower(run, plan)
+    start = partial(start_companion, "panolog.orchestrator.follower", to_json(plan, run))
+    process = start()
     try:
         yield
     finally:
         said, killed = _end(process)
         if killed:
-            process = _follower(run, plan)
+            process = start()
             said, _ = _end(process)
         for line in said.splitlines()[:_LINES]:
             say(line)
@@ -82,29 +85,9 @@ def _end(process: "subprocess.Popen[str]") -> tuple[str, bool]:
     Its exit code is the only proof: before a killed process can be reaped, it still counts as running.
     """
     try:
-        _write(process, END)
+        send_line(process, END)
         said, _ = process.communicate(timeout=_FOLLOWER_S)
     except subprocess.TimeoutExpired:
         process.kill()
         return process.communicate()[0], False
     return said, process.returncode != 0
-
-
-def _follower(run: Path, plan: Plan) -> "subprocess.Popen[str]":
-    """The process. It gets its plan, which has secrets, through a pipe: no other process can read that.
-
-    It is in a session of its own, so that Ctrl-C does not reach it.
-    """
-    command = [sys.executable, "-m", "panolog.orchestrator.follower"]
-    process = subprocess.Popen(
-        command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, text=True, start_new_session=True
-    )
-    _write(process, to_json(plan, run) + "\n")
-    return process
-
-
-def _write(process: "subprocess.Popen[str]", line: str) -> None:
-    assert process.stdin is not None
-    with suppress(BrokenPipeError):  # it was killed
-        process.stdin.write(line)
-        process.stdin.flush()

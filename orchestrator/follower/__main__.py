@@ -26,7 +26,7 @@ def main() -> None:
     ended = threading.Event()
 
     def wait() -> None:
-        if sys.stdin.readline() == END:
+        if sys.stdin.readline() == END + "\n":
             ended.set()
 
     threading.Thread(target=wait, daemon=True).start()

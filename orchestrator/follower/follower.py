@@ -17,7 +17,7 @@ from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 
 POLL_S = 1.0  # between two looks at the database
-END = "end\n"  # what a run's command writes to its follower when it ends; one that is killed does not
+END = "end"  # what a run's command writes to its follower when it ends; one that is killed does not
 LAST_S = 30.0  # for which the last news are delivered, and tried again
 _ORPHAN_S = 60.0  # that a driver without its supervisor gets to write its last checkpoints
 

@@ -1,15 +1,37 @@
-"""Child processes of a supervisor: they end with it, and signals reach them through it."""
+"""Child processes: of a supervisor, which end with it and get signals through it, and next to a driver."""
 
 import ctypes
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from subprocess import DEVNULL, PIPE, Popen
 from typing import Any
 
 ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # are passed on to children
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 _LIBC = ctypes.CDLL(None)
+
+
+def start_companion(module: str, plan: str) -> "Popen[str]":
+    """A process of a module of ours next to a driver, which gets a line with its plan through a pipe.
+
+    The plan may have secrets: no other process can read a pipe. The process is in a session of its own, so
+    that Ctrl-C does not reach it.
+    """
+    command = [sys.executable, "-m", module]
+    process = Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, text=True, start_new_session=True)
+    send_line(process, plan)
+    return process
+
+
+def send_line(process: "Popen[str]", line: str) -> None:
+    """Writes a line to a companion; one that was killed meanwhile does not get it."""
+    assert process.stdin is not None
+    with suppress(BrokenPipeError):
+        process.stdin.write(line + "\n")
+        process.stdin.flush()
 
 
 @contextmanager

@@ -94,7 +94,7 @@ class DiskConfig(Group):
 
 _MEASURED = 1.0  # pixels: renders of a city were 87 to 101 dB from those of the whole model, with 2 71 to 78
 # What runs did before there was a setting for it, by dotted key.
-_FORMER = {
+_FORMER: Mapping[str, Any] = {
     "recipe": "paper",
     "overlap": None,
     "partition.aspect": 0.5,
@@ -185,19 +185,13 @@ class RunConfig(TrainConfig):
         if not isinstance(given, dict):
             return given
         given = _canonical(given)
-        if info.context == RESOLVED:
-            for key, value in _FORMER.items():
-                if not _given(given, key):
-                    _put(given, key, value)
-            return given
         recipe = given.get("recipe", cls.model_fields["recipe"].default)
-        if not isinstance(recipe, str) or recipe not in RECIPES:
-            return given
-        tree = given
-        for key, value in RECIPES[cast(Recipe, recipe)].items():
-            if not _given(tree, key):
-                _put(tree, key, value)
-        return tree
+        known = isinstance(recipe, str) and recipe in RECIPES
+        preset = RECIPES[cast(Recipe, recipe)] if known else {}
+        for key, value in (_FORMER if info.context == RESOLVED else preset).items():
+            if not _given(given, key):
+                _put(given, key, value)
+        return given
 
     @field_validator("memory", mode="before")
     @classmethod

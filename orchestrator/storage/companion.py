@@ -1,18 +1,15 @@
 """The mirror as a process next to the driver: `mirrored` keeps it while a run lasts, and until all is out."""
 
 import json
-import os
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from subprocess import DEVNULL, PIPE
 from typing import Any
 
-from panolog.orchestrator.resources.children import ENDS
+from panolog.orchestrator.resources.children import ENDS, start_companion
 from panolog.orchestrator.storage.plan import Plan, to_json
 from panolog.scene.errors import RunError, StoreError
 
@@ -125,15 +122,7 @@ class _Keeper:
 
 
 def _started(plan: Plan, *, again: bool = False) -> "subprocess.Popen[str]":
-    """The process, in a session of its own, so that Ctrl-C does not reach it. Its words have no secret."""
+    """The process of a mirror. Args: again, in place of one that was killed."""
     if again:
         plan = replace(plan, again=True, force=False)
-    command = [sys.executable, "-m", "panolog.orchestrator.storage"]
-    process = subprocess.Popen(
-        command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, text=True, start_new_session=True, env=os.environ
-    )
-    assert process.stdin is not None
-    with suppress(BrokenPipeError):  # it was killed at once
-        process.stdin.write(to_json(plan) + "\n")
-        process.stdin.flush()
-    return process
+    return start_companion("panolog.orchestrator.storage", to_json(plan))

@@ -249,7 +249,7 @@ class Harness:
             return Driver(self.job, journal, pool, hooks, self.stop, self.clock).run()
 
     def at(self, root: Path) -> "Harness":
-        """The same job in another run folder."""
+        """A harness of this job in another run folder."""
         other = copy(self)
         other.folder = RunFolder(root)
         root.mkdir(exist_ok=True)

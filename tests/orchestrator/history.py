@@ -16,7 +16,7 @@ def started(
 
 
 def model(task: TaskId, iterations: int = 30, seconds: float = 1.5) -> ModelSaved:
-    """Of ten Gaussians."""
+    """The record of a model with ten Gaussians."""
     return ModelSaved(task, f"{task}/model.ply", 10, 100, iterations, seconds)
 
 

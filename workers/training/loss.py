@@ -109,7 +109,7 @@ class Loss:
     """The parts of eq. 6 for the views of one task."""
 
     def __init__(self, scene: Scene, config: TrainConfig, seed: int, schedule: Schedule) -> None:
-        self._config, self._schedule = config.loss, schedule
+        self._schedule = schedule
         self.depth = DepthTargets(scene, config.depth, seed)
         self.unit = scene_length(scene) if config.depth.unit == "baseline" else 1.0  # world units
 
@@ -138,10 +138,6 @@ class Loss:
     def depth_weight(self, iteration: int) -> float:
         """w(t) of eq. 5; for inverse depths in units of 1 / b̂ they are parallaxes γ = b̂ / z, in radians."""
         return self._schedule.depth_weight(iteration) * self.unit
-
-    def rows(self, view: View) -> Tensor | None:
-        """Weights of the rows of a view."""
-        return loss_rows(self._config, view)
 
 
 def loss_rows(config: LossConfig, view: View) -> Tensor | None:

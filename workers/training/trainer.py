@@ -43,7 +43,7 @@ from panolog.workers.training.initialise import (
     scene_gaussians,
     sky_gaussians,
 )
-from panolog.workers.training.loss import Loss
+from panolog.workers.training.loss import Loss, loss_rows
 from panolog.workers.training.optimizer import AVERAGE, Average, ModelState
 from panolog.workers.training.pipeline import Pipeline, Plan
 from panolog.workers.training.relocate import Place, grow
@@ -325,7 +325,7 @@ class Trainer:
             **self.loss.targets(view, weight, around)._asdict(),
             depth_weight=weight,
             lambda_ssim=self.spec.config.loss.lambda_ssim,
-            rows=self.loss.rows(view),
+            rows=loss_rows(self.spec.config.loss, view),
             sh_degree=degree,
             near=self.near,
             exact=self.state.gaussians.exact,

@@ -229,7 +229,7 @@ def test_a_run_of_panoramas_is_submitted_with_how_its_scene_is_made(monkeypatch:
 
 
 class Client:
-    """That of a job server which has had one job of /runs/a, and knows what `panolog status` says there."""
+    """A client of a job server that has had one job of /runs/a and answers `panolog status` there."""
 
     def __init__(self, status: str, message: str = "", said: str = "") -> None:
         self.submitted: list[dict[str, Any]] = []

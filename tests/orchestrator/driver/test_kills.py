@@ -173,7 +173,7 @@ def models(harness: Harness) -> dict[str, bytes]:
 
 @pytest.mark.system
 def test_every_worker_is_killed(calm: tuple[Harness, list[Path]], pool: LocalPool, tmp_path: Path) -> None:
-    """Those that train are killed after a checkpoint; none of them does anything more before that."""
+    """Workers that train are killed once they have saved a checkpoint, and do nothing between the two."""
     harness, _ = calm
     killed, left = harness.at(tmp_path / "run"), {COARSE, SHARD, BLOCK, EVAL}
     workers: dict[TaskId, int] = {}

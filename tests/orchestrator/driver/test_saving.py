@@ -61,7 +61,7 @@ class Census:
 def test_a_driver_holds_two_large_messages_whatever_the_number_of_tasks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All of them wait for the disk at once, and the progress of the others is recorded meanwhile.
+    """Writers wait for the disk side by side, and the progress of other tasks is recorded meanwhile.
 
     What follows a message of the same task is recorded after it.
     """

@@ -58,7 +58,7 @@ def plan_of(server: Receiver, *more: Target) -> Plan:
 
 
 def follower_of(parent: int) -> psutil.Process:
-    """Its follower, which has the command line of its parent until it executes its own program."""
+    """The follower of a process; until it executes its program it has the command line of its parent."""
     wait_until(lambda: living(FOLLOWER, parent), "a follower")
     (process,) = living(FOLLOWER, parent)
     return process

@@ -187,7 +187,7 @@ def problem(scene: Scene, model: Gaussians, view: View, loss: Loss, around: Bake
         **loss.targets(view, 0.3, around)._asdict(),
         depth_weight=0.3,
         lambda_ssim=0.0,
-        rows=loss.rows(view),
+        rows=None,
         sh_degree=3,
         near=0.01,
     )

@@ -4,6 +4,7 @@
 /** @import { RunPage } from "../shared/messages.js" */
 /** @import { Choose } from "./run.js" */
 import { get, messageOf } from "../shared/api.js";
+import { narrow } from "../shared/charts.js";
 import { byId, el, setText, throttled, token } from "../shared/dom.js";
 import { percent } from "../shared/format.js";
 import { draw, plotly, themed, unpack } from "./plot.js";
@@ -17,7 +18,6 @@ const MARK = 60; // of 255, added to the opacity of the selected block
 /** A mark for each state, next to the number of a block: its colour alone says nothing to many. @type {Record<string, string>} */
 const MARKS = { done: "✓", failed: "✕", paused: "‖", running: "▸" };
 const coarse = matchMedia("(pointer: coarse)"); // a finger on the map scrolls the page
-const narrow = matchMedia("(max-width: 720px)");
 
 /** @param {string} color @param {number} alpha */
 const withAlpha = (color, alpha) => color.replace(/rgba?\(([^)]*)\)/, (_, parts) => `rgba(${parts.split(",").slice(0, 3)},${alpha})`);
