@@ -7,6 +7,8 @@ import json
 import os
 import socket
 import subprocess
+import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +25,7 @@ from panolog.orchestrator.follower.watcher import Watcher
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.run.state import ignore
+from tests.deploy.files import ROOT
 from tests.orchestrator.fakes import SetClock
 from tests.orchestrator.follower import histories
 from tests.orchestrator.follower.histories import Curves, expected
@@ -203,17 +206,27 @@ def wandb_records(path: Path) -> Iterator[bytes]:
             yield whole
 
 
+WANDB = """
+import sys
+from pathlib import Path
+from panolog.orchestrator.follower.sinks.wandb_sink import WandbSink
+from tests.orchestrator.follower.test_sinks import each_driver
+
+root, kept = map(Path, sys.argv[1:])
+each_driver(root, lambda: WandbSink("panolog", kept))
+"""
+
+
 @pytest.mark.nightly
 @pytest.mark.system
 def test_wandb_keeps_the_curves_of_the_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its client, which writes to the disk without a server."""
+    """Its client, which writes to the disk without a server, in a process that its service ends with."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # where the package keeps folders once imported
     module, reason = "wandb.proto.wandb_internal_pb2", "the package wandb is not installed: make nightly"
     messages = pytest.importorskip(module, reason=reason)
-    from panolog.orchestrator.follower.sinks.wandb_sink import WandbSink  # noqa: PLC0415
-
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    kept = tmp_path / "kept"
-    folder = each_driver(tmp_path / "run", lambda: WandbSink("panolog", kept))
+    folder, kept = RunFolder(tmp_path / "run"), tmp_path / "kept"
+    environment = os.environ | {"WANDB_MODE": "offline"}
+    subprocess.run([sys.executable, "-c", WANDB, folder.root, kept], check=True, cwd=ROOT, env=environment)
     found: Curves = {}
     for path in sorted(kept.glob("wandb/offline-run-*/*.wandb")):
         for data in wandb_records(path):
@@ -241,7 +254,11 @@ def mlflow_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     store = ["--backend-store-uri", f"sqlite:///{folder}/store.db", "--artifacts-destination", str(folder)]
     command = [str(program), "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1", *store]
     with (folder / "log").open("wb") as log:
-        server = subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, start_new_session=True)
+        # Its jobs, which nothing here uses, would leave a folder in shared memory.
+        environment = os.environ | {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
+        server = subprocess.Popen(
+            command, stdout=log, stderr=log, cwd=folder, env=environment, start_new_session=True
+        )
     url = f"http://127.0.0.1:{port}"
     wait_until(lambda: read(f"{url}/health"), "the server of MLflow", 300)
     yield url
