@@ -24,6 +24,8 @@ from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
 from tests.workers.trainings import block_of, bytes_of, coarse_of, notices, trained
 
+pytestmark = pytest.mark.system
+
 CONFIG = TrainConfig.model_validate(
     {"sky": {"count": 60}, "checkpoint": {"every": 5, "share": 1}, "preview": {"every": 50}}
 )

@@ -17,6 +17,8 @@ from panolog.orchestrator.estimates.calibration import Basis
 from tests.deploy.files import ROOT
 from tests.orchestrator.calibrated import calibrated
 
+pytestmark = pytest.mark.system
+
 BASES = {64: Basis(calibrated(), 3.0)}
 
 

@@ -12,6 +12,8 @@ from panolog.orchestrator.run.config import RunConfig
 from tests.orchestrator.cli.program import begun, call, one_line, shown
 from tests.scenes import write_scene
 
+pytestmark = pytest.mark.system
+
 PRICES = Path(__file__).parents[3] / "deploy" / "prices.toml"
 
 

@@ -31,6 +31,8 @@ from tests.orchestrator.cli.program import call, shown
 from tests.orchestrator.fakes import DIED, MACHINE, CrashError, FakePool, well
 from tests.scenes import write_scene
 
+pytestmark = pytest.mark.system
+
 SETTINGS = {"width": 64, "iterations": 2, "blocks": "2x1x1", "sky.count": 2}
 CONFIG = load_config(flags=SETTINGS)
 

@@ -35,6 +35,8 @@ from tests.orchestrator.dashboard.served import (
     write_whole_run,
 )
 
+pytestmark = pytest.mark.system
+
 SECRET = b"\xff\xd8\xffa secret outside"  # begins as a JPEG does
 UP = [
     "../../secret.jpg",

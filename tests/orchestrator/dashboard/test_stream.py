@@ -28,6 +28,8 @@ from tests.orchestrator.dashboard.served import (
     write_whole_run,
 )
 
+pytestmark = pytest.mark.system
+
 
 def until(messages: Iterator[tuple[str, Any]], event: str) -> Any:
     """The content of the next message of that kind."""

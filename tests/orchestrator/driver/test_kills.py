@@ -31,6 +31,8 @@ from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.orchestrator.fakes import Harness
 from tests.orchestrator.scripted import stalling
 
+pytestmark = pytest.mark.system
+
 SHARD, BLOCK = TaskId.shard(0), TaskId.block(0)
 SAVED = 4  # iteration of the checkpoint of each task that trains
 REAL: dict[str, Any] = {
@@ -151,7 +153,6 @@ def calm(pool: LocalPool, tmp_path_factory: pytest.TempPathFactory) -> tuple[Har
     return harness, copies.made
 
 
-@pytest.mark.system
 def test_drivers_are_killed(calm: tuple[Harness, list[Path]], pool: LocalPool) -> None:
     harness, copies = calm
     expected, kinds = contents(harness.folder.root), set[str]()
@@ -171,7 +172,6 @@ def models(harness: Harness) -> dict[str, bytes]:
     }
 
 
-@pytest.mark.system
 def test_every_worker_is_killed(calm: tuple[Harness, list[Path]], pool: LocalPool, tmp_path: Path) -> None:
     """Workers that train are killed once they have saved a checkpoint, and do nothing between the two."""
     harness, _ = calm

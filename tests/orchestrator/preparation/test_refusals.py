@@ -27,6 +27,8 @@ from tests.orchestrator.preparation.fake_sfm import FakeSfm, fails, image, start
 from tests.prepare.networks.networks import given, red_depth
 from tests.scenes import write_scene
 
+pytestmark = pytest.mark.system
+
 
 def test_what_a_failed_reconstruction_has_kept_is_used_with_other_settings(
     raw: Path, sfm: FakeSfm, tmp_path: Path

@@ -24,6 +24,8 @@ from tests.orchestrator.calibrated import says
 from tests.orchestrator.fakes import MACHINE, FakePool, trained, well
 from tests.scenes import write_scene
 
+pytestmark = pytest.mark.system
+
 SETTINGS = ("sky.count=2", "width=64", "iterations=5", "device=cpu", "blocks=2x1x1")
 KEPT = ("retention.checkpoints=3", "retention.models=false")
 

@@ -18,6 +18,8 @@ from panolog.scene.read import read_scene
 from tests.orchestrator.fakes import MACHINE, FakePool
 from tests.prepare.importers.writers import WRITERS
 
+pytestmark = pytest.mark.system
+
 # All formats give the same scene (tests/prepare/importers/test_same_scene.py); these differ in tracks, split
 # and layout.
 CASES = ("opensfm", "360roam", "panorama_sfm", "nerfstudio")

@@ -14,6 +14,8 @@ from panolog.prepare.networks.inverse_depth import FULL, NEAREST
 from panolog.prepare.panorama_files import list_posed_panoramas
 from tests.scenes import write_scene
 
+pytestmark = pytest.mark.system
+
 DAP = Path(__file__).resolve().parents[3] / "docs" / "dap"
 CODE = """
 import torch

@@ -30,6 +30,8 @@ from tests.prepare.video.containers import (
     write_clip,
 )
 
+pytestmark = pytest.mark.system
+
 Floats = NDArray[np.float64]
 TIMES = [0, 40, 73, 140, 141, 300]  # milliseconds: a variable frame rate
 _LUMA = {"bt709": (0.2126, 0.0722), "bt601": (0.299, 0.114), "bt2020": (0.2627, 0.0593)}  # of red, of blue

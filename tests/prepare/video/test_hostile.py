@@ -31,6 +31,8 @@ from tests.prepare.video.containers import (
 from tests.prepare.video.sensors import camm, gps5, payload
 from tests.prepare.video.videos import tour_images, write_video
 
+pytestmark = pytest.mark.system
+
 
 def clip(folder: Path) -> Path:
     """A clip with all boxes that are read."""
@@ -162,7 +164,6 @@ def test_nested_boxes_and_elements(whole: bytes, tmp_path: Path) -> None:
     assert use(path) in (0, 12)
 
 
-@pytest.mark.system
 def test_the_frames_of_a_damaged_video_are_the_same_after_an_interruption(tmp_path: Path) -> None:
     clean = write_video(tmp_path / "short.mp4", tour_images(30, 45, 2), fourcc="mp4v").read_bytes()
     data = bytearray(clean)

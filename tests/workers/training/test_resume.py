@@ -25,6 +25,8 @@ from tests.workers.trainings import (
     trained,
 )
 
+pytestmark = pytest.mark.system
+
 Groups = dict[str, Any]
 CAPTURED: Groups = {
     "densify": {"until": 0},
