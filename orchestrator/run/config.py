@@ -1,6 +1,7 @@
 """The settings of a run: those of training, and what a whole run needs besides."""
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from difflib import get_close_matches
@@ -18,6 +19,7 @@ from panolog.workers.settings import Group
 from panolog.workers.tasks import Stage
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.recipes import RECIPES, Recipe
+from panolog.workers.training.schedule import FULL_RUN
 
 AUTO = "auto"  # blocks that preflight chooses
 RESOLVED = "resolved"  # context of validation: these are all settings of a run
@@ -227,15 +229,20 @@ class RunConfig(TrainConfig):
         passes, stage2, optimizer = self.passes, self.stage2, self.optimizer
         part = passes.round if stage is Stage.ROUND else passes.repair
         iterations = max(1, round(part * self.iterations))
-        short = (iterations / self.iterations) ** optimizer.short_runs  # else few iterations had higher rates
-        first, rate = passes.position * short * stage2.position, passes.rate * short * stage2.rate
+        first, rate = passes.position * stage2.position, passes.rate * stage2.rate
         update = {
             "iterations": iterations,
+            "optimizer": optimizer.model_copy(update={"short_runs": self._short_runs(iterations)}),
             "densify": self.densify.model_copy(update={"until": 0}),
             "depth": self.depth.model_copy(update={"w0": min(self.depth.w0, self.depth.wT)}),
             "stage2": stage2.model_copy(update={"position": first, "rate": rate}),
         }
         return self.model_copy(update=update)
+
+    def _short_runs(self, iterations: int) -> float:
+        """The exponent by which a pass of so many iterations has the rates of a block's run."""
+        length = [max(1.0, FULL_RUN / count) for count in (self.iterations, iterations)]
+        return self.optimizer.short_runs * math.log(length[0]) / math.log(length[1]) if length[1] > 1 else 0.0
 
     @property
     def measured_detail(self) -> float | None:

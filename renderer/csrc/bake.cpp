@@ -36,7 +36,6 @@ void widen(const std::vector<Span>& spans, const Camera& camera, float slack, fl
           const Span& span = spans[size_t(y) * across + (x + across) % across];
           all.first = std::min(all.first, span.first), all.last = std::max(all.last, span.last);
         }
-      if (const Span& own = spans[size_t(row) * across + column]; own.first <= own.last) all = own;
       float* to = out + 2 * (size_t(row) * across + column);
       to[0] = all.first * (1 - slack), to[1] = all.last * (1 + slack);
     }

@@ -131,6 +131,23 @@ def test_what_is_owned_may_move_a_little_in_depth() -> None:
     assert float(difference.abs().amax(2)[where].mean()) < HALF
 
 
+@pytest.mark.parametrize("exact", [False, True])
+def test_what_moves_into_a_tile_with_far_own_gaussians_is_in_its_order(exact: bool) -> None:
+    """A near lamp comes from the next tile before a frozen wall, which is nearer than what was owned here."""
+    at = Camera(torch.eye(3), torch.zeros(3), 128, 64)
+    pixel, equator = 2 * math.pi / 128, torch.zeros(1)
+    lamp = placed(1, directions(torch.tensor([-3 * pixel]), equator, 5.0), at, -2.5)
+    far = placed(1, directions(torch.tensor([8 * pixel]), equator, 20.0), at, 0.0)
+    scene = replace(concatenate(concatenate(lamp, far), wall(at, 10.0, 1.0, 0.0)), exact=exact)
+    exterior = baked(scene, 2, at)
+    means = scene.means.clone()
+    means[0] = directions(torch.tensor([3 * pixel]), equator, 5.0)[0]
+    moved = scene.with_tensors(scene.tensors() | {"means": means})
+    whole = render(moved, at, near=NEAR).color
+    parts = render(first(moved, 2), at, near=NEAR, exterior=exterior).color
+    assert float((whole - parts).abs().amax(2)[active(exterior, at)].max()) < 2 * HALF
+
+
 def test_inverse_depths_of_any_unit_of_length_are_kept() -> None:
     """float16 has no values above 65,504 or below 6e-8."""
     at, scene = camera(64), cloud(150)

@@ -16,7 +16,7 @@ from panolog.renderer.process import release_memory
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.files import read_at, write_all
-from panolog.scene.gaussians import Gaussians
+from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import packed_bytes, unpack, view_bytes
 from panolog.scene.model import Panorama
 from panolog.workers.training.config import CacheConfig
@@ -173,23 +173,28 @@ class Exterior:
         return self.views.get(row)
 
     def finish(self, cameras: Mapping[int, Camera]) -> str:
-        """Drops the model: all of these cameras, by row, are baked. Returns what that took, for the log.
-
-        On some of them what is baked is compared with the full render, as the block starts.
-        """
-        model, rows = self.model, list(cameras)
+        """Drops the model: all of these cameras, by row, are baked. Returns what that took, for the log."""
+        model = self.model
         assert model is not None, "a second time"
-        found = []
+        self.model = None
+        differences = self.differences(self.own(model), model, cameras)
+        release_memory()
+        mebibytes = self.views.nbytes / 2**20
+        what = f"what surrounds the block for {len(cameras)} panoramas, {mebibytes:.0f} MiB"
+        return f"baked {what}; its colours {differences}"
+
+    def differences(self, own: Gaussians, model: Gaussians, cameras: Mapping[int, Camera]) -> str:
+        """How far what is baked is from the full render on some of the cameras, for the log.
+
+        Args: own, what the block trains, as it is by now; model, what was baked, as in `__init__`.
+        """
+        around = model.select(torch.arange(len(model)) >= model.scene.stop)
+        whole, rows, found = concatenate(own, around), list(cameras), [torch.zeros(1)]
         for row in rows[:: -(-len(rows) // CHECKED)]:
             camera, baked = cameras[row], self.views.get(row).to("cpu")
-            full = render(model, camera, near=self._near).color
-            parts = render(self.own(model), camera, near=self._near, exterior=baked).color
+            full = render(whole, camera, near=self._near).color
+            parts = render(own, camera, near=self._near, exterior=baked).color
             found.append((full - parts).abs().amax(2)[baked.active(camera.width, camera.height)])
-        self.model = None
-        release_memory()
-        differences = torch.cat([torch.zeros(1), *found])
-        return (
-            f"baked what surrounds the block for {len(rows)} panoramas, {self.views.nbytes / 2**20:.0f} MiB;"
-            f" its colours differ from the full render by at most {float(differences.max()):.4f},"
-            f" {float(differences.mean()):.5f} on average"
-        )
+        all_of = torch.cat(found)
+        most, mean = float(all_of.max()), float(all_of.mean())
+        return f"differ from the full render by at most {most:.4f}, {mean:.5f} on average"

@@ -121,6 +121,18 @@ class ModelState:
         return invalid
 
 
+def trained_rows(gaussians: Gaussians, degree: int, *, refine: bool, sky_scales: bool) -> dict[str, int]:
+    """How many rows of each parameter train: of the sky in Stage I its appearance, in Stage II nothing.
+
+    Args: degree of spherical harmonics in use; refine, Stage II; sky_scales, whether Stage I trains those of
+    the sky too.
+    """
+    count, scene = len(gaussians), gaussians.scene.stop
+    used = [name for name in gaussians.tensors() if degree > 0 or name != "shN"]
+    still = ("means",) if sky_scales else ("means", "scales")
+    return dict.fromkeys(used, scene if refine else count) | dict.fromkeys(still, scene)
+
+
 class Average:
     """The mean of a model over iterations, in the host's memory (Polyak and Juditsky 1992).
 

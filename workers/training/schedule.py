@@ -128,10 +128,18 @@ class Schedule:
         count = start + int(start * factor * share)
         return max(start, min(count, densify.max_gaussians)) if densify.max_gaussians else count
 
+    def position(self, iteration: int) -> float:
+        """The rate of means of a full run, extents of the task's cameras: it decays exponentially (3DGS)."""
+        rates, share = self.config.optimizer, iteration / self.iterations
+        first = rates.position * (self.config.stage2.position if self.refine else 1)
+        if first == 0:
+            return 0.0
+        return math.exp((1 - share) * math.log(first) + share * math.log(rates.position_final))
+
     def cooling(self, iteration: int) -> float:
-        """The rate of positions over the first one."""
+        """The rate of positions over the first one of Stage I, at most 1."""
         first = self.config.optimizer.position
-        return self.rates(iteration)["means"] / (first * self.extent) if first > 0 else 0.0
+        return self.position(iteration) / first if first > 0 else 0.0
 
     def width(self, iteration: int, full: int) -> int:
         """Pixels of the panoramas of this iteration: reduced at first in Stage I, if the pyramid has steps.
@@ -157,21 +165,15 @@ class Schedule:
         return float(depth.w0 * (depth.wT / depth.w0) ** (iteration / self.iterations))
 
     def rates(self, iteration: int) -> dict[str, float]:
-        """Learning rates by parameter. The one of means decays exponentially, in scene extents (3DGS)."""
-        rates, stage2 = self.config.optimizer, self.config.stage2
+        """Learning rates by parameter; that of means in world units."""
+        rates, rate = self.config.optimizer, self.config.stage2.rate if self.refine else 1.0
         length = max(1.0, FULL_RUN / self.iterations) ** rates.short_runs
-        shapes, colors = length, math.sqrt(length)
-        share = iteration / self.iterations
-        position, first = 0.0, rates.position
-        if self.refine:
-            shapes, colors, first = shapes * stage2.rate, colors * stage2.rate, first * stage2.position
-        if first > 0:
-            position = math.exp((1 - share) * math.log(first) + share * math.log(rates.position_final))
+        shapes, colors = rate * length, rate * math.sqrt(length)
         return {
-            "means": length * position * self.extent,
+            "means": length * self.position(iteration) * self.extent,
             "quats": shapes * rates.rotation,
             "scales": shapes * rates.scale,
-            "opacities": rates.opacity * (stage2.rate if self.refine else 1),
+            "opacities": rates.opacity * rate,
             "sh0": colors * rates.sh0,
             "shN": colors * rates.shN,
         }

@@ -44,7 +44,7 @@ from panolog.workers.training.initialise import (
     sky_gaussians,
 )
 from panolog.workers.training.loss import Loss, loss_rows
-from panolog.workers.training.optimizer import AVERAGE, Average, ModelState
+from panolog.workers.training.optimizer import AVERAGE, Average, ModelState, trained_rows
 from panolog.workers.training.pipeline import Pipeline, Plan
 from panolog.workers.training.relocate import Place, grow
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
@@ -171,14 +171,18 @@ class Trainer:
 
     def _block(self, initial: Source[Gaussians]) -> Gaussians:
         """What a block trains with, of the Stage I model."""
-        gaussians, kind = initial.load(), self.spec.config.stage2.exterior
+        kind = self.spec.config.stage2.exterior
         if kind == "full":
-            return gaussians
-        gaussians = replace(exterior_last(gaussians, self.spec.cell), exact=self.exact)
+            return initial.load()
+        gaussians = self._sorted(initial)
         if kind == "frozen":
             return gaussians
         self.exterior = Exterior(gaussians, self.near, self.loss.unit, self._room, self.device)
         return Exterior.own(gaussians)
+
+    def _sorted(self, initial: Source[Gaussians]) -> Gaussians:
+        """The Stage I model, what surrounds the block last."""
+        return replace(exterior_last(initial.load(), self.spec.cell), exact=self.exact)
 
     def surround(self, stop: Callable[[], bool]) -> Iterator[Event]:
         """Bake the exterior of a block for its cameras; after a stop the rest is baked when it is needed."""
@@ -251,6 +255,11 @@ class Trainer:
             if stopped:
                 return
         yield from self.saver.finished(wait=True)
+        if self.exterior is not None and self.spec.initial is not None:
+            self.settle()
+            own, cameras = self.state.gaussians.to("cpu"), {row: self._camera(row) for row in self.spec.views}
+            differences = self.exterior.differences(own, self._sorted(self.spec.initial), cameras)
+            yield Notice(self.spec.task, f"at the end the colours of what is baked {differences}")
 
     def result(self) -> Gaussians:
         """The whole model (Stage I), or the block's retained set (eq. 12)."""
@@ -315,9 +324,8 @@ class Trainer:
     def _plan(self, iteration: int, view: View) -> Plan:
         """An iteration as it is to be done."""
         degree, weight = self.schedule.sh_degree(iteration), self.loss.depth_weight(iteration)
-        around, rows = self._around(view.row), self._trained_rows()
-        if degree == 0:
-            del rows["shN"]
+        around = self._around(view.row)
+        sky_scales = self.spec.config.sky.train_scales
         problem = Problem(
             model=self.state.gaussians.tensors(),
             camera=self._camera(view.row),
@@ -339,18 +347,12 @@ class Trainer:
             problem=problem,
             state=self.state,
             rates=self.schedule.rates(iteration),
-            rows=rows,
+            rows=trained_rows(
+                self.state.gaussians, degree, refine=self.schedule.refine, sky_scales=sky_scales
+            ),
             statistics=self.statistics if self.schedule.collects(iteration) else None,
             learning=self.learning if self.spec.cell is None else None,
         )
-
-    def _trained_rows(self) -> dict[str, int]:
-        """The trained rows of each parameter: of the sky in Stage I its appearance, in Stage II nothing."""
-        gaussians = self.state.gaussians
-        count, scene = len(gaussians), gaussians.scene.stop
-        rows = dict.fromkeys(gaussians.tensors(), scene if self.schedule.refine else count)
-        still = ("means",) if self.spec.config.sky.train_scales else ("means", "scales")
-        return rows | dict.fromkeys(still, scene)
 
     def _maintain(self, iteration: int, last: bool) -> Iterator[Event]:
         """After a step, when due: average, drop invalid Gaussians, densify, reset opacities, drop haze."""

@@ -15,6 +15,8 @@ from panolog.scene.ply import read_ply
 from panolog.workers.events import Event
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
+from panolog.workers.training.recipes import RECIPES
+from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.fakes import DIED, CrashError, Harness, begins, fails, well
 
@@ -104,11 +106,14 @@ def test_with_levels_of_detail_a_repair_has_both_blocks_whole(tmp_path: Path) ->
     assert all(notice.task != REPAIR for notice in harness.records(Noticed))
 
 
-def test_a_pass_has_low_rates_and_adds_nothing() -> None:
-    config = RunConfig(iterations=1000, passes={"repair": 0.1, "rate": 0.5, "position": 0.2})  # type: ignore[arg-type]
+@pytest.mark.parametrize("iterations", [1_000, 30_000, 200_000])
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_a_pass_has_low_rates_and_adds_nothing(iterations: int, recipe: str) -> None:
+    given = {"recipe": recipe, "iterations": iterations}
+    config = RunConfig.model_validate(given | {"passes": {"repair": 0.1, "rate": 0.5, "position": 0.2}})
     later = config.later(Stage.REPAIR)
-    assert later.iterations == 100 and later.densify.until == 0
-    factor = 0.1**config.optimizer.short_runs  # of rates that rise for fewer iterations
-    assert later.stage2.rate == pytest.approx(0.5 * factor * config.stage2.rate)
-    assert later.stage2.position == pytest.approx(0.2 * factor * config.stage2.position)
+    assert later.iterations == iterations / 10 and later.densify.until == 0
+    block, repair = (Schedule(c, c.iterations, 1.0, refine=True).rates(1) for c in (config, later))
+    assert repair.pop("means") == pytest.approx(0.2 * block.pop("means"), rel=0.05)  # decays from there
+    assert repair == pytest.approx({name: 0.5 * rate for name, rate in block.items()})
     assert later.depth.w0 <= config.depth.wT

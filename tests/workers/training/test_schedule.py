@@ -124,6 +124,13 @@ def test_a_block_may_have_a_budget_and_a_decay_of_its_own() -> None:
     )
 
 
+@pytest.mark.parametrize("iterations", [500, 30_000])
+def test_noise_cools_from_one_with_the_rate_of_positions(iterations: int) -> None:
+    run = schedule(iterations, optimizer={"short_runs": 0.5})
+    assert [run.cooling(at) for at in (0, iterations)] == pytest.approx([1, 0.01])
+    assert schedule(iterations, refine=True, stage2={"position": 0.3}).cooling(0) == pytest.approx(0.3)
+
+
 def test_a_short_run_has_larger_rates_where_they_follow_its_length() -> None:
     usual, hasty = (schedule(300, optimizer={"short_runs": p}).rates(100) for p in (0, 0.5))
     ratios = {name: hasty[name] / usual[name] for name in usual}
