@@ -18,6 +18,7 @@ def adam_(
     lr: float,
     step: int,
     rows: int | None = None,
+    units: Tensor | None = None,
     betas: tuple[float, float] = BETAS,
     eps: float = EPSILON,
 ) -> None:
@@ -27,16 +28,17 @@ def adam_(
         parameter, gradient, exp_avg, exp_avg_sq: (N, …) float32 of one shape, contiguous.
         lr: learning rate in the parameter's unit.
         step: 1 for the first step; the bias correction needs it.
+        units: what the learning rate of each value is a multiple of, shaped as the parameter; None: all 1.
         rows: how many rows take part; the others keep parameter and moments (a frozen sky).
 
     Raises:
         ValueError: a shape or type differs, something is not contiguous, `step` or `rows` is out of range.
         FloatingPointError: the gradient on the CPU is not finite; parameter and moments are then invalid.
     """
-    tensors = (parameter, gradient, exp_avg, exp_avg_sq)
+    tensors = (parameter, gradient, exp_avg, exp_avg_sq, *([] if units is None else [units]))
     if any(t.shape != parameter.shape or t.dtype != torch.float32 for t in tensors):
         found = [f"{t.dtype} {tuple(t.shape)}" for t in tensors]
-        raise ValueError(f"parameter, gradient and moments must be float32 of one shape, not {found}")
+        raise ValueError(f"parameter, gradient, moments and units must be float32 of one shape, not {found}")
     if not all(t.is_contiguous() for t in (parameter, exp_avg, exp_avg_sq)):
         raise ValueError("parameter and moments change in place: they must be contiguous")
     if step < 1 or (rows is not None and not 0 <= rows <= len(parameter)):
@@ -54,4 +56,5 @@ def adam_(
         beta2=beta2,
         eps=eps,
         step=step,
+        units=units,
     )

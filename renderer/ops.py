@@ -277,13 +277,17 @@ def adam(
     beta2: float,
     eps: float,
     step: int,
+    units: Tensor | None = None,
 ) -> None:
     """One step of Adam (Kingma and Ba 2015, algorithm 1) on the first `count` values, in place.
+
+    Args: units of lr, for each value; None: all 1.
 
     Raises FloatingPointError if their gradient is not finite: the check is part of the pass over it.
     """
     broken = _core.adam(
         **_arrays(parameter=parameter, gradient=gradient, exp_avg=exp_avg, exp_avg_sq=exp_avg_sq),
+        units=None if units is None else _array(units),
         count=count,
         lr=lr,
         beta1=beta1,

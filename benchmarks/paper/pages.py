@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jinja2
 
+from benchmarks.paper.code import recipes
 from benchmarks.paper.crops import Comparison
 from benchmarks.paper.curves import overlap_curve, quality_curve, standalone
 from benchmarks.paper.goals import table as goal_table
@@ -78,8 +79,12 @@ def write_docs(path: Path, studies: Sequence[Study]) -> None:
             folder.mkdir(parents=True, exist_ok=True)
             write_bytes(folder / own, standalone(svg).encode())
             links[own] = f"{folder.name}/{own}"
-    note = "<!-- Written by `python -m benchmarks.paper … --docs`: do not edit. -->\n\n"
-    write_bytes(path, (note + markdown(studies, links)).encode())
+    write_bytes(path, (first_line() + "\n\n" + markdown(studies, links)).encode())
+
+
+def first_line() -> str:
+    """Of the page, as it is written today: with the recipes that it has measured."""
+    return f"<!-- Written by `python -m benchmarks.paper … --docs` of recipes {recipes()}: do not edit. -->"
 
 
 def page(study: Study, drawn: dict[str, str], comparisons: Sequence[Comparison]) -> str:

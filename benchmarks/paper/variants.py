@@ -21,6 +21,7 @@ _SWITCHES = {  # settings of the panolog recipe that mean something only togethe
     ),
     "block growth": ("stage2.growth", "stage2.opacity_decay"),
     "angle": ("densify.measure", "densify.views", "densify.long_axis"),
+    "depth": ("depth.unit", "depth.sky", "depth.wT"),
 }
 _FREE = ("recipe", "refine", "blocks", "partition.", "stage2.", "checkpoint.", "preview.")  # not in Stage I
 _NO_SCORES = ("recipe", "refine", "partition.tau_grad", "stage2.", "checkpoint.", "preview.")  # nor in scores

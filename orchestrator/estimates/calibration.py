@@ -33,9 +33,9 @@ from panolog.workers.events import Calibration, IterationCost
 from panolog.workers.tasks import CALIBRATE
 
 SPLAT = 2 * 64 + 72  # of the rasterizer's: the splat, its rays, some tile entries, the screen gradient
-STEP = 4 * VALUES + SPLAT  # values, gradient, both moments
+STEP = 4 * VALUES + 12 + SPLAT  # values, gradient, both moments, units of positions
 REARRANGED = 3 * VALUES + 16  # after a densification: where the old values and moments were, the indices
-CHECKPOINT = 3 * VALUES + 16  # values, moments, statistics
+CHECKPOINT = 3 * VALUES + 28  # values, moments, units of positions, statistics
 AVERAGE = VALUES + 12  # at the end of a task, when nothing is rearranged any more
 TRAINED = STEP + REARRANGED  # peak bytes of one Gaussian in training on the CPU, checkpoints aside
 PIXEL = 20 * 3 * 4  # bytes of one pixel of a training step there: some twenty float images

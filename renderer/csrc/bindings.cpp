@@ -290,14 +290,15 @@ NB_MODULE(_core, m) {
   m.def(
       "adam",
       [](InOut<float> parameter, In<float> gradient, InOut<float> exp_avg, InOut<float> exp_avg_sq, int64_t count,
-         float lr, float beta1, float beta2, float eps, int64_t step, int threads) {
+         float lr, float beta1, float beta2, float eps, int64_t step, int threads, std::optional<In<float>> units) {
         nb::gil_scoped_release release;
         const panolog::AdamStep state = {.lr = lr,
                                          .beta1 = beta1,
                                          .beta2 = beta2,
                                          .eps = eps,
                                          .correction1 = float(1 - std::pow(double(beta1), double(step))),
-                                         .correction2 = float(1 - std::pow(double(beta2), double(step)))};
+                                         .correction2 = float(1 - std::pow(double(beta2), double(step))),
+                                         .units = units ? units->data() : nullptr};
         std::atomic<bool> broken{false};
         panolog::each_span(count, threads, 1 << 15, [&](int64_t begin, int64_t end) {
           if (all_finite(gradient.data(), begin, end))
@@ -309,7 +310,7 @@ NB_MODULE(_core, m) {
         return broken.load();
       },
       "parameter"_a, "gradient"_a, "exp_avg"_a, "exp_avg_sq"_a, "count"_a, "lr"_a, "beta1"_a, "beta2"_a, "eps"_a,
-      "step"_a, "threads"_a,
+      "step"_a, "threads"_a, "units"_a = nb::none(),
       "One step on the first `count` values, in place. Returns whether a value of their gradient is not finite.");
 
   // For benchmarks.

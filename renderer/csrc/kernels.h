@@ -56,6 +56,7 @@ struct ImageGradients {
 
 struct AdamStep {
   float lr, beta1, beta2, eps, correction1, correction2;  // corrections: 1 - betaᵗ
+  const float* units;                                     // of lr, for each value; null: all 1
 };
 
 // Sums over the samples of a row, in parallel by their place so that the order is fixed; those after the last sixteen

@@ -309,12 +309,16 @@ void gradient_row(const float* const by[3], const float* x, const float* y, cons
 void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict gradient, float* __restrict parameter,
           float* __restrict exp_avg, float* __restrict exp_avg_sq) {
   const float rate = s.lr / s.correction1, root = 1 / sqrtf(s.correction2);
-  for (int64_t i = begin; i < end; ++i) {
+  const auto step = [&](int64_t i, float unit) {
     const float g = gradient[i];
     exp_avg[i] = s.beta1 * exp_avg[i] + (1 - s.beta1) * g;
     exp_avg_sq[i] = s.beta2 * exp_avg_sq[i] + (1 - s.beta2) * g * g;
-    parameter[i] -= rate * exp_avg[i] / (sqrtf(exp_avg_sq[i]) * root + s.eps);
-  }
+    parameter[i] -= unit * rate * exp_avg[i] / (sqrtf(exp_avg_sq[i]) * root + s.eps);
+  };
+  if (const float* __restrict units = s.units)
+    for (int64_t i = begin; i < end; ++i) step(i, units[i]);
+  else
+    for (int64_t i = begin; i < end; ++i) step(i, 1);
 }
 
 }  // namespace

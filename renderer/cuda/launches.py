@@ -152,9 +152,10 @@ def adam(
     beta2: float,
     eps: float,
     step: int,
+    units: Tensor | None = None,
 ) -> None:
     """`ops.adam`: one step on the first `count` values, in place."""
-    update = Update(gradient.contiguous(), parameter, exp_avg, exp_avg_sq, count, lr)
+    update = Update(gradient.contiguous(), parameter, exp_avg, exp_avg_sq, count, lr, units)
     adam_step(launch, [update], beta1, beta2, eps, step)
 
 

@@ -336,6 +336,7 @@ class Update(NamedTuple):
     exp_avg_sq: Tensor
     moving: int
     lr: float
+    units: Tensor | None = None  # of lr, for each value
 
 
 def adam_step(
@@ -352,16 +353,17 @@ def adam_step(
         raise ValueError(f"{len(updates)} parameters are more than {MOST_SEGMENTS}")
     bias = 1 - beta1**step
     blocks, segments = 0, b""
-    for gradient, parameter, exp_avg, exp_avg_sq, moving, lr in updates:
-        pointers = (tensor.data_ptr() for tensor in (gradient, parameter, exp_avg, exp_avg_sq))
+    for *tensors, moving, lr, units in updates:
+        pointers = (0 if tensor is None else tensor.data_ptr() for tensor in (*tensors, units))
         segments += _SEGMENT.pack(*pointers, moving, blocks, lr / bias, 0)
         blocks += math.ceil(moving / THREADS)
-    segments += _SEGMENT.pack(0, 0, 0, 0, 0, blocks, 0, 0) * (MOST_SEGMENTS - len(updates))
+    segments += _SEGMENT.pack(0, 0, 0, 0, 0, 0, blocks, 0, 0) * (MOST_SEGMENTS - len(updates))
     given = Struct(segments)
     given.tensors = {
         f"{name} of segment {row}": tensor
         for row, update in enumerate(updates)
-        for name, tensor in zip(Update._fields[:4], update[:4], strict=True)
+        for name, tensor in update._asdict().items()
+        if isinstance(tensor, Tensor)
     }
     launch(
         "adam_step",
@@ -376,7 +378,7 @@ def adam_step(
     )
 
 
-_SEGMENT = struct.Struct("=4Q2q2f")  # Segment in csrc/cuda/adam.cu
+_SEGMENT = struct.Struct("=5Q2q2f")  # Segment in csrc/cuda/adam.cu
 
 
 def camera_struct(

@@ -228,11 +228,12 @@ class ResetConfig(Group):
 class OptimizerConfig(Group):
     """Adam's learning rates per iteration, constant except for positions."""
 
-    position: float = Field(
-        default=1.6e-4, ge=0, description="first rate of means, extents of the task's cameras; 3DGS, app. A"
-    )
-    position_final: float = Field(
-        default=1.6e-6, gt=0, description="last rate of means, extents of the task's cameras; 3DGS"
+    position: float = Field(default=1.6e-4, ge=0, description="first rate of means, in `unit`; 3DGS, app. A")
+    position_final: float = Field(default=1.6e-6, gt=0, description="last rate of means, in `unit`; 3DGS")
+    unit: Literal["extent", "distance"] = Field(
+        default="extent",
+        description="the extent of the task's cameras, as in 3DGS, or a Gaussian's distance from the nearest"
+        " of them: then a step is as many pixels in a street as in a city, near as well as far",
     )
     sh0: float = Field(default=2.5e-3, ge=0, description="rate of SH of degree 0; 3DGS, app. A")
     shN: float = Field(  # noqa: N815

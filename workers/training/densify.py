@@ -108,6 +108,12 @@ def camera_distances(means: Tensor, centers: NDArray[np.float64]) -> NDArray[np.
     return apart
 
 
+def position_units(means: Tensor, centers: NDArray[np.float64]) -> Tensor:
+    """(N, 3) `ModelState.units` where a step is a part of the distance; copies have those of their source."""
+    apart = torch.from_numpy(camera_distances(means, centers).astype(np.float32)).to(means.device)
+    return apart[:, None].expand(-1, 3).contiguous()
+
+
 def _sources(
     gaussians: Gaussians, statistics: Statistics, config: DensifyConfig, extent: float | NDArray[np.float64]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -15,6 +15,7 @@ MOMENT = "exp_avg."  # in `ModelState.tensors`, before the name of a parameter
 AVERAGE = "average."  # before the names of what `Average.tensors` has
 _COUNT = f"{AVERAGE}count"
 EXACT = "exact"  # in them where `Gaussians.exact`
+UNITS = "units.means"  # in them where the rate of means has units
 
 
 @dataclass(eq=False)
@@ -24,13 +25,14 @@ class ModelState:
     gaussians: Gaussians
     exp_avg: dict[str, Tensor]  # shaped as the parameters
     exp_avg_sq: dict[str, Tensor]
+    units: Tensor | None = None  # (N, 3) of the rate of means, world units; None: that has them itself
 
     @staticmethod
     def start(gaussians: Gaussians) -> "ModelState":
         """The state before the first step: a copy of the parameters, with zero moments."""
         tensors = {name: tensor.detach().clone() for name, tensor in gaussians.tensors().items()}
-        zeros = [{name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2)]
-        return ModelState(gaussians.with_tensors(tensors), *zeros)
+        first, second = ({name: torch.zeros_like(it) for name, it in tensors.items()} for _ in range(2))
+        return ModelState(gaussians.with_tensors(tensors), first, second)
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> "ModelState":
@@ -41,6 +43,7 @@ class ModelState:
             Gaussians(**{name: tensors[name] for name in names}, sky=int(tensors["sky"]), exact=exact),
             {name: tensors[f"{MOMENT}{name}"] for name in names},
             {name: tensors[f"exp_avg_sq.{name}"] for name in names},
+            tensors.get(UNITS),
         )
 
     def tensors(self) -> dict[str, Tensor]:
@@ -50,6 +53,8 @@ class ModelState:
         moments["sky"] = torch.tensor(self.gaussians.sky)
         if self.gaussians.exact:
             moments[EXACT] = torch.tensor(1)
+        if self.units is not None:
+            moments[UNITS] = self.units
         return {**self.gaussians.tensors(), **moments}
 
     def leaves(self, sh_degree: int) -> Gaussians:
@@ -72,8 +77,9 @@ class ModelState:
         parameters = self.gaussians.tensors()
         for name, gradient in gradients.items():
             moments = (self.exp_avg[name], self.exp_avg_sq[name])
+            lr, moving, units = rates[name], rows[name], self._units_of(name)
             try:
-                adam_(parameters[name], gradient, *moments, lr=rates[name], step=step, rows=rows[name])
+                adam_(parameters[name], gradient, *moments, lr=lr, step=step, rows=moving, units=units)
             except FloatingPointError as error:
                 raise FloatingPointError(f"gradient of {name}") from error
 
@@ -89,10 +95,14 @@ class ModelState:
                 self.exp_avg_sq[name],
                 parameter[: rows[name]].numel(),
                 rates[name],
+                self._units_of(name),
             )
             for name, parameter in self.gaussians.tensors().items()
             if (gradient := gradients.get(name)) is not None
         ]
+
+    def _units_of(self, name: str) -> Tensor | None:
+        return self.units if name == "means" else None
 
     def rearrange(self, source: Tensor, new: Tensor, sky: int) -> None:
         """Row i becomes a copy of row source[i], with zero moments if it is `new`.
@@ -105,6 +115,8 @@ class ModelState:
             for name, moment in moments.items():
                 moments[name] = moment[source]
                 moments[name][new] = 0
+        if self.units is not None:
+            self.units = self.units[source]
 
     def drop_invalid(self) -> int:
         """Remove Gaussians with a parameter that is not finite or a zero quaternion; returns how many."""

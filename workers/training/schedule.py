@@ -129,7 +129,7 @@ class Schedule:
         return max(start, min(count, densify.max_gaussians)) if densify.max_gaussians else count
 
     def position(self, iteration: int) -> float:
-        """The rate of means of a full run, extents of the task's cameras: it decays exponentially (3DGS)."""
+        """The rate of means of a full run, in `optimizer.unit`: it decays exponentially (3DGS)."""
         rates, share = self.config.optimizer, iteration / self.iterations
         first = rates.position * (self.config.stage2.position if self.refine else 1)
         if first == 0:
@@ -165,12 +165,12 @@ class Schedule:
         return float(depth.w0 * (depth.wT / depth.w0) ** (iteration / self.iterations))
 
     def rates(self, iteration: int) -> dict[str, float]:
-        """Learning rates by parameter; that of means in world units."""
+        """Learning rates by parameter; that of means in world units, or in `ModelState.units`."""
         rates, rate = self.config.optimizer, self.config.stage2.rate if self.refine else 1.0
         length = max(1.0, FULL_RUN / self.iterations) ** rates.short_runs
         shapes, colors = rate * length, rate * math.sqrt(length)
         return {
-            "means": length * self.position(iteration) * self.extent,
+            "means": length * self.position(iteration) * (1 if rates.unit == "distance" else self.extent),
             "quats": shapes * rates.rotation,
             "scales": shapes * rates.scale,
             "opacities": rates.opacity * rate,

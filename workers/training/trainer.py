@@ -34,7 +34,7 @@ from panolog.workers.meter import Meter
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.densify import Statistics, drop_unrisen, reset_opacities
+from panolog.workers.training.densify import Statistics, drop_unrisen, position_units, reset_opacities
 from panolog.workers.training.direct import Direct
 from panolog.workers.training.exterior import Exterior, Rooms, exterior_last, inside
 from panolog.workers.training.initialise import (
@@ -129,6 +129,7 @@ class Trainer:
         self.views = SoundViews(spec.task, scene, spec.views, cache, spec.config.images.damaged)
         self.near = near_distance(scene, spec.config)
         self.exact = spec.config.projection == "exact"
+        self.centers = scene.centers[list(spec.views)]
         extent = camera_extent(scene, spec.views)
         self.schedule = Schedule(spec.config, spec.iterations, extent, spec.cell is not None)
         self.loss = Loss(scene, spec.config, spec.seed, self.schedule)
@@ -137,15 +138,8 @@ class Trainer:
         device = self.device = torch.device(spec.device)
         launch, count, broken = ops.launcher(device), self.meter.count, self._not_finite
         self.pipeline = Direct(count, broken) if launch is None else Pipeline(launch, device, count, broken)
-        self.learning = Learning(
-            scene,
-            spec.views,
-            spec.config,
-            spec.device,
-            width=spec.width,
-            iterations=spec.iterations,
-            learns=spec.cell is None,
-        )
+        sizes, learns = {"width": spec.width, "iterations": spec.iterations}, spec.cell is None
+        self.learning = Learning(scene, spec.views, spec.config, spec.device, **sizes, learns=learns)
         self.exterior: Exterior | None = None  # if it is baked
         self.average = Average()
         self.iteration = 0
@@ -166,6 +160,8 @@ class Trainer:
                 sky = sky_gaussians(self.scene, config, count, self.spec.views, self.views.get)
                 gaussians = concatenate(gaussians, sky)
         self.state = ModelState.start(replace(gaussians, exact=self.exact).to(self.spec.device))
+        if self.spec.config.optimizer.unit == "distance":
+            self.state.units = position_units(self.state.gaussians.means, self.centers)
         self.start = int(inside(self.state.gaussians, self.spec.cell).sum())
         self.reset_statistics()
 
@@ -369,8 +365,7 @@ class Trainer:
             self.reset_statistics()
         if self.schedule.densifies(iteration):
             random = generator(self.spec.seed, str(self.spec.task), "split", iteration)
-            pixels, centers = self.spec.width**2 // 2, self.scene.centers[list(self.spec.views)]
-            place = Place(self.spec.cell, self.start, pixels, centers)
+            place = Place(self.spec.cell, self.start, self.spec.width**2 // 2, self.centers)
             grow(self.state, self.statistics, self.schedule, place, iteration, random)
             self.reset_statistics()
         if resets:

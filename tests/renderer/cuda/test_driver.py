@@ -66,7 +66,7 @@ def test_the_driver_copies_what_each_kernel_takes(
     for module in nvrtc.MODULES:
         sizes |= parameters(nvrtc.cubin(module, ARCH))
     assert sizes["project_forward"] == [8] * 7 + [64] + [8] * 6
-    assert sizes["adam_step"] == [6 * 56, 4, 4, 4, 4, 8]
+    assert sizes["adam_step"] == [6 * 64, 4, 4, 4, 4, 8]
     command = [sys.executable, "-m", "tests.renderer.cuda.driver_calls", ARCH, repr(sizes)]
     done = subprocess.run(
         command, env=environment, cwd=HERE.parents[2], check=False, capture_output=True, text=True

@@ -263,5 +263,6 @@ def test_absolute_difference(share: float, machine: Machine) -> None:
     check_absolute_difference(machine, share)
 
 
-def test_adam_on_the_first_values(machine: Machine) -> None:
-    check_adam(machine, 500)
+@pytest.mark.parametrize("apart", [False, True])
+def test_adam_on_the_first_values(machine: Machine, apart: bool) -> None:
+    check_adam(machine, 500, apart=apart)

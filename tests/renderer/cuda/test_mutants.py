@@ -101,7 +101,7 @@ def losses(launch: EmulatedLaunch) -> None:
 
 def adam(launch: EmulatedLaunch) -> None:
     for moving in (600, 500):
-        check_adam(emulated(launch), moving)
+        check_adam(emulated(launch), moving, apart=moving == 500)
     parameter, gradient, exp_avg, exp_avg_sq = torch.rand(4, 600, generator=torch.Generator().manual_seed(0))
     before = parameter.clone()
     update = parts.Update(gradient, parameter, exp_avg, exp_avg_sq, 600, 0.01)

@@ -20,6 +20,7 @@ from panolog.workers.training.densify import (
     camera_distances,
     densify,
     drop_large,
+    position_units,
     reset_opacities,
 )
 from panolog.workers.training.initialise import isotropic
@@ -73,6 +74,23 @@ def test_what_is_large_may_be_a_matter_of_distance() -> None:
     densify(state, statistics_of([LOUD] * 3), DensifyConfig(large="distance"), distances, random)
     sizes = state.gaussians.scales[:, 0].exp().tolist()  # bounds: 0.01, 0.99, 0.1
     assert sizes == pytest.approx([0.05, 0.05, *[0.05 / 1.6, 0.5 / 1.6] * 2])
+
+
+def test_a_step_may_be_a_part_of_the_distance() -> None:
+    """From the nearest camera; what is divided keeps it."""
+    state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0)  # at x = 0, 100 and 200
+    state.units = position_units(state.gaussians.means, np.array([[1.0, 0, 0], [210, 0, 0]]))
+    assert state.units.tolist() == [[1] * 3, [99] * 3, [10] * 3]
+    before = state.gaussians.means.clone()
+    gradient = {"means": torch.ones(3, 3)}
+    state = ModelState.from_tensors({name: tensor.clone() for name, tensor in state.tensors().items()})
+    for moments in (state.exp_avg, state.exp_avg_sq):
+        moments["means"].zero_()
+    state.step(gradient, {"means": 0.01}, {"means": 2}, step=1)
+    moved = (before - state.gaussians.means)[:, 0].tolist()
+    assert moved == pytest.approx([0.01 * 1, 0.01 * 99, 0], rel=1e-4)
+    densify(state, statistics_of([LOUD] * 3), DensifyConfig(), EXTENT, np.random.default_rng(0))
+    assert state.units is not None and sorted(state.units[:, 0].tolist()) == [1, 1, 10, 10, 99, 99]
 
 
 def test_moments_follow_and_new_ones_start_at_zero() -> None:

@@ -40,7 +40,7 @@ COARSE: dict[str, Groups] = {
     "distance": {"densify": {"large": "distance", "percent_dense": 0.2}},
     "averaged": {"optimizer": {"average": 0.25}},
     "relocated": {"densify": RELOCATED},
-    "relocated, exact": {"densify": RELOCATED, "projection": "exact"},
+    "relocated, exact": {"densify": RELOCATED, "projection": "exact", "optimizer": {"unit": "distance"}},
     "captured": CAPTURED,
 }
 BLOCKS: dict[str, Groups] = {
@@ -53,6 +53,7 @@ BLOCKS: dict[str, Groups] = {
         "stage2": {"exterior": "baked"},
         "densify": RELOCATED,
         "projection": "exact",
+        "optimizer": {"unit": "distance"},
     },
 }
 

@@ -96,6 +96,8 @@ def test_position_rate_decays_in_scene_extents() -> None:
     assert run.rates(500)["means"] == pytest.approx(2 * 1.6e-5)
     assert run.rates(1_000)["means"] == pytest.approx(2 * 1.6e-6)
     assert run.rates(1)["opacities"] == run.rates(1_000)["opacities"] == 0.05
+    apart = schedule(1_000, optimizer={"unit": "distance"})
+    assert apart.rates(500) == run.rates(500) | {"means": pytest.approx(1.6e-5)}
 
 
 def test_a_block_may_continue_at_the_rates_at_which_stage_one_ended() -> None:
