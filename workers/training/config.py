@@ -247,11 +247,10 @@ class OptimizerConfig(Group):
         ge=0,
         le=1,
         description="exponent p: in a run of fewer than 30,000 iterations the rates of shapes are multiplied"
-        " by (30,000 / iterations)^p and those of colours by its root; 0 = as they are, 3DGS",
+        " by (30,000 / iterations)^p, those of colours by its root and those of positions by its square, with"
+        " 0.5 so that they come as far in all; 0 = as they are, 3DGS",
     )
-    average: float = Field(
-        default=0.0, ge=0, lt=1, description="last fraction of a run whose models are averaged; 3DGS: none"
-    )
+    average: float = Field(default=0.0, ge=0, lt=1, description="part of a run, its last, that is averaged")
 
 
 class Stage2Config(Group):

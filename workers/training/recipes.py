@@ -19,7 +19,7 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "partition.aspect": 0.5,  # the storeys of a house are in one block
         "depth.unit": "baseline",  # a weight that means the same whatever the unit of a reconstruction
         "depth.sky": True,  # nothing near may hide in the sky
-        "depth.wT": 0.25,  # what only the nearest panoramas show well stays where the maps have it
+        "depth.wT": 0.1,  # what only the nearest panoramas show well stays where the maps have it
         "loss.sphere": True,  # a pole has many pixels, and little of what is seen
         "densify.method": "relocate",  # as many Gaussians as the paper, where they are needed; no resets
         "densify.growth": 0.75,  # so that a street has no more than in the paper's recipe
@@ -31,6 +31,8 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "densify.until": 24_000,  # relocation disturbs little, so it may last longer
         "densify.prune_opacity": 0.02,  # fainter ones are haze: they learn more elsewhere, and none is merged
         "densify.opacity_decay": 0.003,  # what no view holds up moves sooner
+        "optimizer.position": 1e-4,
+        "optimizer.position_final": 1e-6,
         "optimizer.unit": "distance",  # else what is near moves by pixels each step, and never comes to rest
         "optimizer.short_runs": 0.5,  # a short run at the rates of a long one ends before shapes arrive
         "optimizer.average": 0.125,  # what single views pull out of place at the end evens out

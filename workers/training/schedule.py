@@ -170,7 +170,7 @@ class Schedule:
         length = max(1.0, FULL_RUN / self.iterations) ** rates.short_runs
         shapes, colors = rate * length, rate * math.sqrt(length)
         return {
-            "means": length * self.position(iteration) * (1 if rates.unit == "distance" else self.extent),
+            "means": length**2 * self.position(iteration) * (1 if rates.unit == "distance" else self.extent),
             "quats": shapes * rates.rotation,
             "scales": shapes * rates.scale,
             "opacities": rates.opacity * rate,
