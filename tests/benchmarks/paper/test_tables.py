@@ -134,3 +134,9 @@ def test_overlap_counts_what_gradients_add() -> None:
 def test_markdown_keeps_columns_aligned() -> None:
     lines = markdown(["a", "b"], [[1234, 0.5], [None, 12345.6]]).splitlines()
     assert lines == ["| a     | b      |", "|-------|--------|", "| 1,234 | 0.5000 |", "| –     | 12,346 |"]
+
+
+def test_the_page_of_the_documentation_has_measured_the_recipes_of_today() -> None:
+    """Else `python -m benchmarks.paper` has to measure them again: the page says with which options."""
+    page = Path(__file__).parents[3] / "docs" / "quality.md"
+    assert page.read_text().partition("\n")[0] == pages.first_line()
