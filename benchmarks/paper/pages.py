@@ -83,7 +83,7 @@ def write_docs(path: Path, studies: Sequence[Study]) -> None:
 
 
 def first_line() -> str:
-    """Of the page, as it is written today: with the recipes that it has measured."""
+    """The first line of docs/quality.md, which has the fingerprint of the recipes of today."""
     return f"<!-- Written by `python -m benchmarks.paper … --docs` of recipes {recipes()}: do not edit. -->"
 
 

@@ -16,7 +16,7 @@ from panolog.renderer.process import release_memory
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.files import read_at, write_all
-from panolog.scene.gaussians import Gaussians, concatenate
+from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import packed_bytes, unpack, view_bytes
 from panolog.scene.model import Panorama
 from panolog.workers.training.config import CacheConfig
@@ -183,13 +183,12 @@ class Exterior:
         what = f"what surrounds the block for {len(cameras)} panoramas, {mebibytes:.0f} MiB"
         return f"baked {what}; its colours {differences}"
 
-    def differences(self, own: Gaussians, model: Gaussians, cameras: Mapping[int, Camera]) -> str:
+    def differences(self, own: Gaussians, whole: Gaussians, cameras: Mapping[int, Camera]) -> str:
         """How far what is baked is from the full render on some of the cameras, for the log.
 
-        Args: own, what the block trains, as it is by now; model, what was baked, as in `__init__`.
+        Args: own, what the block trains, as it is by now; whole, the same with all that was baked.
         """
-        around = model.select(torch.arange(len(model)) >= model.scene.stop)
-        whole, rows, found = concatenate(own, around), list(cameras), [torch.zeros(1)]
+        rows, found = list(cameras), [torch.zeros(1)]
         for row in rows[:: -(-len(rows) // CHECKED)]:
             camera, baked = cameras[row], self.views.get(row).to("cpu")
             full = render(whole, camera, near=self._near).color

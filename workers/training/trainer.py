@@ -27,7 +27,7 @@ from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
 from panolog.workers import stopping
 from panolog.workers.capture.learning import Learning
-from panolog.workers.comparison import better_block
+from panolog.workers.comparison import better_block, with_block
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
 from panolog.workers.merge import retained
 from panolog.workers.meter import Meter
@@ -170,15 +170,11 @@ class Trainer:
         kind = self.spec.config.stage2.exterior
         if kind == "full":
             return initial.load()
-        gaussians = self._sorted(initial)
+        gaussians = replace(exterior_last(initial.load(), self.spec.cell), exact=self.exact)
         if kind == "frozen":
             return gaussians
         self.exterior = Exterior(gaussians, self.near, self.loss.unit, self._room, self.device)
         return Exterior.own(gaussians)
-
-    def _sorted(self, initial: Source[Gaussians]) -> Gaussians:
-        """The Stage I model, what surrounds the block last."""
-        return replace(exterior_last(initial.load(), self.spec.cell), exact=self.exact)
 
     def surround(self, stop: Callable[[], bool]) -> Iterator[Event]:
         """Bake the exterior of a block for its cameras; after a stop the rest is baked when it is needed."""
@@ -190,7 +186,7 @@ class Trainer:
             exterior.of(row, self._camera(row))
             if self.meter.due():
                 yield self.meter.progress(self.iteration, len(self.state.gaussians))
-        yield Notice(self.spec.task, exterior.finish({row: self._camera(row) for row in self.spec.views}))
+        yield Notice(self.spec.task, exterior.finish(self._cameras()))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint. Raises RunError if it is of another task or a longer run."""
@@ -251,10 +247,11 @@ class Trainer:
             if stopped:
                 return
         yield from self.saver.finished(wait=True)
-        if self.exterior is not None and self.spec.initial is not None:
+        if self.exterior is not None and self.spec.initial is not None and self.spec.cell is not None:
             self.settle()
-            own, cameras = self.state.gaussians.to("cpu"), {row: self._camera(row) for row in self.spec.views}
-            differences = self.exterior.differences(own, self._sorted(self.spec.initial), cameras)
+            own = self.state.gaussians.to("cpu")
+            whole = with_block(self.spec.initial.load(), self.spec.cell, own)
+            differences = self.exterior.differences(own, whole, self._cameras())
             yield Notice(self.spec.task, f"at the end the colours of what is baked {differences}")
 
     def result(self) -> Gaussians:
@@ -297,6 +294,9 @@ class Trainer:
 
     def _camera(self, row: int) -> Camera:
         return self.learning.camera(row, self.width)
+
+    def _cameras(self) -> dict[int, Camera]:
+        return {row: self._camera(row) for row in self.spec.views}
 
     def _around(self, row: int) -> Baked | None:
         """What a camera sees of a baked exterior."""
