@@ -281,7 +281,7 @@ def adam(
 ) -> None:
     """One step of Adam (Kingma and Ba 2015, algorithm 1) on the first `count` values, in place.
 
-    Args: units of lr, for each value; None: all 1.
+    Args: units (N,) of lr, for each of the N rows of the parameter; None: all 1.
 
     Raises FloatingPointError if their gradient is not finite: the check is part of the pass over it.
     """

@@ -38,3 +38,15 @@ def project_to_pixels(
     u = np.floor(width * (azimuth / (2 * math.pi) + 0.5)).astype(np.int64) % width
     v = np.floor(height * (elevation / math.pi + 0.5)).astype(np.int64).clip(0, height - 1)
     return distance, v, u
+
+
+def fibonacci_sphere(count: int) -> NDArray[np.float64]:
+    """(count, 3) unit directions, evenly distributed: equal steps in height, the golden angle in azimuth.
+
+    A uniform spherical sampling with neither holes nor clusters, unlike independent random directions.
+    """
+    index = np.arange(count)
+    z = 1 - (2 * index + 1) / count
+    azimuth = index * (math.pi * (3 - math.sqrt(5)))
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)

@@ -79,7 +79,7 @@ def calibrate(spec: CalibrateSpec) -> Iterator[Progress | Calibration]:
     started = time.monotonic()
     with open_cache(spec, scene, views, len(views) * each) as cache:
         trainer = Trainer(trial, scene, cache)
-        trainer.begin()
+        yield from trainer.begin()
         begin = time.monotonic() - started
         yield Progress(spec.task, 1, _PARTS, 0.0)
         cache.prefetch(views)
@@ -163,7 +163,7 @@ def _target(spec: CalibrateSpec, trainer: Trainer, share: float, seconds: float)
     start = len(gaussians) - gaussians.sky
     pixels = spec.width * (spec.width // 2)
     added = additions(start, share, pixels)
-    coarse = population(start, added, pixels, trainer.schedule)[-1][1]
+    coarse = population(trainer.start, added, pixels, trainer.schedule, start)[-1][1]
     block = population(coarse, added, pixels, replace(trainer.schedule, refine=True))[-1][1]
     affordable = int(spec.seconds / ((_WARM_UP + 1) * seconds) * len(gaussians))
     return max(start, min(block, min(spec.most, affordable) - gaussians.sky))

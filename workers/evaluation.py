@@ -16,7 +16,7 @@ from panolog.workers.seams.measurement import SeamMeasurement, Seams
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.tasks import EVAL, TaskId
-from panolog.workers.training.config import ImagesConfig
+from panolog.workers.training.task_config import ImagesConfig
 
 FACES = 2  # of a shard: what is around more of them would be much of the place
 _IMAGE_MEMORY = 2**30  # bytes of decoded panoramas; each one is needed once

@@ -37,18 +37,18 @@ def additions(points: int, share: float, pixels: int) -> float:
     return share * points * (GROWTH_OFFSET + GROWTH_SLOPE * math.log(max(1.0, pixels / max(points, 1))))
 
 
-def population(start: int, added: float, pixels: int, schedule: Schedule) -> list[Period]:
+def population(start: int, added: float, pixels: int, schedule: Schedule, filled: int = 0) -> list[Period]:
     """The number of scene Gaussians over a task, sky not counted; the iterations add up to the task's.
 
-    Args: start, how many there are at its begin; added, `additions` of the scene; pixels of one
-    panorama.
+    Args: start, the points or Gaussians that it starts from; added, `additions` of the scene; pixels of one
+    panorama; filled, how many there are at its begin, if more (`Schedule.first`).
     """
     relocates = schedule.config.densify.method == "relocate"
     cap = schedule.config.densify.max_gaussians
     first = added * (_REFINED if schedule.refine else 1.0)
     rate = first
     periods: list[Period] = []
-    count, since = start, 0
+    count, since = max(start, filled), 0
     for iteration in schedule.turns():
         if schedule.densifies(iteration):
             periods.append((iteration - since, count))

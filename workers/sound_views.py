@@ -1,6 +1,9 @@
 """The panoramas of a task that can be decoded: damaged ones are left out, up to a limit."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import torch
+from torch import Tensor
 
 from panolog.renderer import ops
 from panolog.scene.errors import ImageError
@@ -9,6 +12,8 @@ from panolog.scene.model import Scene
 from panolog.workers.events import LeftOut
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import TaskId
+
+_LEFT_OUT = "views.left_out"  # in checkpoints: rows of the panoramas
 
 
 def open_cache(
@@ -65,9 +70,25 @@ class SoundViews:
             self._notices.append(LeftOut(self._task, f"{name} is left out: {error}", name))
             return None
 
+    def each(self, rows: Sequence[int], ahead: int) -> Iterator[View]:
+        """Some views in order, without those left out; so many ahead decode meanwhile. Raises as `get`."""
+        for index, row in enumerate(rows):
+            self._cache.prefetch(rows[index : index + ahead])
+            if (view := self.get(row)) is not None:
+                yield view
+
     def first(self, rows: Iterable[int]) -> View:
         """The first of some views that is not left out. Raises as `get`; StopIteration if there is none."""
         return next(view for view in map(self.get, rows) if view is not None)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Which are left out, for a checkpoint; none if all are sound."""
+        return {_LEFT_OUT: torch.tensor(sorted(self.left_out))} if self.left_out else {}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """The inverse of `tensors`, also among others."""
+        if _LEFT_OUT in tensors:
+            self.left_out.update(tensors[_LEFT_OUT].tolist())
 
     def notices(self) -> list[LeftOut]:
         """The panoramas that were left out since the last call."""

@@ -29,7 +29,7 @@ class Goal:
 def goals(results: Results, kinds: Mapping[str, str]) -> list[Goal]:
     """Those for which there are results. Args: kinds, of KINDS by scene, where it is not a street."""
     by_scene = [*_blocks(results, kinds), *_g2ps(results), *_haze(results)]
-    return [*_recipes(results), *_sooner(results), *by_scene]
+    return [*_recipes(results), *_sooner(results), *_lasting(results), *by_scene]
 
 
 def table(found: Sequence[Goal]) -> Table:
@@ -40,9 +40,13 @@ def table(found: Sequence[Goal]) -> Table:
 
 def _recipes(results: Results) -> Iterator[Goal]:
     """panolog against paper, at equal iterations and at equal wall-clock."""
-    for variant, how in (("panolog-time", "equal wall-clock"), ("panolog", "equal iterations")):
+    for variant, base, how in (
+        ("panolog-time", "paper", "equal wall-clock"),
+        ("panolog", "paper", "equal iterations"),
+        ("panolog-stage1", "paper-stage1", "Stage I alone, equal iterations"),
+    ):
         for metric, least in (("ws_psnr", 1.5), ("psnr", 1.2), ("ssim", 0.0)):
-            gains = _gains(results, variant, "paper", metric)
+            gains = _gains(results, variant, base, metric)
             if not gains:
                 continue
             mean, worst = fmean(gains.values()), min(gains.values())
@@ -57,7 +61,7 @@ def _recipes(results: Results) -> Iterator[Goal]:
         pairs = [
             (scene, a.gaussians, b.gaussians)
             for scene in results.scenes
-            if (a := results.first(scene, variant)) and (b := results.first(scene, "paper"))
+            if (a := results.first(scene, variant)) and (b := results.first(scene, base))
         ]
         if pairs:
             yield Goal(
@@ -98,6 +102,20 @@ def _sooner(results: Results) -> Iterator[Goal]:
             measured,
             met,
         )
+
+
+def _lasting(results: Results) -> Iterator[Goal]:
+    """Whether longer training is never worse."""
+    for scene in results.scenes:
+        run = results.first(scene, "panolog-stage1")
+        if run is not None and run.curve:
+            most, last = max(point.ws_psnr for point in run.curve), run.curve[-1].ws_psnr
+            yield Goal(
+                f"{scene}: Stage I of panolog at its end",
+                "at its best",
+                f"{last:.2f} dB, at most {most:.2f} dB before",
+                last >= most,
+            )
 
 
 def reached(curve: Sequence[Point], level: float) -> float | None:

@@ -17,7 +17,7 @@ POINTS = 8  # states of a stage that a curve evaluates
 _SWITCHES = {  # settings of the panolog recipe that mean something only together
     "relocation": (
         *("densify.method", "densify.growth", "densify.filled", "densify.weight", "densify.until"),
-        *("densify.opacity_decay", "densify.scale_decay", "densify.noise", "densify.max_gaussians"),
+        *("densify.opacity_decay", "densify.noise", "densify.max_gaussians"),
     ),
     "block growth": ("stage2.growth", "stage2.opacity_decay"),
     "angle": ("densify.measure", "densify.views", "densify.long_axis"),
@@ -140,6 +140,7 @@ def groups() -> tuple[Group, ...]:
     switches = [variant.name for variant in _switches()]
     return (
         Group("main", "Recipe against recipe", ("paper", "panolog", "panolog-time")),
+        Group("stage1", "Stage I alone, over its iterations", ("paper-stage1", "panolog-stage1")),
         Group(
             "length",
             "Blocks against Stage I alone",
@@ -244,6 +245,7 @@ def _lengths() -> list[Variant]:
             f"{recipe}-stage1",
             f"Stage I of {recipe}, as blocks begin with it",
             {"recipe": recipe, "refine": False},
+            curve=True,
             spread=True,
         )
         for recipe in RECIPES

@@ -23,7 +23,7 @@ from panolog.orchestrator.run.records import BlockPlan, Failure
 from panolog.orchestrator.run.state import RunState
 from panolog.scene.ply import ply_header
 from panolog.workers.tasks import COARSE, Stage, TaskId
-from panolog.workers.training.config import CacheConfig
+from panolog.workers.training.task_config import CacheConfig
 
 _SMALLER = 1 / 4  # of the image cache, after a shortage of memory
 _FREE = 1 / 2  # of a machine's free memory that its tasks on GPUs fill with decoded panoramas

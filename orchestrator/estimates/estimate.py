@@ -225,8 +225,7 @@ class Estimator:
         return math.ceil(own * self.parts.share) if self.bakes else own
 
     @property
-    def bakes(self) -> bool:
-        """Whether blocks have a baked exterior."""
+    def bakes(self) -> bool:  # whether blocks have a baked exterior
         return self.config.stage2.exterior == "baked"
 
     @property
@@ -287,9 +286,9 @@ class Estimator:
     @cached_property
     def _beyond(self) -> int:
         """Bytes of a GPU beyond what is counted: the context, and what the calibration had more or less."""
-        measured = self.basis.measured
-        counted = device_memory.training(measured.grown.gaussians, measured.width * (measured.width // 2))
-        return device_memory.CONTEXT + measured.grown.device - counted
+        grown, width = self.basis.measured.grown, self.basis.measured.width
+        counted = device_memory.training(grown.gaussians, width * (width // 2))
+        return device_memory.CONTEXT + grown.device - counted
 
     def slots(self, host: int) -> int:
         """How many tasks work at a time, at least one: as GPUs, or cores and memory, allow.
@@ -309,7 +308,8 @@ class Estimator:
     @cached_property
     def _start(self) -> int:
         """Scene Gaussians that Stage I starts with; of several districts, that of the one with most."""
-        return math.ceil(len(self.scene.points) * self.parts.district[1])
+        points = self.parts.points
+        return self._schedule.first(points, self._pixels) if self.parts.mapped else points
 
     @cached_property
     def _added(self) -> float:
@@ -317,11 +317,11 @@ class Estimator:
 
     @cached_property
     def _coarse(self) -> list[Period]:
-        return population(self._start, self._added, self._pixels, self._schedule)
+        return population(self.parts.points, self._added, self._pixels, self._schedule, self._start)
 
     @property
     def _whole(self) -> int:  # scene Gaussians that Stage I comes to
-        return math.ceil(self._coarse[-1][1] * len(self.scene.points) / max(1, self._start))
+        return math.ceil(self._coarse[-1][1] * len(self.scene.points) / max(1, self.parts.points))
 
     @cached_property
     def _block(self) -> list[Period]:

@@ -56,6 +56,16 @@ class Parts:
         starts = [len(points_of(scene, row, districts.cell(i), self.width)) for i, row in enumerate(rows)]
         return int(districts.cameras.sum(axis=1).max()), max(starts) / len(scene.points)
 
+    @cached_property
+    def points(self) -> int:
+        """Sparse points that Stage I starts from; of several districts, those of the one with most."""
+        return math.ceil(len(self.scene.points) * self.district[1])
+
+    @property
+    def mapped(self) -> bool:
+        """Whether there are depth images, from which Stage I may start too."""
+        return any(self.scene.panoramas[row].depth for row in self.scene.train)
+
     def learning(self, cameras: int) -> int:
         """Bytes of what Stage I learns about so many panoramas; of movers, all else is a few numbers."""
         return state_bytes(self.config.movers, cameras, self.width)

@@ -104,6 +104,7 @@ _FORMER: Mapping[str, Any] = {
     "depth.sky": True,
     "densify.prune_scale": 0.0,
 }
+_WITHOUT_EFFECT = ("densify.scale_decay",)  # settings of older versions that no recipe used
 _FORMER_EXTERIOR = {"train": "full", "fixed": "frozen"}  # of stage2.exterior
 
 
@@ -266,6 +267,10 @@ def _canonical(given: dict[str, Any]) -> dict[str, Any]:
         _put(tree, "stage2.exterior", partition.pop("exterior"))
     elif isinstance(stage2, dict) and stage2.get("exterior") in _FORMER_EXTERIOR:
         stage2["exterior"] = _FORMER_EXTERIOR[stage2["exterior"]]
+    for key in _WITHOUT_EFFECT:
+        if _given(tree, key):
+            group, name = key.split(".")
+            del tree[group][name]
     return tree
 
 

@@ -30,7 +30,7 @@ from panolog.scene.ply import (
 from panolog.workers.capture.captured import Captured, joined
 from panolog.workers.merge import merge, retained
 from panolog.workers.tasks import COARSE, MERGE, TaskId
-from panolog.workers.training.saved_model import SavedModel
+from panolog.workers.training.checkpoint import SavedModel
 
 _TRAINED = 0.5  # of its iterations, from which on a checkpoint is used: `benchmarks.money.early_end`
 

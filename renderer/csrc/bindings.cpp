@@ -298,7 +298,8 @@ NB_MODULE(_core, m) {
                                          .eps = eps,
                                          .correction1 = float(1 - std::pow(double(beta1), double(step))),
                                          .correction2 = float(1 - std::pow(double(beta2), double(step))),
-                                         .units = units ? units->data() : nullptr};
+                                         .units = units ? units->data() : nullptr,
+                                         .values = units ? int64_t(parameter.size() / units->size()) : 0};
         std::atomic<bool> broken{false};
         panolog::each_span(count, threads, 1 << 15, [&](int64_t begin, int64_t end) {
           if (all_finite(gradient.data(), begin, end))

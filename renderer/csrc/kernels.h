@@ -56,7 +56,8 @@ struct ImageGradients {
 
 struct AdamStep {
   float lr, beta1, beta2, eps, correction1, correction2;  // corrections: 1 - betaᵗ
-  const float* units;                                     // of lr, for each value; null: all 1
+  const float* units;                                     // of lr, for each row; null: all 1
+  int64_t values;                                         // of a row
 };
 
 // Sums over the samples of a row, in parallel by their place so that the order is fixed; those after the last sixteen

@@ -315,10 +315,11 @@ void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict
     exp_avg_sq[i] = s.beta2 * exp_avg_sq[i] + (1 - s.beta2) * g * g;
     parameter[i] -= unit * rate * exp_avg[i] / (sqrtf(exp_avg_sq[i]) * root + s.eps);
   };
-  if (const float* __restrict units = s.units)
-    for (int64_t i = begin; i < end; ++i) step(i, units[i]);
-  else
-    for (int64_t i = begin; i < end; ++i) step(i, 1);
+  const int64_t values = s.units ? s.values : end;
+  for (int64_t i = begin; i < end;) {
+    const int64_t row = i / values, next = (row + 1) * values, last = next < end ? next : end;
+    for (const float unit = s.units ? s.units[row] : 1; i < last; ++i) step(i, unit);
+  }
 }
 
 }  // namespace

@@ -336,7 +336,7 @@ class Update(NamedTuple):
     exp_avg_sq: Tensor
     moving: int
     lr: float
-    units: Tensor | None = None  # of lr, for each value
+    units: Tensor | None = None  # (N,) of lr, for each row of the parameter
 
 
 def adam_step(
@@ -355,7 +355,8 @@ def adam_step(
     blocks, segments = 0, b""
     for *tensors, moving, lr, units in updates:
         pointers = (0 if tensor is None else tensor.data_ptr() for tensor in (*tensors, units))
-        segments += _SEGMENT.pack(*pointers, moving, blocks, lr / bias, 0)
+        values = 1 if units is None else tensors[0].numel() // max(1, units.numel())
+        segments += _SEGMENT.pack(*pointers, moving, blocks, lr / bias, values)
         blocks += math.ceil(moving / THREADS)
     segments += _SEGMENT.pack(0, 0, 0, 0, 0, 0, blocks, 0, 0) * (MOST_SEGMENTS - len(updates))
     given = Struct(segments)
@@ -378,7 +379,7 @@ def adam_step(
     )
 
 
-_SEGMENT = struct.Struct("=5Q2q2f")  # Segment in csrc/cuda/adam.cu
+_SEGMENT = struct.Struct("=5Q2qfi")  # Segment in csrc/cuda/adam.cu
 
 
 def camera_struct(

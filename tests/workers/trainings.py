@@ -96,7 +96,7 @@ def begun(spec: TrainSpec) -> Iterator[Trainer]:
     """A trainer before its first iteration."""
     scene = spec.scene.load()
     with open_cache(spec, scene, spec.views, 2**30) as cache, closing(Trainer(spec, scene, cache)) as trainer:
-        trainer.begin()
+        list(trainer.begin())
         list(trainer.surround(lambda: False))
         yield trainer
 

@@ -1,7 +1,8 @@
 """The settings of training, each with its unit and the source of its default.
 
 Free of torch: `orchestrator.run` reads these settings and must not import it. The settings of all parts of
-training are therefore here and not next to their code.
+training are therefore here and not next to their code; those of its tasks, which no model depends on, are in
+`task_config`.
 
 Iterations are stated for a run of 30,000 and scale with its real length (`schedule.Schedule`), except where a
 field has "as they are". "3DGS" is Kerbl et al. 2023; "eq." and "app." are those of the PanoLOG paper.
@@ -13,6 +14,7 @@ from pydantic import Field, field_validator
 
 from panolog.workers.capture.config import CaptureConfig
 from panolog.workers.settings import Group
+from panolog.workers.training.task_config import CacheConfig, CheckpointConfig, ImagesConfig, PreviewConfig
 
 
 class LossConfig(Group):
@@ -58,6 +60,13 @@ class DepthConfig(Group):
         description="unit of depths in the loss: that of the poses, as in eq. 5, or b̂ (eq. 8)",
     )
     sky: bool = Field(default=False, description="whether the sky is in the Ω of eq. 5, as infinitely far")
+    points: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="part of the budget of Gaussians (`densify.growth`) that Stage I begins with: points that"
+        " depth images agree on fill the gaps of the sparse cloud; 0 = that cloud alone, 3DGS",
+    )
     kind: Literal["inverse", "depth"] = Field(
         default="inverse", description="radial inverse depth or radial depth in depth images; eq. 4: inverse"
     )
@@ -180,9 +189,6 @@ class DensifyConfig(Group):
         ge=0,
         lt=1,
         description="by how much opacities sink at each densification; Rota Bulò et al. 2024",
-    )
-    scale_decay: float = Field(
-        default=0.0, ge=0, lt=1, description="by how much log scales sink at each densification"
     )
     noise: float = Field(
         default=0.5,
@@ -315,61 +321,12 @@ class SHConfig(Group):
 
     degree: int = Field(default=3, ge=0, le=3, description="highest degree used; 3DGS")
     every: int = Field(default=1_000, ge=1, description="iterations until the degree grows by one; 3DGS")
-
-
-class CheckpointConfig(Group):
-    """When a task can be taken up again."""
-
-    every: int = Field(
-        default=1_000,
-        ge=1,
-        description="iterations as they are between two, at least; a few minutes of work on the CPU",
-    )
-    share: float = Field(
-        default=0.03,
-        gt=0,
-        le=1,
-        description="of a task's time that saving may take: one that is due earlier is skipped; 1 = none is."
-        " More than a few percent would be felt",
-    )
-    interval: float = Field(
-        default=60.0,
+    near: float = Field(
+        default=0.0,
         ge=0,
-        description="seconds between two at least for a task on a GPU, where `every` takes a few seconds;"
-        " what a lost process costs at most, and hardly more than its start",
-    )
-
-
-class PreviewConfig(Group):
-    """Pictures of the run in progress."""
-
-    every: int = Field(default=500, ge=1, description="iterations as they are between two, a render each")
-
-
-class CacheConfig(Group):
-    """Decoded panoramas in memory."""
-
-    memory: float = Field(
-        default=4.0,
-        gt=0,
-        description="GiB of decoded panoramas one task may keep, a thousand at 1024 pixels width; the default"
-        " grows for tasks on GPUs, to half of the machine's free memory for all",
-    )
-    device: float | None = Field(
-        default=None,
-        ge=0,
-        description="the same on its GPU, besides; none = what the estimate of its training leaves free",
-    )
-
-
-class ImagesConfig(Group):
-    """Panoramas that are damaged after the start of a run."""
-
-    damaged: float = Field(
-        default=0.05,
-        ge=0,
-        lt=1,
-        description="fraction of a task's panoramas, at least one, that may be undecodable; 0 = none may",
+        description="distance, in camera baselines (eq. 8), under which degrees 1 to 3 of a Gaussian learn in"
+        " proportion to its distance: what is near is seen from directions far apart, and not between; in"
+        " shorter runs by `optimizer.short_runs` less, so that they come as far in all; 0 = all alike, 3DGS",
     )
 
 

@@ -13,6 +13,7 @@ from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians, logit
 from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.optimizer import ModelState
+from panolog.workers.training.schedule import Schedule
 
 SPLIT_SHRINK = 1.6  # both parts of a split Gaussian are smaller by this factor; 3DGS
 _EPSILON = 1e-6  # distance of opacities from 0 and 1 that are computed with
@@ -108,10 +109,21 @@ def camera_distances(means: Tensor, centers: NDArray[np.float64]) -> NDArray[np.
     return apart
 
 
-def position_units(means: Tensor, centers: NDArray[np.float64]) -> Tensor:
-    """(N, 3) `ModelState.units` where a step is a part of the distance; copies have those of their source."""
-    apart = torch.from_numpy(camera_distances(means, centers).astype(np.float32)).to(means.device)
-    return apart[:, None].expand(-1, 3).contiguous()
+def rate_units(
+    means: Tensor, centers: NDArray[np.float64], schedule: Schedule, baseline: float
+) -> dict[str, Tensor]:
+    """`ModelState.units` of means (N, 3) and of SH of higher degrees; copies have those of their source.
+
+    Args: centers (K, 3) of cameras and their baseline b̂ (eq. 8), world units.
+    """
+    units, config = {}, schedule.config
+    near = config.sh.near * baseline / schedule.length**2  # as far in all in a run of any length
+    distance = torch.from_numpy(camera_distances(means, centers).astype(np.float32)).to(means.device)
+    if config.optimizer.unit == "distance":
+        units["means"] = distance
+    if near > 0:
+        units["shN"] = (distance / near).clamp(max=1)
+    return units
 
 
 def _sources(

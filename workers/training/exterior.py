@@ -19,7 +19,7 @@ from panolog.scene.files import read_at, write_all
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import packed_bytes, unpack, view_bytes
 from panolog.scene.model import Panorama
-from panolog.workers.training.config import CacheConfig
+from panolog.workers.training.task_config import CacheConfig
 
 _RELEASE = 8  # views: what baking one leaves free is not what the next one needs
 CHECKED = 4  # views, at most, on which what is baked is compared with the full render

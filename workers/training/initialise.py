@@ -14,11 +14,12 @@ from scipy.spatial import cKDTree
 
 from panolog.partition.bounds import baseline
 from panolog.partition.cells import Volume
-from panolog.scene.gaussians import SH_REST, Gaussians, logit
+from panolog.scene.gaussians import SH_REST, Gaussians, concatenate, logit
 from panolog.scene.images import View, pixels, unexposed
 from panolog.scene.model import Scene
-from panolog.scene.projection import project_to_pixels
+from panolog.scene.projection import fibonacci_sphere, project_to_pixels
 from panolog.workers.training.config import SkyConfig, TrainConfig
+from panolog.workers.training.surfaces import NO_POINTS, Points
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 OPACITY = 0.1  # initial, 3DGS
@@ -78,21 +79,22 @@ def isotropic(
 
 
 def scene_gaussians(
-    scene: Scene, views: Sequence[int] | None = None, district: Volume | None = None, width: int = 0
+    scene: Scene, chosen: NDArray[np.int64] | None = None, more: Points = NO_POINTS
 ) -> Gaussians:
     """One Gaussian for each point of the sparse cloud, its size the distance of its neighbours (3DGS).
 
     Its bounds come from the training cameras: no pose that is held out has an influence.
 
-    Args: views, the rows of `scene.panoramas` that are trained on, None = all that train; as `points_of`.
+    Args: chosen, rows of the cloud as of `points_of`, None = all; more, points beyond the cloud.
     """
-    chosen = points_of(scene, scene.train if views is None else views, district, width)
-    points, colors = scene.points[chosen], scene.colors[chosen]
+    chosen = np.arange(len(scene.points)) if chosen is None else chosen
+    points = np.concatenate([scene.points[chosen], more.points])
+    colors = np.concatenate([scene.colors[chosen], more.colors]) / 255.0
     spacing = _neighbour_distance(points)
     camera, _ = cKDTree(scene.centers[list(scene.train)]).query(points)
     tiny = np.finfo(np.float32).tiny  # a point in a camera
     scales = np.clip(spacing, SCALE_MIN * camera, SCALE_MAX * camera).clip(min=tiny)
-    return isotropic(points, scales, colors / 255.0, OPACITY)
+    return isotropic(points, scales, colors, OPACITY)
 
 
 def points_of(
@@ -116,6 +118,20 @@ def points_of(
     cubes = np.floor(others / np.exp2(level)[:, None])
     _, first = np.unique(np.column_stack([level, cubes]), axis=0, return_index=True)
     return np.sort(np.concatenate([observed[inside], observed[~inside][first]]))
+
+
+def first_model(
+    scene: Scene,
+    config: SkyConfig,
+    chosen: NDArray[np.int64],
+    more: Points,
+    views: Sequence[int],
+    pixels: int,
+    view: Callable[[int], View | None],
+) -> Gaussians:
+    """What Stage I starts with: `scene_gaussians` and `sky_gaussians`. Args: pixels of a panorama."""
+    points, count = scene_gaussians(scene, chosen, more), config.number(pixels)
+    return concatenate(points, sky_gaussians(scene, config, count, views, view)) if count else points
 
 
 def _neighbour_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -145,18 +161,6 @@ def sky_gaussians(
     colors = _colors(scene, means, [views[i] for i in evenly], view)
     gaussians = isotropic(means, np.full(count, spacing), colors, config.opacity)
     return replace(gaussians, sky=count)
-
-
-def fibonacci_sphere(count: int) -> NDArray[np.float64]:
-    """(count, 3) unit directions, evenly distributed: equal steps in height, the golden angle in azimuth.
-
-    A uniform spherical sampling with neither holes nor clusters, unlike independent random directions.
-    """
-    index = np.arange(count)
-    z = 1 - (2 * index + 1) / count
-    azimuth = index * (math.pi * (3 - math.sqrt(5)))
-    ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
 
 
 def _colors(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ MOMENT = "exp_avg."  # in `ModelState.tensors`, before the name of a parameter
 AVERAGE = "average."  # before the names of what `Average.tensors` has
 _COUNT = f"{AVERAGE}count"
 EXACT = "exact"  # in them where `Gaussians.exact`
-UNITS = "units.means"  # in them where the rate of means has units
+UNITS = "units."  # before the names of parameters whose rate has units
 
 
 @dataclass(eq=False)
@@ -25,7 +25,7 @@ class ModelState:
     gaussians: Gaussians
     exp_avg: dict[str, Tensor]  # shaped as the parameters
     exp_avg_sq: dict[str, Tensor]
-    units: Tensor | None = None  # (N, 3) of the rate of means, world units; None: that has them itself
+    units: dict[str, Tensor] = field(default_factory=dict)  # (N,) of the rates of some parameters, by name
 
     @staticmethod
     def start(gaussians: Gaussians) -> "ModelState":
@@ -43,7 +43,7 @@ class ModelState:
             Gaussians(**{name: tensors[name] for name in names}, sky=int(tensors["sky"]), exact=exact),
             {name: tensors[f"{MOMENT}{name}"] for name in names},
             {name: tensors[f"exp_avg_sq.{name}"] for name in names},
-            tensors.get(UNITS),
+            {name.removeprefix(UNITS): it for name, it in tensors.items() if name.startswith(UNITS)},
         )
 
     def tensors(self) -> dict[str, Tensor]:
@@ -53,8 +53,7 @@ class ModelState:
         moments["sky"] = torch.tensor(self.gaussians.sky)
         if self.gaussians.exact:
             moments[EXACT] = torch.tensor(1)
-        if self.units is not None:
-            moments[UNITS] = self.units
+        moments |= {f"{UNITS}{name}": tensor for name, tensor in self.units.items()}
         return {**self.gaussians.tensors(), **moments}
 
     def leaves(self, sh_degree: int) -> Gaussians:
@@ -77,7 +76,7 @@ class ModelState:
         parameters = self.gaussians.tensors()
         for name, gradient in gradients.items():
             moments = (self.exp_avg[name], self.exp_avg_sq[name])
-            lr, moving, units = rates[name], rows[name], self._units_of(name)
+            lr, moving, units = rates[name], rows[name], self.units.get(name)
             try:
                 adam_(parameters[name], gradient, *moments, lr=lr, step=step, rows=moving, units=units)
             except FloatingPointError as error:
@@ -95,14 +94,11 @@ class ModelState:
                 self.exp_avg_sq[name],
                 parameter[: rows[name]].numel(),
                 rates[name],
-                self._units_of(name),
+                self.units.get(name),
             )
             for name, parameter in self.gaussians.tensors().items()
             if (gradient := gradients.get(name)) is not None
         ]
-
-    def _units_of(self, name: str) -> Tensor | None:
-        return self.units if name == "means" else None
 
     def rearrange(self, source: Tensor, new: Tensor, sky: int) -> None:
         """Row i becomes a copy of row source[i], with zero moments if it is `new`.
@@ -115,8 +111,7 @@ class ModelState:
             for name, moment in moments.items():
                 moments[name] = moment[source]
                 moments[name][new] = 0
-        if self.units is not None:
-            self.units = self.units[source]
+        self.units = {name: tensor[source] for name, tensor in self.units.items()}
 
     def drop_invalid(self) -> int:
         """Remove Gaussians with a parameter that is not finite or a zero quaternion; returns how many."""

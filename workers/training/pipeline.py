@@ -1,10 +1,10 @@
-"""Training iterations on a card: the host launches them and reads their results a few iterations later.
+"""Training iterations: on the CPU one by one, on a card some ahead of their results.
 
-It never waits for all that it launched, only, when it is `AHEAD` iterations ahead, for the oldest of these.
-The buffers for pairs of splats and tiles have the size that the same view needed before, with a margin. Where
-that was too small, or a loss or gradient is not finite, the device skips the step of that iteration and of
-all that follow (`renderer.cuda.iteration`). The host then repeats them from that one on: the model is as if
-each had been done once, in order.
+The host never waits for all that it launched on a card, only, when it is `AHEAD` iterations ahead, for the
+oldest of these. The buffers for pairs of splats and tiles have the size that the same view needed before,
+with a margin. Where that was too small, or a loss or gradient is not finite, the device skips the step of
+that iteration and of all that follow (`renderer.cuda.iteration`). The host then repeats them from that one
+on: the model is as if each had been done once, in order.
 """
 
 import math
@@ -20,10 +20,13 @@ from panolog.renderer.cuda import iteration, parts
 from panolog.renderer.cuda.iteration import Found, Problem
 from panolog.renderer.cuda.parts import Launch
 from panolog.renderer.motion import MOTION_SUMS
+from panolog.renderer.render import render
 from panolog.scene.errors import RunError
+from panolog.scene.gaussians import Gaussians
 from panolog.workers.capture.learning import Learning, Observed
 from panolog.workers.training.densify import Statistics
-from panolog.workers.training.optimizer import ModelState
+from panolog.workers.training.loss import loss_of
+from panolog.workers.training.optimizer import ModelState, finite_loss
 
 AHEAD = 3  # iterations: the card stays busy while the host is late once
 MARGIN = 1.25  # of the room for pairs over what the view needed last
@@ -43,6 +46,65 @@ class Plan:
     rows: dict[str, int]  # how many of each parameter move; parameters that are not in it do not
     statistics: Statistics | None  # where its screen gradients count
     learning: Learning | None  # of how the view was captured, in Stage I
+
+
+class Direct:
+    """The iterations of one task on the CPU, through autograd: each is over when `run` returns."""
+
+    def __init__(
+        self, finished: Callable[[float, float], None], broken: Callable[[str, Plan], RunError]
+    ) -> None:
+        """Args: as those of `Pipeline`."""
+        self._finished = finished
+        self._broken = broken
+
+    def run(self, plan: Plan) -> None:
+        """One iteration. Raises RunError if its loss or a gradient is not finite."""
+        problem = plan.problem
+        leaves: Gaussians = plan.state.leaves(problem.sh_degree)
+        counts = plan.statistics is not None
+        screen = torch.zeros(len(leaves), 2, requires_grad=True) if counts else None
+        motion = torch.zeros(MOTION_SUMS, dtype=torch.float64, requires_grad=True) if problem.moving else None
+        rendered = render(
+            leaves,
+            problem.camera,
+            sh_degree=problem.sh_degree,
+            near=problem.near,
+            screen=screen,
+            exterior=problem.exterior,
+            motion=motion,
+        )
+        found = loss_of(rendered, problem)
+        found.loss.backward()  # type: ignore[no-untyped-call]
+        gradients = {n: leaf.grad for n, leaf in leaves.tensors().items() if leaf.grad is not None}
+        try:
+            value = finite_loss(found.loss)
+            plan.state.step(gradients, plan.rates, plan.rows, plan.iteration)
+        except FloatingPointError as error:
+            raise self._broken(str(error), plan) from error
+        if plan.statistics is not None and screen is not None and screen.grad is not None:
+            plan.statistics.add(screen.grad, rendered.visible, leaves.means.detach(), problem.camera)
+        if plan.learning is not None:
+            observed = Observed(
+                view=plan.view,
+                iteration=plan.iteration,
+                image=plan.problem.image,
+                color=rendered.color.detach(),
+                inverse_depth=rendered.inverse_depth.detach(),
+                exposure=found.exposure,
+                affine=plan.problem.exposure,
+                status=None,
+            )
+            plan.learning.step(observed)
+            if motion is not None and motion.grad is not None:
+                plan.learning.learn_motion(plan.view, plan.iteration, motion.grad.numpy())
+        self._finished(value, float(found.mse))
+
+    def settle(self) -> None:
+        """As `Pipeline.settle`: nothing is in flight."""
+
+    def forget(self) -> None:
+        """As `Pipeline.forget`: nothing is kept of a view."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,8 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "depth.unit": "baseline",  # a weight that means the same whatever the unit of a reconstruction
         "depth.sky": True,  # nothing near may hide in the sky
         "depth.wT": 0.1,  # what only the nearest panoramas show well stays where the maps have it
+        "depth.points": 0.8,  # what is plain has no sparse points, and is where holes remain
+        "sh.near": 10.0,  # the ground of a path: its cameras are a few directions, and not what is between
         "loss.sphere": True,  # a pole has many pixels, and little of what is seen
         "densify.method": "relocate",  # as many Gaussians as the paper, where they are needed; no resets
         "densify.growth": 0.75,  # so that a street has no more than in the paper's recipe

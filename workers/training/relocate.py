@@ -169,13 +169,11 @@ def _share(gaussians: Gaussians, rows: Counts, parts: Counts, long_axis: bool, s
 
 
 def _decay(gaussians: Gaussians, inside: NDArray[np.bool_], config: DensifyConfig) -> None:
-    """Opacities and sizes of those inside become a little less: what no view holds up vanishes."""
+    """Opacities of those inside become a little less: what no view holds up vanishes."""
     rows = torch.from_numpy(inside.nonzero()[0]).to(gaussians.means.device)
     if config.opacity_decay > 0:
         opacities = opacities_of(gaussians, rows)
         write_opacities(gaussians, rows, np.maximum(opacities - config.opacity_decay, _LEAST_OPACITY))
-    if config.scale_decay > 0:
-        gaussians.scales[rows] -= config.scale_decay
 
 
 def _shake(

@@ -24,7 +24,7 @@ from panolog.scene.files import SUFFIX
 from panolog.scene.images import packed_bytes, unpack
 from panolog.workers.events import Checkpoint, CheckpointWritten, Event, Notice
 from panolog.workers.training import checkpoint
-from panolog.workers.training.config import CheckpointConfig
+from panolog.workers.training.task_config import CheckpointConfig
 
 _LOG = logging.getLogger(__name__)
 _MARKER = 1024  # bytes

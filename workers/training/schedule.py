@@ -128,6 +128,15 @@ class Schedule:
         count = start + int(start * factor * share)
         return max(start, min(count, densify.max_gaussians)) if densify.max_gaussians else count
 
+    def first(self, points: int, pixels: int) -> int:
+        """How many scene Gaussians Stage I begins with, if depth images have as many points.
+
+        Args: points of the sparse cloud; pixels of one panorama.
+        """
+        config = self.config.depth
+        part = config.points if config.w0 > 0 else 0.0
+        return max(points, int(part * self.budget(self.iterations, points, pixels)))
+
     def position(self, iteration: int) -> float:
         """The rate of means of a full run, in `optimizer.unit`: it decays exponentially (3DGS)."""
         rates, share = self.config.optimizer, iteration / self.iterations
@@ -164,13 +173,19 @@ class Schedule:
             return 0.0
         return float(depth.w0 * (depth.wT / depth.w0) ** (iteration / self.iterations))
 
+    @property
+    def length(self) -> float:
+        """By what the rates of shapes are multiplied in a run that is shorter than a full one."""
+        return float(max(1.0, FULL_RUN / self.iterations) ** self.config.optimizer.short_runs)
+
     def rates(self, iteration: int) -> dict[str, float]:
-        """Learning rates by parameter; that of means in world units, or in `ModelState.units`."""
+        """Learning rates by parameter; those of means and of SH of higher degrees in `ModelState.units`."""
         rates, rate = self.config.optimizer, self.config.stage2.rate if self.refine else 1.0
-        length = max(1.0, FULL_RUN / self.iterations) ** rates.short_runs
-        shapes, colors = rate * length, rate * math.sqrt(length)
+        shapes, colors = rate * self.length, rate * math.sqrt(self.length)
         return {
-            "means": length**2 * self.position(iteration) * (1 if rates.unit == "distance" else self.extent),
+            "means": self.length**2
+            * self.position(iteration)
+            * (1 if rates.unit == "distance" else self.extent),
             "quats": shapes * rates.rotation,
             "scales": shapes * rates.scale,
             "opacities": rates.opacity * rate,

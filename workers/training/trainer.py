@@ -6,7 +6,7 @@ iteration: a task that resumes from a checkpoint ends with the same bytes as one
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 
@@ -21,40 +21,40 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.render import encode_jpeg, render, to_bytes
 from panolog.scene.errors import RunError
-from panolog.scene.gaussians import Gaussians, concatenate
+from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
 from panolog.workers import stopping
 from panolog.workers.capture.learning import Learning
 from panolog.workers.comparison import better_block, with_block
-from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
+from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Trained
 from panolog.workers.merge import retained
 from panolog.workers.meter import Meter
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.densify import Statistics, drop_unrisen, position_units, reset_opacities
-from panolog.workers.training.direct import Direct
+from panolog.workers.training.densify import Statistics, drop_unrisen, rate_units, reset_opacities
 from panolog.workers.training.exterior import Exterior, Rooms, exterior_last, inside
 from panolog.workers.training.initialise import (
     camera_extent,
+    first_model,
     near_distance,
-    scene_gaussians,
-    sky_gaussians,
+    points_of,
+    scene_length,
 )
 from panolog.workers.training.loss import Loss, loss_rows
 from panolog.workers.training.optimizer import AVERAGE, Average, ModelState, trained_rows
-from panolog.workers.training.pipeline import Pipeline, Plan
+from panolog.workers.training.pipeline import Direct, Pipeline, Plan
 from panolog.workers.training.relocate import Place, grow
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
 from panolog.workers.training.schedule import Schedule, order
+from panolog.workers.training.surfaces import Surfaces
 
 _LOG = logging.getLogger(__name__)
 
 PREFETCH = 4  # views that decode in the background ahead of the one in training
 PREVIEW_WIDTH = 1024  # pixels, at most
-_LEFT_OUT = "views.left_out"  # in checkpoints: rows of the panoramas, absent where there are none
 _START = "growth.start"  # in checkpoints: `Trainer.start`, absent in older ones
 
 
@@ -102,7 +102,10 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
         open_cache(spec, scene, spec.views, rooms.host, rooms.device) as cache,
         closing(Trainer(spec, scene, cache, rooms.baked)) as trainer,
     ):
-        trainer.begin() if spec.checkpoint is None else trainer.restore(spec.checkpoint.load())
+        if spec.checkpoint is None:
+            yield from trainer.begin()
+        else:
+            trainer.restore(spec.checkpoint.load())
         count, start = len(trainer.state.gaussians), trainer.iteration
         _LOG.info("%s: trains %d Gaussians from iteration %d of %d", spec.task, count, start, spec.iterations)
         yield from trainer.surround(stop)
@@ -148,22 +151,31 @@ class Trainer:
         self.statistics: Statistics
         self.start = 0  # scene Gaussians of the cell before the first iteration
 
-    def begin(self) -> None:
-        """Start from the sparse cloud and the sky (Stage I) or from the Stage I model (Stage II)."""
+    def begin(self) -> Iterator[Progress]:
+        """Start from points and the sky (Stage I) or the Stage I model (Stage II), with signs of work."""
         self._resize(self.schedule.width(1, self.spec.width))
         if self.spec.initial is not None:
             gaussians = self._block(self.spec.initial)
+            self.start = int(inside(gaussians, self.spec.cell).sum())
         else:
-            spec, config = self.spec, self.spec.config.sky
-            gaussians = scene_gaussians(self.scene, spec.views, spec.district, spec.width)
-            if count := config.number(self.spec.width * (self.spec.width // 2)):
-                sky = sky_gaussians(self.scene, config, count, self.spec.views, self.views.get)
-                gaussians = concatenate(gaussians, sky)
+            gaussians = yield from self._first()
         self.state = ModelState.start(replace(gaussians, exact=self.exact).to(self.spec.device))
-        if self.spec.config.optimizer.unit == "distance":
-            self.state.units = position_units(self.state.gaussians.means, self.centers)
-        self.start = int(inside(self.state.gaussians, self.spec.cell).sum())
+        given = self.centers, self.schedule, scene_length(self.scene)
+        self.state.units = rate_units(self.state.gaussians.means, *given)
         self.reset_statistics()
+
+    def _first(self) -> Generator[Progress, None, Gaussians]:
+        """What Stage I starts with."""
+        scene, spec, pixels = self.scene, self.spec, self.spec.width * (self.spec.width // 2)
+        chosen = points_of(scene, spec.views, spec.district, spec.width)
+        self.start = len(chosen)
+        surfaces, missing = Surfaces(scene), self.schedule.first(self.start, pixels) - self.start
+        for view in self.views.each(spec.views if missing else (), self.cache.ahead(PREFETCH)):
+            surfaces.add(view, self.loss.depth.target(view))
+            if self.meter.due():
+                yield self.meter.progress(0, self.start)
+        more = surfaces.points(scene.points[chosen], self.centers, missing)
+        return first_model(scene, spec.config.sky, chosen, more, spec.views, pixels, self.views.get)
 
     def _block(self, initial: Source[Gaussians]) -> Gaussians:
         """What a block trains with, of the Stage I model."""
@@ -204,11 +216,10 @@ class Trainer:
         self.statistics = Statistics(*found, self.spec.config.densify)
         self.average = Average.from_tensors(checkpoint.tensors)
         self.learning.restore(tensors)
+        self.views.restore(tensors)
         known = tensors.get(_START)
         self.start = int(inside(self.state.gaussians, self.spec.cell).sum()) if known is None else int(known)
         self.iteration = checkpoint.iteration
-        if _LEFT_OUT in tensors:
-            self.views.left_out.update(tensors[_LEFT_OUT].tolist())
 
     def checkpoint(self, copy: Callable[[Tensors], dict[str, Tensor]] = copied) -> Checkpoint:
         """All of the state, copied to the CPU: steps change it in place."""
@@ -219,9 +230,8 @@ class Trainer:
             _START: torch.tensor(self.start),
             **self.average.tensors(),
             **self.learning.tensors(),
+            **self.views.tensors(),
         }
-        if self.views.left_out:
-            tensors[_LEFT_OUT] = torch.tensor(sorted(self.views.left_out))
         return Checkpoint(self.spec.task, self.iteration, copy(tensors))
 
     def run(self, stop: Callable[[], bool]) -> Iterator[Event]:

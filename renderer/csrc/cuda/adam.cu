@@ -9,9 +9,10 @@ constexpr int kMostSegments = 6;
 struct Segment {
   const float* gradient;
   float *parameter, *exp_avg, *exp_avg_sq;
-  const float* units;  // of the rate, for each value; null: all 1
+  const float* units;  // of the rate, for each row; null: all 1
   int64_t count, first;
-  float rate, unused;  // rate: lr / (1 - beta1ᵗ)
+  float rate;      // lr / (1 - beta1ᵗ)
+  int32_t values;  // of a row
 };
 
 struct Segments {
@@ -34,5 +35,5 @@ extern "C" __global__ void __launch_bounds__(256)
   const float g = own.gradient[i];
   const float m = beta1 * own.exp_avg[i] + (1 - beta1) * g, s = beta2 * own.exp_avg_sq[i] + (1 - beta2) * g * g;
   own.exp_avg[i] = m, own.exp_avg_sq[i] = s;
-  own.parameter[i] -= (own.units ? own.units[i] : 1.0f) * own.rate * m / (sqrtf(s) * root + eps);
+  own.parameter[i] -= (own.units ? own.units[i / own.values] : 1.0f) * own.rate * m / (sqrtf(s) * root + eps);
 }

@@ -14,8 +14,8 @@ from panolog.orchestrator.run.records import Merged
 from panolog.orchestrator.run.state import RunState
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE, EVAL, TaskId
-from panolog.workers.training.config import CacheConfig
 from panolog.workers.training.initialise import scene_gaussians
+from panolog.workers.training.task_config import CacheConfig
 from tests.workers.small import WIDTH, small_scene
 
 GIB = 2**30

@@ -32,7 +32,7 @@ from panolog.workers.events import Calibration, Checkpoint, Event, Progress, Tra
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
-from panolog.workers.training.config import CacheConfig
+from panolog.workers.training.task_config import CacheConfig
 from tests.orchestrator.fakes import LOST_NODE, CrashError, Harness, Script, SetClock, begins, fails, well
 
 GIB = 2**30

@@ -25,8 +25,8 @@ from panolog.workers.events import Checkpoint, CheckpointWritten, Event, Notice,
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from panolog.workers.training import checkpoint
-from panolog.workers.training.config import CheckpointConfig
 from panolog.workers.training.saving import Outbox, Saver
+from panolog.workers.training.task_config import CheckpointConfig
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.fakes import FakePool, Harness, trained, well
 

@@ -20,12 +20,14 @@ from panolog.workers.training.densify import (
     camera_distances,
     densify,
     drop_large,
-    position_units,
+    rate_units,
     reset_opacities,
 )
 from panolog.workers.training.initialise import isotropic
 from panolog.workers.training.optimizer import ModelState, finite_loss
+from panolog.workers.training.schedule import FULL_RUN, Schedule
 from tests.renderer.cuda.emulation import EmulatedLaunch
+from tests.workers.trainings import settings
 
 EXTENT = 10.0  # so that scales above 0.1 split
 QUIET, LOUD = 0.0, 1.0  # screen gradients
@@ -76,11 +78,16 @@ def test_what_is_large_may_be_a_matter_of_distance() -> None:
     assert sizes == pytest.approx([0.05, 0.05, *[0.05 / 1.6, 0.5 / 1.6] * 2])
 
 
+def schedule_of(iterations: int = FULL_RUN, **groups: Any) -> Schedule:
+    return Schedule(settings(**groups), iterations, EXTENT, refine=False)
+
+
 def test_a_step_may_be_a_part_of_the_distance() -> None:
     """From the nearest camera; what is divided keeps it."""
     state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0)  # at x = 0, 100 and 200
-    state.units = position_units(state.gaussians.means, np.array([[1.0, 0, 0], [210, 0, 0]]))
-    assert state.units.tolist() == [[1] * 3, [99] * 3, [10] * 3]
+    centers, given = np.array([[1.0, 0, 0], [210, 0, 0]]), schedule_of(optimizer={"unit": "distance"})
+    state.units = rate_units(state.gaussians.means, centers, given, 5.0)
+    assert {name: units.tolist() for name, units in state.units.items()} == {"means": [1, 99, 10]}
     before = state.gaussians.means.clone()
     gradient = {"means": torch.ones(3, 3)}
     state = ModelState.from_tensors({name: tensor.clone() for name, tensor in state.tensors().items()})
@@ -90,7 +97,28 @@ def test_a_step_may_be_a_part_of_the_distance() -> None:
     moved = (before - state.gaussians.means)[:, 0].tolist()
     assert moved == pytest.approx([0.01 * 1, 0.01 * 99, 0], rel=1e-4)
     densify(state, statistics_of([LOUD] * 3), DensifyConfig(), EXTENT, np.random.default_rng(0))
-    assert state.units is not None and sorted(state.units[:, 0].tolist()) == [1, 1, 10, 10, 99, 99]
+    assert sorted(state.units["means"].tolist()) == [1, 1, 10, 10, 99, 99]
+
+
+def test_what_is_near_may_be_slow_to_depend_on_the_direction() -> None:
+    state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0)  # at x = 0, 100 and 200
+    centers, full = np.array([[1.0, 0, 0], [210, 0, 0]]), schedule_of(sh={"near": 4})
+    state.units = rate_units(state.gaussians.means, centers, full, 5.0)
+    assert state.units["shN"].tolist() == pytest.approx([0.05, 1, 0.5])
+    assert rate_units(state.gaussians.means, centers, full, 0.0) == {}
+    short = schedule_of(15_000, sh={"near": 4}, optimizer={"short_runs": 0.5})  # half as far in an iteration
+    assert rate_units(state.gaussians.means, centers, short, 5.0)["shN"].tolist() == pytest.approx(
+        [0.1, 1, 1]
+    )
+    gradient = {name: torch.ones_like(tensor) for name, tensor in state.gaussians.tensors().items()}
+    before = {name: tensor.clone() for name, tensor in state.gaussians.tensors().items()}
+    for moments in (state.exp_avg, state.exp_avg_sq):
+        for moment in moments.values():
+            moment.zero_()
+    state.step(gradient, dict.fromkeys(gradient, 0.01), dict.fromkeys(gradient, 3), step=1)
+    moved = {name: before[name] - tensor for name, tensor in state.gaussians.tensors().items()}
+    assert moved["shN"][:, 7, 2].tolist() == pytest.approx([0.0005, 0.01, 0.005], rel=1e-3)
+    assert moved["sh0"][:, 0, 1].tolist() == pytest.approx([0.01] * 3, rel=1e-3)
 
 
 def test_moments_follow_and_new_ones_start_at_zero() -> None:

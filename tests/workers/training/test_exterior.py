@@ -23,11 +23,12 @@ from panolog.scene.model import Scene
 from panolog.workers.comparison import with_block
 from panolog.workers.events import Checkpoint, Preview
 from panolog.workers.specs import Value
-from panolog.workers.training import direct
-from panolog.workers.training.config import CacheConfig, TrainConfig
+from panolog.workers.training import pipeline
+from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.exterior import BAKED, Exterior, Rooms, exterior_last, inside
 from panolog.workers.training.loss import Loss, loss_of
 from panolog.workers.training.schedule import Schedule
+from panolog.workers.training.task_config import CacheConfig
 from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
 from tests.workers.trainings import block_of, coarse_of, notices, same, trained
@@ -114,7 +115,7 @@ def test_a_block_that_ends_early_leaves_neither_its_thread_nor_its_file(
         events = train(task)
         while not readers():
             next(events)
-        monkeypatch.setattr(direct, "render", lambda *_, **__: 1 / 0)
+        monkeypatch.setattr(pipeline, "render", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             list(events)
         assert not readers() and [file.closed for file in files] == [True, True]

@@ -12,13 +12,13 @@ from panolog.partition.bounds import Aabb
 from panolog.partition.cells import Cell, Grid
 from panolog.scene.images import View, exposed, exposure_affine, load_view
 from panolog.scene.model import Scene
+from panolog.scene.projection import fibonacci_sphere
 from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.initialise import (
     OUTSIDE,
     SCALE_MAX,
     SH_C0,
     camera_extent,
-    fibonacci_sphere,
     near_distance,
     points_of,
     scene_gaussians,
@@ -82,7 +82,7 @@ def test_a_district_begins_coarser_where_it_keeps_nothing(scene: Scene) -> None:
     span = OUTSIDE * 2 * math.pi / WIDTH * distance
     assert 0.3 * np.median(span) < np.median(apart[:, 1]) < 2 * np.median(span)
     assert len(points_of(cloud, cloud.train, HALF, 8 * WIDTH)) > len(found)
-    assert len(scene_gaussians(cloud, cloud.train, HALF, WIDTH)) == len(found)
+    assert len(scene_gaussians(cloud, found)) == len(found)
 
 
 def test_extent_is_that_of_the_views_trained_on(scene: Scene) -> None:

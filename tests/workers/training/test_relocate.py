@@ -142,7 +142,7 @@ def test_what_is_outside_of_the_cell_stays_as_it_is() -> None:
     inside = (state.gaussians.means[:200, 0] > 0).numpy()
     opaque = (state.gaussians.opacities[:200] >= logit(0.005)).numpy()
     outside = {n: t[:200][~inside & opaque] for n, t in state.gaussians.tensors().items()}
-    config = DensifyConfig(method="relocate", opacity_decay=0.01, scale_decay=0.01, noise=1)
+    config = DensifyConfig(method="relocate", opacity_decay=0.01, noise=1)
     room = Room(2 * int(inside.sum()), inside, 1.0)
     relocate(state, quiet(state), config, room, np.random.default_rng(1))
     after = state.gaussians.means[state.gaussians.scene, 0] <= 0
@@ -168,7 +168,7 @@ def test_noise_moves_the_faint_within_their_own_shape() -> None:
 
 def test_threads_do_not_matter() -> None:
     found = []
-    config = DensifyConfig(method="relocate", weight="gradient", long_axis=True, scale_decay=0.01)
+    config = DensifyConfig(method="relocate", weight="gradient", long_axis=True)
     for count in (1, 3):
         state, generator = random_state(40_003), torch.Generator().manual_seed(1)
         statistics = Statistics(torch.rand(40_000, generator=generator), torch.ones(40_000), config)

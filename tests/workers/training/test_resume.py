@@ -39,7 +39,7 @@ COARSE: dict[str, Groups] = {
     "pyramid": {"pyramid": {"steps": (0.3, 0.7)}},  # with checkpoints at both sides of each step
     "distance": {"densify": {"large": "distance", "percent_dense": 0.2}},
     "averaged": {"optimizer": {"average": 0.25}},
-    "relocated": {"densify": RELOCATED},
+    "relocated": {"densify": RELOCATED, "depth": {"points": 0.8}},
     "relocated, exact": {"densify": RELOCATED, "projection": "exact", "optimizer": {"unit": "distance"}},
     "captured": CAPTURED,
 }

@@ -15,8 +15,8 @@ from panolog.scene.images import packed_bytes
 from panolog.workers.events import Checkpoint, CheckpointWritten, Event
 from panolog.workers.tasks import COARSE
 from panolog.workers.training import checkpoint, saving
-from panolog.workers.training.config import CheckpointConfig
 from panolog.workers.training.saving import Outbox, Saver, Staging
+from panolog.workers.training.task_config import CheckpointConfig
 from tests.on_device import needs_a_card
 
 ONE = {"means": torch.rand(7, 3), "views": torch.arange(7), "sky": torch.tensor(2), "none": torch.rand(0, 3)}

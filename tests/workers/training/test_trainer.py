@@ -17,7 +17,7 @@ from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event, Preview
 from panolog.workers.specs import Value
 from panolog.workers.tasks import TaskId
-from panolog.workers.training import direct
+from panolog.workers.training import pipeline
 from panolog.workers.training.exterior import inside
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.on_device import ToDevice
@@ -157,7 +157,7 @@ def test_what_is_not_finite_ends_the_run_with_a_name(
         rendered = render(gaussians, *args, **options)  # type: ignore[arg-type]
         return rendered._replace(color=rendered.color * float("nan"))
 
-    monkeypatch.setattr(direct, "render", poisoned)
+    monkeypatch.setattr(pipeline, "render", poisoned)
     with pytest.raises(RunError, match=r"coarse: the loss is not finite at iteration 1, view pano_\d\.png"):
         list(train(coarse))
 
@@ -211,6 +211,6 @@ def test_a_preview_shows_a_view_that_is_on_a_device(coarse: TrainSpec) -> None:
     for options in on_device:
         with PanoramaCache(scene, coarse.views, WIDTH, 1, **options) as cache:
             trainer = Trainer(replace(coarse, iterations=1), scene, cache)
-            trainer.begin()
+            list(trainer.begin())
             shown += [event for event in trainer.run(lambda: False) if isinstance(event, Preview)]
     assert len(shown) == 2 and shown[0] == shown[1]
