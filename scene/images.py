@@ -189,31 +189,20 @@ class PanoramaCache:
             ConfigError: `width` is odd or more than the panoramas have.
         """
         self._panoramas = {row: scene.panoramas[row] for row in rows}
-        self._most = scene.width
+        if width < 2 or width % 2 or width > scene.width:
+            raise ConfigError(f"width {width}: give an even number up to {scene.width}, the panoramas'")
+        self._width = width
         self._locate = locate
         self._cpu = device == "cpu"
         self._upload = upload or (Upload() if self._cpu else CudaUpload(device))
-        self._bytes = budget, 0 if self._cpu else room
         self.threads = _THREADS if self._cpu else max(1, min(threads, MOST_THREADS))
         self._staying: dict[int, _Loaded] = {}
         self._views: OrderedDict[int, _Loaded] = OrderedDict()  # the last is the most recently used
         self._decoded: OrderedDict[int, View] = OrderedDict()  # those that have left a GPU, likewise
         # One thread for each decode: OpenCV's own would fight with the trainer's for the cores.
         self._pool = ThreadPoolExecutor(self.threads, "decode", initializer=cv2.setNumThreads, initargs=(1,))
-        self.resize(width)
-
-    def resize(self, width: int) -> None:
-        """From now on views have this width; those of another are dropped.
-
-        Raises ConfigError if it is odd or more than the panoramas have.
-        """
-        if width < 2 or width % 2 or width > self._most:
-            raise ConfigError(f"width {width}: give an even number up to {self._most}, the panoramas'")
-        self._width = width
-        self._drop()
         largest = max((view_bytes(panorama, width) for panorama in self._panoramas.values()), default=1)
-        budget, room = self._bytes
-        self._budget, self._room = max(1, budget // largest), room // largest  # views
+        self._budget, self._room = max(1, budget // largest), 0 if self._cpu else room // largest  # views
         self._capacity = self._budget if self._cpu else passing_views(self.threads)
         _LOG.info(
             "image cache: holds %d panoramas of %d at width %d", self._budget, len(self._panoramas), width
@@ -242,9 +231,6 @@ class PanoramaCache:
     def close(self) -> None:
         """Drops all views and ends the threads."""
         self._pool.shutdown(cancel_futures=True)
-        self._drop()
-
-    def _drop(self) -> None:
         for loaded in (*self._staying.values(), *self._views.values()):
             loaded.cancel()
         for views in (self._staying, self._views, self._decoded):

@@ -25,7 +25,7 @@ from panolog.workers.metrics import load_lpips
 from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import CALIBRATE, TaskId
-from panolog.workers.training.config import PyramidConfig, SHConfig, TrainConfig
+from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import densify
 from panolog.workers.training.trainer import Trainer, TrainSpec
 
@@ -61,9 +61,8 @@ def calibrate(spec: CalibrateSpec) -> Iterator[Progress | Calibration]:
     scene = spec.scene.load()
     decode = _decode_seconds(spec, scene)
     views = _views(spec, scene, decode)
-    # all degrees at once and the full width: after a part of a run they are in use
-    whole = {"sh": SHConfig(degree=spec.config.sh.degree, every=1), "pyramid": PyramidConfig()}
-    config = spec.config.model_copy(update=whole)
+    sh = spec.config.sh.model_copy(update={"every": 1})  # all degrees at once, as after a part of a run
+    config = spec.config.model_copy(update={"sh": sh})
     trial = TrainSpec(
         task=spec.task,
         scene=spec.scene,

@@ -90,7 +90,7 @@ def measure(iterations: int) -> tuple[float, float, Counter[str]]:
         succeeds = (driver.CUresult.CUDA_SUCCESS,)
         stack.enter_context(mock.patch.object(driver, "cuLaunchKernel", lambda *_: succeeds))
         trainer = Trainer(spec, scene, stack.enter_context(PanoramaCache(scene, (0, 1), WIDTH, 2**20)))
-        trainer.loss.depth._aligned[view.row, WIDTH] = Alignment(1.0, 0.1, None)
+        trainer.loss.depth._aligned[view.row] = Alignment(1.0, 0.1, None)
         list(trainer.begin())
         first = 10_000  # all degrees are in use, and screen gradients count
         took = []

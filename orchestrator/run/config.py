@@ -104,7 +104,8 @@ _FORMER: Mapping[str, Any] = {
     "depth.sky": True,
     "densify.prune_scale": 0.0,
 }
-_WITHOUT_EFFECT = ("densify.scale_decay",)  # settings of older versions that no recipe used
+# Settings of older versions that no recipe used, as runs have them that did not either.
+_WITHOUT_EFFECT: Mapping[str, Any] = {"densify.scale_decay": 0.0, "pyramid.steps": []}
 _FORMER_EXTERIOR = {"train": "full", "fixed": "frozen"}  # of stage2.exterior
 
 
@@ -267,10 +268,13 @@ def _canonical(given: dict[str, Any]) -> dict[str, Any]:
         _put(tree, "stage2.exterior", partition.pop("exterior"))
     elif isinstance(stage2, dict) and stage2.get("exterior") in _FORMER_EXTERIOR:
         stage2["exterior"] = _FORMER_EXTERIOR[stage2["exterior"]]
-    for key in _WITHOUT_EFFECT:
-        if _given(tree, key):
-            group, name = key.split(".")
-            del tree[group][name]
+    for key, without in _WITHOUT_EFFECT.items():
+        group, name = key.split(".")
+        settings = tree.get(group)
+        if isinstance(settings, dict) and settings.get(name) == without:
+            del settings[name]
+            if not settings:
+                del tree[group]
     return tree
 
 

@@ -70,22 +70,17 @@ def test_what_fits_is_decoded_once_and_what_does_not_is_dropped(root: Path) -> N
         assert cache.get(5) is not second
 
 
-def test_after_a_resize_all_views_have_the_other_width(root: Path) -> None:
+def test_the_budget_counts_bytes_of_views_of_the_width(root: Path) -> None:
     scene = read_scene(root)
     with PanoramaCache(scene, range(6), WIDTH // 2, 2 * VIEW) as cache:
-        cache.prefetch(range(6))
-        cache.get(0)
-        cache.resize(WIDTH)
-        expected = [pixels_of(p.image) for p in scene.panoramas]
-        assert all(np.array_equal(cache.get(row).image.numpy(), expected[row]) for row in range(6))
-        kept = cache.get(5)
-        cache.get(0)
-        assert cache.get(5) is kept  # two fit: the budget counts bytes
-        cache.get(1)
-        assert cache.get(0) is not kept
-        for width in (0, 31, WIDTH + 2):
-            with pytest.raises(InputError, match=f"width {width}"):
-                cache.resize(width)
+        kept = [cache.get(row) for row in range(6)]
+        assert all(cache.get(row) is kept[row] for row in range(6))  # views of a fourth of the bytes
+
+
+@pytest.mark.parametrize("width", [0, 31, WIDTH + 2])
+def test_a_width_that_is_odd_or_too_large_is_refused(root: Path, width: int) -> None:
+    with pytest.raises(InputError, match=f"width {width}"):
+        PanoramaCache(read_scene(root), range(6), width, 2 * VIEW)
 
 
 def test_layers_are_resized_without_mixing_in_what_has_no_value(root: Path) -> None:

@@ -8,9 +8,9 @@ Iterations are stated for a run of 30,000 and scale with its real length (`sched
 field has "as they are". "3DGS" is Kerbl et al. 2023; "eq." and "app." are those of the PanoLOG paper.
 """
 
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from panolog.workers.capture.config import CaptureConfig
 from panolog.workers.settings import Group
@@ -26,24 +26,6 @@ class LossConfig(Group):
         description="true = pixels count by their area on the sphere, as WS-PSNR measures them, in L1, D-SSIM"
         " and so in the gradients that densify; false = all alike, 3DGS",
     )
-
-
-class PyramidConfig(Group):
-    """Stage I on reduced panoramas first: coarse shapes need few pixels, and few pixels little time."""
-
-    steps: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
-        default=(),
-        max_length=3,
-        description="fractions of Stage I at which the width doubles, ascending, the last one to the full"
-        " width: [0.2, 0.5] begins with a quarter; none = full from the start, 3DGS",
-    )
-
-    @field_validator("steps")
-    @classmethod
-    def _ascending(cls, steps: tuple[float, ...]) -> tuple[float, ...]:
-        if list(steps) != sorted(set(steps)):
-            raise ValueError("the fractions must ascend")
-        return steps
 
 
 class DepthConfig(Group):
@@ -342,7 +324,6 @@ class TrainConfig(CaptureConfig):
         default="affine", description="an affine splat (eq. 2), or along each pixel's ray (csrc/rays.h)"
     )
     loss: LossConfig = LossConfig()
-    pyramid: PyramidConfig = PyramidConfig()
     depth: DepthConfig = DepthConfig()
     sky: SkyConfig = SkyConfig()
     densify: DensifyConfig = DensifyConfig()

@@ -20,14 +20,13 @@ from panolog.workers.training.schedule import Schedule
 
 @dataclass(eq=False)
 class DepthTargets:
-    """Targets of the depth loss for one task. Each panorama is aligned when it is first seen at a width."""
+    """Targets of the depth loss for one task. Each panorama is aligned when it is first seen."""
 
     scene: Scene
     config: DepthConfig
     seed: int
     notices: list[str] = field(default_factory=list)  # of images left out or fitted again, not yet reported
-    _aligned: dict[tuple[int, int], Alignment | None] = field(default_factory=dict)  # by row and width
-    _noted: set[str] = field(default_factory=set)
+    _aligned: dict[int, Alignment | None] = field(default_factory=dict)  # by row
 
     def target(self, view: View) -> tuple[Tensor, Tensor] | None:
         """Target (H, W) inverse radial depth and validity (H, W) bool of a view; None without usable depth.
@@ -58,23 +57,17 @@ class DepthTargets:
         """The alignment of a view, by its mask when it is first seen; None without usable depth."""
         if view.inverse_depth is None:
             return None
-        at = view.row, view.image.shape[1]
-        if at not in self._aligned:
-            name = self.scene.panoramas[view.row].name
+        row = view.row
+        if row not in self._aligned:
+            name = self.scene.panoramas[row].name
             try:
-                found = self._aligned[at] = self._align(view)
+                found = self._aligned[row] = self._align(view)
                 if found.note:
-                    self._note(f"{name}: {found.note}")
+                    self.notices.append(f"{name}: {found.note}")
             except AlignmentError as error:
-                self._aligned[at] = None
-                self._note(f"{name} is left out of the depth loss: {error}")
-        return self._aligned[at]
-
-    def _note(self, notice: str) -> None:
-        """Once for all widths."""
-        if notice not in self._noted:
-            self._noted.add(notice)
-            self.notices.append(notice)
+                self._aligned[row] = None
+                self.notices.append(f"{name} is left out of the depth loss: {error}")
+        return self._aligned[row]
 
 
 class Targets(NamedTuple):

@@ -103,9 +103,6 @@ class Direct:
     def settle(self) -> None:
         """As `Pipeline.settle`: nothing is in flight."""
 
-    def forget(self) -> None:
-        """As `Pipeline.forget`: nothing is kept of a view."""
-
 
 @dataclass(frozen=True, eq=False)
 class _Launched:
@@ -160,10 +157,6 @@ class Pipeline:
         """
         while self._launched:
             self._read()
-
-    def forget(self) -> None:
-        """The views have another size: what was counted in them no longer holds. Nothing may be in flight."""
-        self._density.clear()
 
     def _room(self, plan: Plan) -> int | None:
         """Pairs to have room for; None before any count is known."""

@@ -13,7 +13,6 @@ from functools import cached_property, lru_cache
 from panolog.scene.random_streams import generator
 from panolog.workers.training.config import DensifyConfig, TrainConfig
 
-NARROWEST = 16  # pixels, of a reduced panorama
 FULL_RUN = 30_000  # iterations that the config's schedules are stated for
 AVERAGED = 32  # models in an average, about: 13 were as good as 62
 GROWTH_OFFSET, GROWTH_SLOPE = 0.85, 0.5  # by the pixels of each Gaussian, measured: workers/growth.py
@@ -149,15 +148,6 @@ class Schedule:
         """The rate of positions over the first one of Stage I, at most 1."""
         first = self.config.optimizer.position
         return self.position(iteration) / first if first > 0 else 0.0
-
-    def width(self, iteration: int, full: int) -> int:
-        """Pixels of the panoramas of this iteration: reduced at first in Stage I, if the pyramid has steps.
-
-        Args: full, the even width of the run.
-        """
-        steps = () if self.refine else self.config.pyramid.steps
-        left = sum(iteration <= step * self.iterations for step in steps)
-        return min(full, max(NARROWEST, full >> left & ~1))
 
     def sh_degree(self, iteration: int) -> int:
         """Degrees of spherical harmonics in use: growing in Stage I (3DGS), all of them in Stage II."""

@@ -146,14 +146,12 @@ class Trainer:
         self.exterior: Exterior | None = None  # if it is baked
         self.average = Average()
         self.iteration = 0
-        self.width = spec.width  # of the views at present, `schedule.width`
         self.state: ModelState
         self.statistics: Statistics
         self.start = 0  # scene Gaussians of the cell before the first iteration
 
     def begin(self) -> Iterator[Progress]:
         """Start from points and the sky (Stage I) or the Stage I model (Stage II), with signs of work."""
-        self._resize(self.schedule.width(1, self.spec.width))
         if self.spec.initial is not None:
             gaussians = self._block(self.spec.initial)
             self.start = int(inside(gaussians, self.spec.cell).sum())
@@ -282,7 +280,6 @@ class Trainer:
         """The view of this iteration; the next ones start to decode."""
         ahead = range(iteration, min(iteration + self.cache.ahead(PREFETCH), self.spec.iterations) + 1)
         known = self.views.left_out
-        self._resize(self.schedule.width(iteration, self.spec.width))
         coming = [next(row for row in self._order(i) if row not in known) for i in ahead]
         self.cache.prefetch(coming)
         if self.exterior is not None:
@@ -290,20 +287,11 @@ class Trainer:
         view = self.loss.aligned(self.views.first(self._order(iteration)), iteration)
         return self.learning.view(view)
 
-    def _resize(self, width: int) -> None:
-        """The width of the views from now on."""
-        if width == self.width:
-            return
-        self.settle()
-        self.width = width
-        self.cache.resize(width)
-        self.pipeline.forget()
-
     def _order(self, iteration: int) -> Iterator[int]:
         return order(self.spec.seed, str(self.spec.task), self.spec.views, iteration)
 
     def _camera(self, row: int) -> Camera:
-        return self.learning.camera(row, self.width)
+        return self.learning.camera(row, self.spec.width)
 
     def _cameras(self) -> dict[int, Camera]:
         return {row: self._camera(row) for row in self.spec.views}
@@ -401,7 +389,7 @@ class Trainer:
             rendered = render(model, camera, sh_degree=degree, near=self.near, exterior=around)
         photograph, picture = view.image.cpu().numpy(), to_bytes(rendered.color)
         if around is not None:
-            left_out = ~around.active(self.width, self.width // 2).cpu().numpy()
+            left_out = ~around.active(self.spec.width, self.spec.width // 2).cpu().numpy()
             picture[left_out] = photograph[left_out] // 4
         jpeg = encode_jpeg(np.concatenate([picture, photograph]), PREVIEW_WIDTH)
         return Preview(self.spec.task, self.iteration, self.scene.panoramas[view.row].name, jpeg)

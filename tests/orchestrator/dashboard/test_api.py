@@ -47,7 +47,7 @@ def test_the_page_of_a_run_has_its_results_and_settings(served: Served) -> None:
     settings = {setting["key"]: setting for setting in run["config"]}
     assert settings["iterations"]["changed"]
     assert not settings["sky.kappa"]["changed"]
-    assert not settings["pyramid.steps"]["changed"]  # a list in run.json
+    assert not settings["partition.cuts"]["changed"]  # a list in run.json
     relocates = settings["densify.method"]
     assert (relocates["value"], relocates["changed"]) == ("relocate", False)  # that is its recipe's
     assert "eq. 3" in settings["sky.kappa"]["unit_or_doc"]

@@ -51,15 +51,6 @@ def test_implausible_images_are_left_out_and_named_once(scene: Scene) -> None:
         assert "pano_1.png is left out" in targets.notices[0] and reason in targets.notices[0]
 
 
-def test_each_width_has_an_alignment_of_its_own(scene: Scene) -> None:
-    """A task that resumes at the full width has seen no other."""
-    small, full = (load_view(scene.panoramas[1], 1, width) for width in (WIDTH // 2, WIDTH))
-    ours, theirs = (DepthTargets(scene, DepthConfig(), 0) for _ in range(2))
-    assert ours.target(small) is not None
-    found, expected = ours.target(full), theirs.target(full)
-    assert found is not None and expected is not None and torch.equal(found[0], expected[0])
-
-
 def test_target_is_inverse_depth_and_zero_in_the_sky_if_that_counts(scene: Scene) -> None:
     view = view_of(scene, 0)  # 0.3 from the middle of the sphere
     panoramas = tuple(replace(panorama, depth_affine=AFFINE) for panorama in scene.panoramas)

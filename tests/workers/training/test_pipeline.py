@@ -90,13 +90,13 @@ def small_room(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture
-def waited(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
-    """Iterations for which the host has waited, and the widths of their views."""
-    found: list[tuple[int, int]] = []
+def waited(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Iterations for which the host has waited."""
+    found: list[int] = []
     carefully = pipeline.Pipeline._carefully
 
     def counting(self: pipeline.Pipeline, plan: pipeline.Plan) -> None:
-        found.append((plan.iteration, plan.problem.camera.width))
+        found.append(plan.iteration)
         carefully(self, plan)
 
     monkeypatch.setattr(pipeline.Pipeline, "_carefully", counting)
@@ -150,20 +150,13 @@ def test_it_learns_as_on_the_cpu(projection: str, exterior: str, spec: TrainSpec
 
 
 @pytest.mark.system
-def test_a_pyramid_learns_as_on_the_cpu(spec: TrainSpec, waited: list[tuple[int, int]]) -> None:
-    """The pairs of a smaller view are not those of a larger one: the first of each size waits for them."""
-    learns_as_on_the_cpu(replace(changed(spec, pyramid={"steps": (0.5,)}, **STILL), width=WIDTH))
-    assert waited == [(1, WIDTH // 2), (7, WIDTH)]
-
-
-@pytest.mark.system
 def test_too_little_room_is_put_right(
-    spec: TrainSpec, events: list[Event], monkeypatch: pytest.MonkeyPatch, waited: list[tuple[int, int]]
+    spec: TrainSpec, events: list[Event], monkeypatch: pytest.MonkeyPatch, waited: list[int]
 ) -> None:
     """Checkpoints, previews, densifications and the end follow iterations that had to be repeated."""
     with small_room(monkeypatch):
         assert contents(on_card(spec)) == contents(events)
-    assert [iteration for iteration, _ in waited] == list(range(1, ITERATIONS + 1))
+    assert waited == list(range(1, ITERATIONS + 1))
 
 
 @pytest.mark.system

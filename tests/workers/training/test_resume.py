@@ -36,7 +36,6 @@ CAPTURED: Groups = {
 }
 COARSE: dict[str, Groups] = {
     "usual": {},
-    "pyramid": {"pyramid": {"steps": (0.3, 0.7)}},  # with checkpoints at both sides of each step
     "distance": {"densify": {"large": "distance", "percent_dense": 0.2}},
     "averaged": {"optimizer": {"average": 0.25}},
     "relocated": {"densify": RELOCATED, "depth": {"points": 0.8}},

@@ -3,10 +3,9 @@
 from typing import Any
 
 import pytest
-from pydantic import ValidationError
 
 from panolog.scene.random_streams import generator
-from panolog.workers.training.config import PyramidConfig, TrainConfig
+from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.schedule import Schedule, epoch
 
 
@@ -64,22 +63,6 @@ def test_opacities_recover_from_a_reset_before_the_next_pruning() -> None:
 def test_no_reset_near_the_end(iterations: int) -> None:
     always = schedule(iterations, densify={"until": 30_000}, reset={"every_floor": 1})
     assert not any(always.resets(i) for i in range(1, iterations + 1) if i > 0.7 * iterations)
-
-
-def test_a_pyramid_doubles_the_width_in_stage_one() -> None:
-    steps = {"steps": [0.2, 0.5]}
-    run = schedule(100, pyramid=steps)
-    assert [run.width(i, 1024) for i in (1, 20, 21, 50, 51, 100)] == [256, 256, 512, 512, 1024, 1024]
-    assert [run.width(i, 100) for i in (1, 21, 51)] == [24, 50, 100]  # even
-    assert [run.width(i, 20) for i in (1, 51)] == [16, 20]
-    assert schedule(100, pyramid=steps, refine=True).width(1, 1024) == 1024
-    assert schedule(100).width(1, 1024) == 1024
-
-
-@pytest.mark.parametrize("steps", [[0.5, 0.2], [0.2, 0.2], [0.0], [1.0], [0.1, 0.2, 0.3, 0.4]])
-def test_a_pyramid_that_does_not_ascend_is_refused(steps: list[float]) -> None:
-    with pytest.raises(ValidationError):
-        PyramidConfig.model_validate({"steps": steps})
 
 
 def test_depth_weight_decays_exponentially() -> None:
