@@ -28,7 +28,7 @@ class Goal:
 
 def goals(results: Results, kinds: Mapping[str, str]) -> list[Goal]:
     """Those for which there are results. Args: kinds, of KINDS by scene, where it is not a street."""
-    by_scene = [*_blocks(results, kinds), *_g2ps(results), *_haze(results)]
+    by_scene = [*_blocks(results, kinds), *_memory(results), *_g2ps(results), *_haze(results)]
     return [*_recipes(results), *_sooner(results), *_lasting(results), *by_scene]
 
 
@@ -145,6 +145,19 @@ def _blocks(results: Results, kinds: Mapping[str, str]) -> Iterator[Goal]:
                         f"{gain.signed} dB",
                         gain.mean >= least,
                     )
+
+
+def _memory(results: Results) -> Iterator[Goal]:
+    for scene in results.scenes:
+        gains = {count: results.gain(scene, f"memory-{count}", "memory-1") for count in (2, 4, 8)}
+        found = {count: gain for count, gain in gains.items() if gain is not None}
+        if found:
+            yield Goal(
+                f"{scene}: blocks against one model, with one budget of memory for every task",
+                "at least +1.5 dB with one of the numbers of blocks",
+                ", ".join(f"{count} blocks {gain.signed} dB" for count, gain in found.items()),
+                max(gain.mean for gain in found.values()) >= 1.5,
+            )
 
 
 def _g2ps(results: Results) -> Iterator[Goal]:

@@ -14,6 +14,8 @@ from panolog.workers.training.recipes import RECIPES
 
 Measured = Mapping[str, Result]  # by variant, of one scene and one seed
 POINTS = 8  # states of a stage that a curve evaluates
+BUDGET = 30_000  # scene Gaussians of a task, where memory is the limit
+_GRIDS = {1: "1x1x1", 2: "2x1x1", 4: "2x2x1", 8: "4x2x1"}  # by the number of blocks
 _SWITCHES = {  # settings of the panolog recipe that mean something only together
     "relocation": (
         *("densify.method", "densify.growth", "densify.filled", "densify.weight", "densify.until"),
@@ -131,7 +133,7 @@ def differs_in_plan_alone(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
 
 def variants() -> dict[str, Variant]:
     """All of them by name."""
-    found = [*_recipes(), *_ablations(), *_blocks(), *_lengths(), *_switches()]
+    found = [*_recipes(), *_ablations(), *_blocks(), *_memory(), *_lengths(), *_switches()]
     return {variant.name: variant for variant in found}
 
 
@@ -165,6 +167,13 @@ def groups() -> tuple[Group, ...]:
             "tau", "The threshold τ of eq. 11", ("paper", "tau-0.7", "tau-0.8", "tau-0.9"), source="threshold"
         ),
         Group("blocks", "Number of blocks", ("blocks-1", "blocks-2", "blocks-4", "blocks-8")),
+        Group(
+            "memory",
+            "One budget of memory for every task",
+            ("memory-1", *(f"memory-{count}" for count in _GRIDS if count > 1)),
+            note=f"No task may have more than {BUDGET:,} Gaussians, the sky not counted. `memory-1` is one"
+            " model that trains for as many iterations as Stage I and four blocks together.",
+        ),
     )
 
 
@@ -232,10 +241,29 @@ def _ablations() -> list[Variant]:
 
 
 def _blocks() -> list[Variant]:
-    grids = {1: "1x1x1", 2: "2x1x1", 4: "2x2x1", 8: "4x2x1"}
     return [
         Variant(f"blocks-{count}", f"panolog in {grid}", {"recipe": "panolog", "blocks": grid})
-        for count, grid in grids.items()
+        for count, grid in _GRIDS.items()
+    ]
+
+
+def _memory() -> list[Variant]:
+    """Each task grows as far as its memory goes: one model has one budget, blocks have one each."""
+    full = {"recipe": "panolog", "densify.max_gaussians": BUDGET, "densify.growth": 10.0}
+
+    def in_all(length: int, measured: Measured) -> int:
+        return length * (1 + measured["memory-4"].blocks)
+
+    alone = full | {"refine": False}
+    return [
+        *(
+            Variant(
+                f"memory-{count}", f"{BUDGET:,} Gaussians in each of {count} blocks", full | {"blocks": grid}
+            )
+            for count, grid in _GRIDS.items()
+            if count > 1
+        ),
+        Variant("memory-1", f"{BUDGET:,} Gaussians", alone, in_all, ("memory-4",), guess=5.0),
     ]
 
 

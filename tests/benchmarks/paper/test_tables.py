@@ -91,6 +91,12 @@ def test_goals_are_met_or_missed() -> None:
         assert [goal.met for goal in goals.goals(Results(runs), {"street": kind})][1:] == met_there
 
 
+def test_blocks_with_one_budget_of_memory_each_are_compared_with_one_model() -> None:
+    runs = [result("memory-1", 24.0), result("memory-2", 25.0), result("memory-8", 25.6)]
+    (goal,) = goals.goals(Results(runs), {})
+    assert (goal.measured, goal.met) == ("2 blocks +1.00 dB, 8 blocks +1.60 dB", True)
+
+
 def test_stage_one_is_compared_with_itself_on_its_way() -> None:
     worse = (Point(50.0, 26.1, "coarse"), Point(100.0, 26.0, "coarse"))
     runs = [result("paper-stage1", 24.0), result("panolog-stage1", 26.0, curve=worse)]
