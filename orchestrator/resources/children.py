@@ -4,26 +4,44 @@ import ctypes
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from subprocess import DEVNULL, PIPE, Popen
+from subprocess import PIPE, Popen
+from tempfile import TemporaryFile
 from typing import Any
 
 ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # are passed on to children
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
+_COMPLAINT = 4096  # bytes of stderr that are looked at
 _LIBC = ctypes.CDLL(None)
 
 
-def start_companion(module: str, plan: str) -> "Popen[str]":
+class Companion(Popen[str]):
     """A process of a module of ours next to a driver, which gets a line with its plan through a pipe.
 
     The plan may have secrets: no other process can read a pipe. The process is in a session of its own, so
     that Ctrl-C does not reach it.
     """
-    command = [sys.executable, "-m", module]
-    process = Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, text=True, start_new_session=True)
-    send_line(process, plan)
-    return process
+
+    def __init__(self, command: Sequence[str], plan: str) -> None:
+        """Starts the command."""
+        self._errors = TemporaryFile()  # noqa: SIM115  # closed with this object
+        super().__init__(
+            command, stdin=PIPE, stdout=PIPE, stderr=self._errors, text=True, start_new_session=True
+        )
+        send_line(self, plan)
+
+    @property
+    def complaint(self) -> str:
+        """The last line that it has written to stderr, such as the error of a traceback; "" without one."""
+        size = self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(0, size - _COMPLAINT))
+        return self._errors.read().decode(errors="replace").strip().rpartition("\n")[2]
+
+
+def start_companion(module: str, plan: str) -> Companion:
+    """A `Companion` of a module."""
+    return Companion([sys.executable, "-m", module], plan)
 
 
 def send_line(process: "Popen[str]", line: str) -> None:

@@ -2,18 +2,19 @@
 
 import json
 import signal
-import subprocess
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
-from panolog.orchestrator.resources.children import ENDS, start_companion
+from panolog.orchestrator.resources.children import ENDS, Companion, start_companion
 from panolog.orchestrator.storage.plan import Plan, to_json
 from panolog.scene.errors import RunError, StoreError
 
-_AGAIN_S = 10.0  # before a mirror that was killed is started again
+_AGAIN_S, _LONGEST_S = 10.0, 600.0  # before a mirror that was killed is started again: first, at most
+_TRIES = 3  # of mirrors in a row that end at once, after the end of the run
 _STOP_S = 10.0  # for a mirror to say what is left after it was stopped
 Say = Callable[[str], None]
 
@@ -90,15 +91,24 @@ class _Keeper:
         raise RunError(f"{self._plan.url}: the process of its mirror has ended (code {self._process.wait()})")
 
     def _keep(self) -> None:
-        """Reads what the mirror says, and starts another one if it was killed."""
+        """Reads what the mirror says, and starts another one if it was killed; later each time."""
+        pause, tries = _AGAIN_S, 0
         while True:
+            began = time.monotonic()
             for content in self._lines():
                 self._left = str(content.get("left", "")) or self._left
             if self._process.wait() == 0:
                 return
-            killed = f"{self._plan.url}: its mirror was killed (code {self._process.returncode})"
-            self._left = killed
-            last = self._ended.wait(_AGAIN_S)
+            why = (
+                f"code {self._process.returncode}{self._process.complaint and f': {self._process.complaint}'}"
+            )
+            self._left = killed = f"{self._plan.url}: its mirror was killed ({why})"
+            if time.monotonic() - began > _LONGEST_S:
+                pause, tries = _AGAIN_S, 0
+            last = self._ended.wait(pause)
+            pause, tries = min(2 * pause, _LONGEST_S), tries + 1
+            if last and tries > _TRIES:
+                return
             self._process = _started(self._plan, again=True)
             if last:
                 with suppress(OSError):
@@ -121,7 +131,7 @@ class _Keeper:
                 yield json.loads(line)
 
 
-def _started(plan: Plan, *, again: bool = False) -> "subprocess.Popen[str]":
+def _started(plan: Plan, *, again: bool = False) -> Companion:
     """The process of a mirror. Args: again, in place of one that was killed."""
     if again:
         plan = replace(plan, again=True, force=False)

@@ -32,8 +32,8 @@ _PIECE = 2**22  # bytes hashed at a time
 # What is not copied out: it is of this machine, or a resumed driver makes it anew.
 _LOCAL = ("store", "control", "lock", "driver", "tensorboard", DATABASE, f"{DATABASE}-journal")
 _REMADE = ("initial.ply",)
-# What a run needs only to be resumed: no result.
-_WORK = ("blocks", "coarse", "district", "round", "repair", "union", "scene", "prepare", "follower", DATABASE)
+_MADE = ("blocks", "coarse", "district", "round", "repair", "union", "scene")  # folders
+_WORK = (*_MADE, "prepare", "follower", DATABASE)  # what a run needs only to be resumed: no result
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,12 @@ def mirrored(name: str) -> bool:
 def is_result(name: str) -> bool:
     """Whether a file of a run is for its user, and not only for what resumes it."""
     return PurePosixPath(name).parts[0] not in _WORK
+
+
+def is_work(name: str) -> bool:
+    """Whether a file is of what takes time to make: a run that has any is never withdrawn."""
+    first, *rest = PurePosixPath(name).parts
+    return first in _MADE or first == "scene.sfm" or (first == "prepare" and rest[:1] == ["masks"])
 
 
 def number_of(name: str) -> int:

@@ -24,6 +24,7 @@ from panolog.scene.stores.store import Store
 
 EXPIRES_S = 90.0
 _REFRESH_S = 20.0
+_BOOT, _MOUNTS = Path("/proc/sys/kernel/random/boot_id"), Path("/proc/self/ns/mnt")
 _POLL_S = 1.0  # between two looks at the lease of a mirror on this machine that is about to end
 
 
@@ -72,17 +73,26 @@ class Lease:
                 self.require()
 
 
+def _machine() -> str:
+    """This machine since its start, or this container: two may have one host name."""
+    with suppress(OSError):
+        return f"{_BOOT.read_text().strip()}:{_MOUNTS.stat().st_ino}"
+    return socket.gethostname()
+
+
 @dataclass(frozen=True)
 class _Owner:
     """Who holds a lease."""
 
     folder: str  # stands for the run's folder on its machine
+    machine: str = field(default_factory=_machine)
     token: str = field(default_factory=lambda: secrets.token_hex(8))
 
     def content(self, *, released: bool = False) -> bytes:
         """The lease as it is written now."""
         held = {"owner": self.token, "folder": self.folder, "time": time.time(), "released": released}
-        return json.dumps(held | {"host": socket.gethostname(), "pid": os.getpid()}).encode()
+        who = {"host": socket.gethostname(), "machine": self.machine, "pid": os.getpid()}
+        return json.dumps(held | who).encode()
 
 
 def take(store: Store, root: Path, *, force: bool, again: bool = False) -> Lease:
@@ -97,7 +107,7 @@ def take(store: Store, root: Path, *, force: bool, again: bool = False) -> Lease
     while True:
         found = newest(store, LEASES)
         held = _read(store, found) if found else {}
-        own = (held.get("host"), held.get("folder")) == (socket.gethostname(), owner.folder)
+        own = (held.get("machine"), held.get("folder")) == (owner.machine, owner.folder)
         if _live(held) and not force and not (own and again):
             if own and not lock.held(root / "lock"):
                 time.sleep(_POLL_S)
@@ -124,13 +134,16 @@ def holder(store: Store) -> str:
 
 
 def _read(store: Store, name: str) -> dict[str, Any]:
-    """A lease; nothing if it is gone or damaged."""
+    """A lease; nothing if it is gone. One that is damaged is held since it was written, by some machine."""
     content = store.read(name)
+    if content is None:
+        return {}
     with suppress(ValueError, TypeError):
-        found = json.loads(content or b"{}")
+        found = json.loads(content)
         if isinstance(found, dict) and isinstance(found.get("time"), int | float):
             return found
-    return {}
+    version = store.version(name)
+    return {"time": version.modified} if version is not None else {}
 
 
 def _live(held: dict[str, Any]) -> bool:

@@ -21,7 +21,7 @@ from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.reading import reading
 from panolog.orchestrator.run.records import Outcome
-from panolog.orchestrator.run.state import replay
+from panolog.orchestrator.run.state import RunState, Status, replay
 from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.storage.layout import (
     DATABASE,
@@ -33,8 +33,10 @@ from panolog.orchestrator.storage.layout import (
     Manifest,
     digest_of,
     is_result,
+    is_work,
     mirrored,
     number_of,
+    numbered,
     put_pointer,
 )
 from panolog.orchestrator.storage.lease import Lease
@@ -61,6 +63,10 @@ class Mirror:
         self._lock = threading.Lock()  # of `_state`
         self._cost = 0.0  # seconds that the last snapshot and manifest took
         self._swept = False
+        self._begun = known is not None  # whether the store has anything of the run that took time
+        self._own: list[str] = []  # keys that this mirror has made, the pointer's first
+        for left in folder.mirror.parent.glob("*.part"):  # of a mirror that was killed
+            left.unlink()
 
     @property
     def state(self) -> MirrorState:
@@ -95,11 +101,12 @@ class Mirror:
     def _try(self, *, last: bool) -> bool:
         """One round. Returns whether all is out that there was at its begin."""
         try:
-            if not self._folder.info.exists() or not self._folder.database.exists():
-                if last:
-                    self._withdraw()
-                return True
-            self.round(last=last)
+            if self._folder.info.exists() and self._folder.database.exists():
+                self.round(last=last)
+            elif self._begun:
+                self._say(problem=f"{self._folder.root} is gone, or no run any more; the store keeps the run")
+            elif last:
+                self._withdraw()
         except RunLockedError as error:
             self._say(problem=str(error))
             return False
@@ -122,16 +129,24 @@ class Mirror:
             taken = time.monotonic()
             files = first | self._send(self._present())
             began += time.monotonic() - taken
+            state = replay(read_milestones(snapshot))
             entry = self._put(snapshot, DATABASE, self._files.get(DATABASE))
         finally:
             snapshot.unlink(missing_ok=True)
-        if last and self._delivered():
+        lost = {
+            name: self._files[name]
+            for name in _needed(self._folder, state) & self._files.keys() - files.keys()
+        }
+        files |= lost
+        self._begun |= state.prepared or any(map(is_work, files))
+        if last and state.outcome in (Outcome.DONE, Outcome.LIMITED):
             if any(known.key == name for name, known in self._files.items()):  # of an end before
                 self._publish(files | {DATABASE: entry}, moment)  # what is in force must not change
             files = self._publish_results(files)
         self._publish(files | {DATABASE: entry}, moment)
         self._cost = time.monotonic() - began
-        self._say(problem="", pending_files=0, pending_bytes=0, since=moment, complete=last)
+        gone = f"no longer in {self._folder.root}, but kept in the store: {', '.join(sorted(lost))}"
+        self._say(problem=gone if lost else "", pending_files=0, pending_bytes=0, since=moment, complete=last)
 
     def _present(self) -> dict[str, Stamp]:
         """The files of the run that are copied out, as they are now; run.json last."""
@@ -208,6 +223,7 @@ class Mirror:
         entry = Entry(key, status.st_size, digest_of(path), status.st_mtime_ns)
         if known is not None and (known.size, known.sha256) == (entry.size, entry.sha256):
             return known
+        self._own.append(key)
         self._store.put(path, key)
         return entry
 
@@ -232,6 +248,7 @@ class Mirror:
         self._lease.require()
         manifest = Manifest(f"{MANIFESTS}/{time.time_ns():x}-{secrets.token_hex(4)}", files)
         packed = manifest.pack()
+        self._own = [numbered(POINTERS, self._lease.number), *self._own, manifest.name]
         self._store.write(manifest.name, packed)
         self._say(announced=manifest.name)
         put_pointer(self._store, self._lease.number, manifest, packed)
@@ -271,15 +288,10 @@ class Mirror:
         self._replaced += sorted(unnamed - {it.key for it in named.values()})
         return named
 
-    def _delivered(self) -> bool:
-        outcome = replay(read_milestones(self._folder.database)).outcome
-        return outcome in (Outcome.DONE, Outcome.LIMITED)
-
     def _withdraw(self) -> None:
-        """Removes a run that has been refused, from the store as from the disk."""
-        if self._state.published:
-            for name in [it for folder in (POINTERS, MANIFESTS, OBJECTS) for it in self._store.list(folder)]:
-                self._store.remove(name)
+        """Removes what this mirror has stored of a run that was refused before anything was made."""
+        for key in dict.fromkeys(self._own):
+            self._store.remove(key)
         self._say(complete=True)
 
     def _say(self, **changes: object) -> None:
@@ -287,6 +299,17 @@ class Mirror:
             self._state = replace(self._state, **changes)  # type: ignore[arg-type]
             if self._folder.info.exists():
                 write_state(self._folder.mirror, self._state)
+
+
+def _needed(folder: RunFolder, state: RunState) -> set[str]:
+    """The files that records name and that a resume or a user would miss."""
+    found = [folder.info, *([folder.point_cloud] if state.merged is not None else [])]
+    for task in state.tasks.values():
+        if task.status == Status.DONE:  # of a run that is done, `clean` removes the models of parts
+            found += [] if state.outcome == Outcome.DONE else [folder.model(task.id)]
+        elif task.checkpoint is not None:
+            found.append(folder.checkpoint(task.id))
+    return {folder.relative(path) for path in found}
 
 
 def _joined(folder: str, name: str) -> str:

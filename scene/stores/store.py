@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from panolog.scene.errors import StoreError, StoreLostError
+from panolog.scene.files import write_bytes
 from panolog.scene.stores.url import PROTOCOLS, StoreUrl, parse_url
 
 T = TypeVar("T")
@@ -168,6 +169,9 @@ class Store:
         """Stores bytes. Args: new, only if there is no such object. Returns whether that was so."""
 
         def pipe() -> bool:
+            if not new and self.url.protocol == "file":  # a reader finds it whole, as in a store
+                write_bytes(Path(self._made(name)), data)
+                return True
             self._files.pipe_file(self._made(name), data, mode="create" if new else "overwrite")
             return True
 

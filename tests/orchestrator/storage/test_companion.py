@@ -1,12 +1,14 @@
 """The process of a mirror: it is kept alive, and takes no signal from a supervisor that waits for one."""
 
 import signal
+import sys
 import threading
 from pathlib import Path
 
 import psutil
 import pytest
 
+from panolog.orchestrator.resources.children import Companion
 from panolog.orchestrator.storage import companion
 from panolog.orchestrator.storage.companion import mirrored
 from panolog.orchestrator.storage.lease import take
@@ -75,3 +77,19 @@ def test_a_mirror_that_cannot_be_replaced_is_reported_at_once_and_at_the_end(
         driver.end()
     assert "its mirror was killed (code -9), and another one cannot work" in said[1]
     lease.release()
+
+
+def test_a_mirror_that_fails_each_time_is_given_up_with_its_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the end of the run nothing is waited for: it would be started as fast as it fails."""
+    plans, program = list[str](), "print('{\"ready\": true}', flush=True); input(); input()"
+
+    def start(_: str, plan: str) -> Companion:
+        plans.append(plan)
+        return Companion([sys.executable, "-c", program], plan)
+
+    monkeypatch.setattr(companion, "start_companion", start)
+    with pytest.raises(RunError, match=r"was killed \(code 1: EOFError"), mirrored(plan_of(tmp_path), print):
+        pass
+    assert len(plans) == 1 + companion._TRIES

@@ -1,6 +1,8 @@
 """The mirror of a run: the store is whole after every request, whatever fails, and has each file once."""
 
 import json
+import os
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -12,7 +14,7 @@ import pytest
 
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import Outcome
+from panolog.orchestrator.run.records import Noticed, Outcome
 from panolog.orchestrator.storage import lease as leases
 from panolog.orchestrator.storage.fetch import bring, for_status, viewed
 from panolog.orchestrator.storage.layout import (
@@ -130,12 +132,65 @@ def test_results_of_a_run_that_a_limit_has_ended_are_replaced_when_it_is_complet
 
 
 def test_a_run_that_was_refused_leaves_nothing(tmp_path: Path) -> None:
-    driver, store, mirror = stored(tmp_path)
+    """Of its own: what others have put there is none of it."""
+    store, driver = open_store(f"file://{tmp_path}/store"), Driver(tmp_path / "run")
+    store.write("notes.txt", b"of a user")
+    mirror, lease = mirror_of(driver, store)
+    mirror.round()
     assert current(store) is not None
     driver.folder.info.unlink()
     rounds(mirror)
-    assert current(store) is None
-    assert store.list(OBJECTS) == {}
+    lease.release()
+    assert mirror.state.complete
+    assert {it for it in store.list() if "/leases/" not in it} == {"notes.txt"}
+
+
+@pytest.mark.parametrize("folder", ["removed", "moved", "empty"])
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_folder_that_is_gone_takes_nothing_from_the_store(
+    tmp_path: Path, folder: str, resumed: bool
+) -> None:
+    """By rm -rf before a fresh `resume`, mv, or a disk that is no longer mounted, while the mirror copies."""
+    driver, store, mirror = stored(tmp_path)
+    driver.end(Outcome.INTERRUPTED)
+    mirror.round()
+    if resumed:  # another mirror, which has made nothing of it itself
+        mirror, _ = mirror_of(driver, store, force=True)
+    before = {it: content for it in store.list() if "/leases/" not in it and (content := store.read(it))}
+    if folder == "moved":
+        driver.folder.root.rename(tmp_path / "elsewhere")
+    else:
+        shutil.rmtree(driver.folder.root)
+    if folder == "empty":
+        driver.folder.root.mkdir()
+    rounds(mirror)
+    assert {it: store.read(it) for it in before} == before
+    assert not mirror.state.complete
+    assert (
+        mirror.state.problem == f"{driver.folder.root} is gone, or no run any more; the store keeps the run"
+    )
+    fetched(store, tmp_path / "fresh")
+
+
+def test_a_checkpoint_that_is_lost_here_stays_in_the_store_and_is_reported(tmp_path: Path) -> None:
+    driver, store, mirror = stored(tmp_path)
+    driver.folder.checkpoint(COARSE).unlink()
+    for number in range(3):
+        driver._append(Noticed(None, str(number)))
+        mirror.round()
+        assert mirror.state.problem.endswith("kept in the store: coarse/checkpoint.safetensors")
+        fetched(store, tmp_path / f"fresh{number}")
+    driver.save()
+    mirror.round()
+    assert mirror.state.problem == ""
+
+
+def test_what_a_killed_mirror_has_held_is_let_go(tmp_path: Path) -> None:
+    driver, store, _ = stored(tmp_path)
+    held = driver.folder.mirror.with_name("0123abcd.part")
+    held.write_bytes(b"of a checkpoint")
+    mirror_of(driver, store, force=True)
+    assert not held.exists()
 
 
 def test_a_store_that_fails_delays_only_the_mirror_and_says_so(tmp_path: Path) -> None:
@@ -210,6 +265,41 @@ def test_the_mirror_of_a_live_driver_is_replaced_but_not_that_of_another(tmp_pat
         take(store, driver.folder.root, force=False, again=True)
         with pytest.raises(RunLockedError):
             take(store, tmp_path / "elsewhere", force=False, again=True)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"time": "now"}'])
+def test_a_lease_that_cannot_be_read_is_held(tmp_path: Path, content: bytes) -> None:
+    store = open_store(f"file://{tmp_path}/store")
+    take(store, tmp_path / "run", force=False).end()
+    (name,) = store.list(LEASES)
+    store.write(name, content)
+    with pytest.raises(RunLockedError, match="a driver on another machine is at work"):
+        take(store, tmp_path / "run", force=False)
+    os.utime(tmp_path / "store" / name, (1, 1))
+    take(store, tmp_path / "run", force=False)
+
+
+def test_containers_with_one_host_name_are_two_machines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One does not wait for the other in silence: only this machine's mirror is about to end."""
+    store = open_store(f"file://{tmp_path}/store")
+    boot = tmp_path / "boot_id"
+    for number in ("1", "2"):
+        boot.write_text(number)
+        monkeypatch.setattr(leases, "_BOOT", boot)
+        if number == "1":
+            take(store, tmp_path / "run", force=False)
+    with pytest.raises(RunLockedError, match="is at work on it"):
+        take(store, tmp_path / "run", force=False)
+
+
+def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
+    store = open_store(f"file://{tmp_path}/store")
+    store.write("a", b"old" * 1000)
+    with (tmp_path / "store" / "a").open("rb") as before:
+        store.write("a", b"new")
+        assert before.read() == b"old" * 1000
 
 
 def test_a_mirror_that_was_killed_after_its_pointer_leaves_a_folder_that_is_kept(tmp_path: Path) -> None:
