@@ -3,7 +3,8 @@
 Commands import what they need when they run, so that `--help` and `status` import neither torch nor Ray.
 """
 
-from typing import Annotated, Any
+import sys
+from typing import Annotated, Any, TextIO, cast
 
 import typer
 
@@ -18,7 +19,7 @@ from panolog.orchestrator.cli import (
     run,
     scene,
 )
-from panolog.orchestrator.cli.console import say
+from panolog.orchestrator.cli.console import Lasting, say
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.orchestrator.run import log
 from panolog.scene.errors import InputError, PanologError, in_one_line
@@ -116,4 +117,5 @@ def _program(
 
 def main() -> None:
     """Runs the program."""
+    sys.stderr = cast(TextIO, Lasting(sys.stderr))
     app(prog_name="panolog")

@@ -3,11 +3,11 @@
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from threading import Event, Thread
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from panolog.orchestrator.run.folder import command_line
 
@@ -15,6 +15,32 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _FIRST, _LINES = 3.0, 15.0  # seconds to the first line of progress and between two, without a terminal
+
+
+class Lasting:
+    """A text stream that drops what cannot be written.
+
+    Its reader may have ended (`panolog run … 2>&1 | tee`, Ctrl-C), its terminal may be closed, the disk under
+    it may be full: a run goes on, and saves its checkpoints when it is stopped for the same reason.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        """Args: stream, which messages go to as long as it takes them."""
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """As `TextIO.write`."""
+        with suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """As `TextIO.flush`."""
+        with suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 @cache

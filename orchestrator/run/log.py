@@ -7,6 +7,7 @@ level; `panolog -v` sets it to INFO, `-vv` to DEBUG. Workers inherit the variabl
 import logging
 import os
 import sys
+from contextlib import suppress
 
 from panolog.scene.errors import ConfigError
 
@@ -19,7 +20,8 @@ class _Stderr(logging.Handler):
     """Writes to what `sys.stderr` is at the moment: the live display replaces it."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        print(self.format(record), file=sys.stderr, flush=True)
+        with suppress(OSError):  # its terminal was closed, or the disk under it is full
+            print(self.format(record), file=sys.stderr, flush=True)
 
 
 def configure(verbose: int = 0) -> None:

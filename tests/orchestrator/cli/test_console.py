@@ -1,11 +1,17 @@
 """Progress on stderr, and the usage of every command."""
 
+import logging
+import os
+import pty
 import re
-from collections.abc import Iterator
-from contextlib import closing
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from io import StringIO
 from pathlib import Path
 from threading import Event
+from typing import TextIO, cast
 
 import pytest
 from rich.console import Console
@@ -13,6 +19,8 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from panolog.orchestrator.cli import app, console
+from panolog.orchestrator.cli.console import Lasting
+from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Outcome, Record, RunBegan, RunEnded, TaskFailed, TaskStarted
 from panolog.orchestrator.run.state import replay
 from panolog.orchestrator.run.store import Database
@@ -107,3 +115,56 @@ def test_the_reason_of_a_failed_run_is_printed_once(terminal: bool, tmp_path: Pa
     for display, times in ((shown, 0), (status, 1)):
         assert isinstance(display.file, StringIO)
         assert display.file.getvalue().count("no memory") == times
+
+
+def full() -> TextIO:
+    """A stream on a full disk."""
+    return Path("/dev/full").open("w", buffering=1)
+
+
+def broken() -> TextIO:
+    """A pipe whose reader has ended."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    return os.fdopen(writer, "w", buffering=1)
+
+
+def closed() -> TextIO:
+    """A terminal whose program has ended."""
+    master, terminal = pty.openpty()
+    os.close(master)
+    return os.fdopen(terminal, "w", buffering=1)
+
+
+@pytest.mark.parametrize("dead", [full, broken, closed])
+def test_a_run_outlasts_the_reader_of_its_messages(
+    dead: Callable[[], TextIO], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream = dead()
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(OSError):
+        stream.write("a line\n")
+    shown = Console(file=cast(TextIO, Lasting(stream)), force_terminal=dead is closed)
+    with progress(shown, tmp_path) as show, closing(Database(tmp_path / "run.db")) as database:
+        for record in (
+            RunBegan("here", 1, False),
+            TaskStarted(COARSE, 1, 0, "here", 1, "cpu", 1),
+            RunEnded(Outcome.DONE),
+        ):
+            stored = database.append([record])
+            show(replay(stored), stored)
+    monkeypatch.setattr(sys, "stderr", stream)
+    log._Stderr().emit(logging.makeLogRecord({"msg": "a line"}))
+    with suppress(OSError):
+        stream.close()
+
+
+@pytest.mark.parametrize("dead", [full, broken, closed])
+def test_the_exit_code_is_right_without_a_reader_of_messages(
+    dead: Callable[[], TextIO], tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "panolog.orchestrator.cli", "status", str(tmp_path / "none")]
+    stream = dead()
+    assert subprocess.run(command, stderr=stream, timeout=300, check=False).returncode == 2
+    with suppress(OSError):
+        stream.close()
