@@ -30,7 +30,6 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.stages.scenes import save_captured
-from panolog.scene.errors import RunError
 from panolog.scene.files import atomic, publish, remove_partial, write_bytes
 from panolog.scene.model import Scene
 from panolog.scene.ply import write_ply
@@ -99,7 +98,7 @@ def tidy(folder: RunFolder, state: RunState) -> list[Record]:
     """What a driver does with checkpoints before it begins. Returns notices.
 
     Those of tasks that are done are removed: the driver before was killed between the record of the result
-    and the removal. A damaged one gives way to the one before it, if that was kept.
+    and the removal. A damaged one is set aside, and the one before it takes its place, if that was kept.
 
     Raises OSError or RunError if the disk takes nothing.
     """
@@ -107,28 +106,37 @@ def tidy(folder: RunFolder, state: RunState) -> list[Record]:
     for task in state.tasks.values():
         if task.status == Status.DONE:
             remove_checkpoints(folder, task.id)
-        elif (iteration := _restored(folder, task.id)) is not None:
-            message = f"its last checkpoint is damaged: it continues from that at iteration {iteration}"
+        elif message := _repaired(folder, task.id):
             notices.append(Noticed(task.id, message))
     return notices
 
 
-def _restored(folder: RunFolder, task: TaskId) -> int | None:
-    """The iteration of the earlier checkpoint that has taken the place of a damaged one; None if none has."""
+def _repaired(folder: RunFolder, task: TaskId) -> str:
+    """Puts an earlier checkpoint of a task in the place of one that is damaged or gone.
+
+    Returns what the task then continues from; "" if nothing was wrong.
+    """
     last, earlier = folder.checkpoint(task), folder.earlier_checkpoints(task)
-    if not earlier or (last.exists() and _iteration(last) is not None):
-        return None
+    if (_iteration(last) is not None) if last.exists() else not earlier:
+        return ""
+    if last.exists():
+        last.replace(_aside(last))
     for path in reversed(earlier):
         if (iteration := _iteration(path)) is not None:
             path.replace(last)
-            return iteration
-    return None
+            return f"its last checkpoint is damaged: it continues from that at iteration {iteration}"
+    return "its last checkpoint is damaged: it starts from the beginning"
+
+
+def _aside(last: Path) -> Path:
+    """Where a damaged checkpoint is kept until its task is done."""
+    return last.with_name(f"{last.name}.damaged")
 
 
 def remove_checkpoints(folder: RunFolder, task: TaskId) -> None:
     """Removes what a task needed until it was done, and what its attempts have left. Raises OSError."""
     path = folder.checkpoint(task)
-    for file in (path, *folder.earlier_checkpoints(task), folder.early(task)):
+    for file in (path, _aside(path), *folder.earlier_checkpoints(task), folder.early(task)):
         file.unlink(missing_ok=True)
     if task.stage.refines:
         folder.initial(task).unlink(missing_ok=True)
@@ -182,9 +190,7 @@ def _take_checkpoint(folder: RunFolder, event: CheckpointWritten, keep: int) -> 
     written = path.with_name(event.name)
     try:
         size, iteration = written.stat().st_size, checkpoint.iteration_of(written)
-    except (FileNotFoundError, RunError) as error:
-        if isinstance(error.__cause__, OSError):
-            raise
+    except (FileNotFoundError, checkpoint.DamagedCheckpointError):
         size = iteration = -1
     if (size, iteration) != (event.size, event.iteration):
         written.unlink(missing_ok=True)
@@ -215,9 +221,7 @@ def _iteration(path: Path) -> int | None:
     """The iteration of a checkpoint; None if it is damaged. Raises RunError if it cannot be read."""
     try:
         return checkpoint.iteration_of(path)
-    except RunError as error:
-        if isinstance(error.__cause__, OSError):
-            raise
+    except checkpoint.DamagedCheckpointError:
         return None
 
 

@@ -3,22 +3,30 @@
 The driver, whose memory is small, makes PLYs of the models in them, in pieces.
 """
 
-from collections.abc import Iterator
+import zlib
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.files import Locate, atomic, here
 from panolog.scene.gaussians import Gaussians
-from panolog.workers.events import Checkpoint
+from panolog.workers.events import Checkpoint, Notice
+from panolog.workers.specs import Source
 from panolog.workers.tasks import TaskId
 from panolog.workers.training.optimizer import AVERAGE, EXACT, MOMENT
 
+_SUM = "crc32"  # in the metadata
 _ROWS = 2**16  # of a model in memory at a time
+
+
+class DamagedCheckpointError(RunError):
+    """A file is no checkpoint, or no longer the one that was written."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +41,26 @@ class CheckpointFile:
         return load(self.locate(self.path))
 
 
+def loaded(task: TaskId, source: Source[Checkpoint] | None) -> Generator[Notice, None, Checkpoint | None]:
+    """What a task continues from; none without a checkpoint, or with a notice if it is damaged.
+
+    Raises RunError if it cannot be read.
+    """
+    try:
+        return None if source is None else source.load()
+    except DamagedCheckpointError as error:
+        yield Notice(task, f"{error}: it starts from the beginning")
+        return None
+
+
 def save(path: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint by atomic rename: its tensors as they are, task and iteration as metadata.
 
     Raises:
         RunError: the file cannot be written, with the system's reason.
     """
-    metadata = {"task": str(checkpoint.task), "iteration": str(checkpoint.iteration)}
+    names = {"task": str(checkpoint.task), "iteration": str(checkpoint.iteration)}
+    metadata = names | {_SUM: str(_sum_of(checkpoint.tensors))}
     try:
         with atomic(path) as temporary:
             save_file(checkpoint.tensors, temporary, metadata)
@@ -51,7 +72,8 @@ def load(path: Path) -> Checkpoint:
     """Read a checkpoint that `save` wrote; its tensors are on the CPU.
 
     Raises:
-        RunError: the file is missing, truncated or no checkpoint.
+        DamagedCheckpointError: the file is truncated, no checkpoint, or has other bytes than were written.
+        RunError: it cannot be read, or is missing.
     """
     return _read(path, tensors=True)
 
@@ -73,11 +95,21 @@ def _read(path: Path, *, tensors: bool) -> Checkpoint:
             metadata = file.metadata() or {}
             names = file.keys() if tensors else ()
             content = {name: file.get_tensor(name) for name in names}
+        if tensors and int(metadata.get(_SUM, _sum_of(content))) != _sum_of(content):  # older ones have none
+            raise ValueError("its bytes are not those that were written")
         return Checkpoint(TaskId.parse(metadata["task"]), int(metadata["iteration"]), content)
-    except (OSError, SafetensorError, KeyError, ValueError, InputError) as error:
-        raise RunError(
-            f"{path} is not a whole checkpoint ({error}); remove it, and the task starts from the beginning"
-        ) from error
+    except OSError as error:
+        raise RunError(f"cannot read the checkpoint {path}: {error}") from error
+    except (SafetensorError, KeyError, ValueError, InputError) as error:
+        raise DamagedCheckpointError(f"{path} is not a whole checkpoint ({error})") from error
+
+
+def _sum_of(tensors: Mapping[str, Tensor]) -> int:
+    """CRC-32 of tensors, in the order of their names."""
+    found = 0
+    for _, tensor in sorted(tensors.items()):
+        found = zlib.crc32(tensor.contiguous().numpy().reshape(-1).data.cast("B"), found)
+    return found
 
 
 class SavedModel:

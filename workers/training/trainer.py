@@ -33,6 +33,7 @@ from panolog.workers.merge import retained
 from panolog.workers.meter import Meter
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
+from panolog.workers.training.checkpoint import loaded
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, drop_unrisen, rate_units, reset_opacities
 from panolog.workers.training.exterior import Exterior, Rooms, exterior_last, inside
@@ -102,10 +103,11 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
         open_cache(spec, scene, spec.views, rooms.host, rooms.device) as cache,
         closing(Trainer(spec, scene, cache, rooms.baked)) as trainer,
     ):
-        if spec.checkpoint is None:
-            yield from trainer.begin()
+        if saved := (yield from loaded(spec.task, spec.checkpoint)):
+            trainer.restore(saved)
         else:
-            trainer.restore(spec.checkpoint.load())
+            yield from trainer.begin()
+        del saved  # its memory
         count, start = len(trainer.state.gaussians), trainer.iteration
         _LOG.info("%s: trains %d Gaussians from iteration %d of %d", spec.task, count, start, spec.iterations)
         yield from trainer.surround(stop)

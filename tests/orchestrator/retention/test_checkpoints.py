@@ -87,11 +87,15 @@ def test_a_damaged_one_gives_way_to_the_last_whole_one(folder: RunFolder, damage
     assert saving.tidy(folder, state()) == []
 
 
-def test_without_another_one_a_damaged_one_is_reported_as_before(folder: RunFolder) -> None:
+def test_without_another_one_a_damaged_one_is_set_aside_until_the_task_is_done(folder: RunFolder) -> None:
     save(folder, 50, 1)
     folder.checkpoint(COARSE).write_bytes(b"x")
+    (notice,) = saving.tidy(folder, state())
+    assert notice == Noticed(COARSE, "its last checkpoint is damaged: it starts from the beginning")
+    assert [path.read_bytes() for path in folder.of(COARSE).iterdir()] == [b"x"]
     assert saving.tidy(folder, state()) == []
-    assert folder.checkpoint(COARSE).read_bytes() == b"x"
+    saving.tidy(folder, state(done=True))
+    assert list(folder.of(COARSE).iterdir()) == []
 
 
 def test_a_disk_without_links_keeps_the_last_one(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
