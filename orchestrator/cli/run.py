@@ -77,8 +77,7 @@ def run(
     with mirrored(output, local) as root, _followed(root, notify, log):
         if _supervised(max_resumes, supervise=supervise):
             first = ["run", source, "-o", str(root), *as_settings(config), *as_arguments(options)]
-            first += [*driver, *budget.options()]
-            code = _supervise(root, first, driver, address, max_resumes)
+            code = _supervise(root, first, driver, budget.options(), address, max_resumes)
         else:
             with progress_bar("starting"):
                 from panolog.orchestrator.commands import session
@@ -117,8 +116,8 @@ def resume(
         read_info(RunFolder(root))  # fails before torch is imported
         with _followed(root, notify, log):
             if _supervised(max_resumes, supervise=supervise):
-                first = ["resume", str(root), *options, *budget.options(), "--has-mirror"]
-                code = _supervise(root, first, options, address, max_resumes)
+                first = ["resume", str(root), "--has-mirror"]
+                code = _supervise(root, first, options, budget.options(), address, max_resumes)
             else:
                 with progress_bar("starting"):
                     from panolog.orchestrator.commands import session
@@ -292,7 +291,12 @@ def _supervised(limit: int | None, *, supervise: bool) -> bool:
 
 
 def _supervise(
-    root: Path, first: list[str], options: list[str], address: str | None, limit: int | None
+    root: Path,
+    first: list[str],
+    options: list[str],
+    limits: list[str],
+    address: str | None,
+    limit: int | None,
 ) -> int:
     """Runs drivers as children of this process. Returns the exit code of the last one."""
     from panolog.orchestrator.commands.supervise import Supervised, supervise
@@ -301,8 +305,8 @@ def _supervise(
         err().show_cursor()  # a driver that was killed in its display has hidden it
         say(f"panolog: {line}", style="red")
 
-    options = [*options, "--has-mirror"]
-    return supervise(Supervised(root, first, options, address, limit or _RESUMES, show))
+    first, options = [*first, *options, *limits], [*options, "--has-mirror"]
+    return supervise(Supervised(root, first, options, limits, address, limit or _RESUMES, show))
 
 
 @contextmanager

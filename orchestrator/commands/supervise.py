@@ -46,6 +46,7 @@ class Supervised:
     root: Path  # of the run
     first: Sequence[str]  # arguments of `panolog` for the first driver
     options: Sequence[str]  # of `panolog resume` for the others
+    limits: Sequence[str]  # options that count once a driver has recorded them: of cost and time
     address: str | None  # of the cluster
     limit: int  # of resumes without progress
     say: Callable[[str], None]  # called with one line
@@ -82,6 +83,7 @@ class _Supervisor:
     signals: set[signal.Signals]  # that are blocked here
     before: set[Any]  # what is blocked in the drivers
     stopping: bool = False  # a user has requested it
+    taken: bool = False  # a driver of this supervisor has taken the run over, and recorded the limits
 
     def supervise(self) -> int:
         """As the function."""
@@ -105,7 +107,8 @@ class _Supervisor:
                 run.say(f"stopped; {self._resume} resumes the run")
                 return 130
             if RunFolder(run.root).info.exists():
-                arguments = ["resume", str(run.root), *run.options, "--resumed-after", why]
+                limits = () if self.taken else run.limits
+                arguments = ["resume", str(run.root), *run.options, *limits, "--resumed-after", why]
 
     @property
     def _resume(self) -> str:
@@ -118,7 +121,9 @@ class _Supervisor:
         while (code := driver.poll()) is None:
             if (number := self._taken(_POLL_S)) is not None:
                 driver.send_signal(number)
-        return code, cause(code, _state(self.run.root), driver.pid)
+        state = _state(self.run.root)
+        self.taken = self.taken or (state.driver is not None and state.driver.pid == driver.pid)
+        return code, cause(code, state, driver.pid)
 
     def _taken(self, seconds: float) -> int | None:
         """The next request to stop, if one comes in that time; also returns when a driver has ended."""

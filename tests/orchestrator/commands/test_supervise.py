@@ -31,6 +31,7 @@ word, _, value = {lines!r}[number].partition(" ")
 if word != "refused":
     root.mkdir(exist_ok=True)
     (root / "run.json").touch()
+if word not in ("refused", "early"):
     database = Database(root / "run.db")
     database.append([RunBegan("host", os.getpid(), number > 0)])
     if word == "saves":
@@ -58,8 +59,8 @@ class Script:
     def run(self, *lines: str, limit: int = 3, address: str | None = None) -> int:
         text = DRIVER.format(root=str(self.root), log=str(self._log), lines=lines)
         self._monkeypatch.setattr(supervise, "_PROGRAM", (sys.executable, "-c", text))
-        first, options = ["run", "scene", "-o", "run"], ["--nice", "3"]
-        return supervise.supervise(Supervised(self.root, first, options, address, limit, self._say))
+        first, options, limits = ["run", "scene", "-o", "run"], ["--nice", "3"], ["--max-cost", "5.0"]
+        return supervise.supervise(Supervised(self.root, first, options, limits, address, limit, self._say))
 
     def _say(self, line: str) -> None:
         self.said.append(line)
@@ -118,6 +119,14 @@ def test_a_driver_that_died_before_its_run_folder_was_there_is_started_anew(scri
     assert script.drivers == ["run scene -o run"] * 2
 
 
+def test_limits_are_given_until_a_driver_has_recorded_them(script: Script) -> None:
+    """One may be killed between run.json and its first record."""
+    assert script.run("early -9", "saves -9", "ends 0") == 0
+    _, second, third = script.drivers
+    assert second.startswith("resume") and "--max-cost 5.0" in second
+    assert third.startswith("resume") and "--max-cost" not in third
+
+
 @pytest.mark.parametrize("end", ["fails 1", "refused 2", "dies 130"])
 def test_what_another_driver_cannot_help_ends(script: Script, end: str) -> None:
     assert script.run(end) == int(end.split()[1])
@@ -167,7 +176,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and those of nohup this one
 supervise._PROGRAM = (sys.executable, "-c", sys.argv[2])
 supervise._FIRST_S = 600.0
 say = lambda line: print(line, flush=True)
-sys.exit(supervise.supervise(supervise.Supervised(Path(sys.argv[1]), [], [], None, 3, say)))
+sys.exit(supervise.supervise(supervise.Supervised(Path(sys.argv[1]), [], [], [], None, 3, say)))
 """
 WAITS = """
 import os, signal, sys
