@@ -161,8 +161,11 @@ class RunState:
 
     def following(self, id: TaskId) -> tuple[tuple[TaskId, ...], ...]:
         """The stages from the blocks to the merge that make something of a task's model."""
-        begin = next((at for at, stage in enumerate(self.between, 1) if id in stage), 0)
-        return (*self.between[begin:], (MERGE,))
+        between = self.between
+        begins = [at for at, stage in enumerate(between, 1) if stage and stage[0].stage is id.stage]
+        if len(begins) > 1:  # by kind alone where that is enough: a pass has thousands of tasks
+            begins = [at for at in begins if id in between[at - 1]]
+        return (*between[begins[0] if begins else 0 :], (MERGE,))
 
     def joined(self, id: TaskId) -> bool:
         """Whether a task's model, or what stands for it, is already a part of another."""
@@ -389,9 +392,14 @@ def _interrupted(task: TaskState, time: float | None) -> TaskState:
 
 
 def _outdate(state: RunState, task: TaskId) -> RunState:
-    """A new model makes what was made of older ones worthless: unions, what trained on, the merge."""
-    follow = {EVAL, DELIVER, *state.measures, *(id for stage in state.following(task) for id in stage)}
-    return state if state.tasks.keys().isdisjoint(follow) else _without(state, follow)
+    """A new model makes what was made of older ones worthless: unions, what trained on, the merge.
+
+    Whatever follows it begins with the next stage, or with the merge if a limit has left out stages.
+    """
+    stages = state.following(task)
+    if MERGE not in state.tasks and state.tasks.keys().isdisjoint(stages[0]):
+        return state
+    return _without(state, {EVAL, DELIVER, *state.measures, *(id for stage in stages for id in stage)})
 
 
 def _without(state: RunState, tasks: set[TaskId]) -> RunState:

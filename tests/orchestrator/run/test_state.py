@@ -198,3 +198,30 @@ def test_rows_of_older_runs_are_read() -> None:
 def test_a_row_of_another_format_is_an_input_error(kind: str, text: str) -> None:
     with pytest.raises(InputError):
         from_json(kind, text)
+
+
+def test_a_replay_with_passes_looks_at_each_task_a_few_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each model of a block used to be compared with all tasks of all passes."""
+    looks, hashed = [0], TaskId.__hash__
+
+    def counted(id: TaskId) -> int:
+        looks[0] += 1
+        return hashed(id)
+
+    def looks_of(blocks: int) -> int:
+        faces = [TaskId.repair(face) for face in range(2 * blocks)]
+        plan = tuple(BlockPlan(block, 50, 1000, True) for block in range(blocks))
+        tasks = [*map(TaskId.block, range(blocks)), TaskId.union(0), *faces]
+        records: list[Record] = [
+            BEGAN,
+            model(COARSE),
+            PlanSaved("", plan, (tuple(map(str, faces)),), 0),
+            *map(model, tasks),
+        ]
+        stored = [Stored(number, 1.0, record) for number, record in enumerate(records)]
+        looks[0] = 0
+        replay(stored)
+        return looks[0]
+
+    monkeypatch.setattr(TaskId, "__hash__", counted)
+    assert looks_of(400) < 2.2 * looks_of(200)
