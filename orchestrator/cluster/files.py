@@ -13,6 +13,7 @@ import os
 import shutil
 import signal
 import socket
+import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -43,6 +44,8 @@ _READS = 4  # pieces of files that the server reads at a time
 _PIECE = 2**26  # bytes sent at a time: a merged model may be larger than the object store
 _SIGN_S = 20.0  # between two signs that files arrive
 _ANSWER_S = 5.0  # in which the server must answer, which reads pieces meanwhile
+_SPARE = 0.1  # of a disk, which copies leave free
+_RECENT_S = 600.0  # since its last use, in which a copy stays: its task may be about to open it
 _TIMEOUT_S = 10.0  # in which the machines must have removed their copies
 _RECEIVED: deque[int] = deque()  # bytes of each transfer to this process that no event has reported yet
 
@@ -128,6 +131,7 @@ class NodeFiles:
         copy.parent.mkdir(parents=True, exist_ok=True)
         with (copy.parent / "lock").open("w") as lock:  # of two tasks that want it at once one fetches
             fcntl.flock(lock, fcntl.LOCK_EX)
+            os.utime(copy.parent / "lock")  # when it was used last
             if not copy.is_file():
                 _make_room(copy, stamp.size)
                 self._fetch(path, stamp, copy)
@@ -271,14 +275,31 @@ def _digest(path: Path, stamp: Stamp) -> str:
 
 
 def _make_room(copy: Path, size: int) -> None:
-    """Removes copies of older versions of a file. Raises OSError if the disk has no room for the new one."""
+    """Removes copies of older versions of a file; while `_SPARE` of the disk is not free, also unused ones.
+
+    Raises OSError if the disk then has no room for the new one.
+    """
     of_path = copy.parent.name.partition("-")[0]
     for older in copy.parent.parent.glob(f"{of_path}-*"):
         if older != copy.parent:
             shutil.rmtree(older, ignore_errors=True)
+    wanted = size + int(_SPARE * shutil.disk_usage(copy.parent).total)
+    others = _unused(copy.parent) if shutil.disk_usage(copy.parent).free < wanted else []
+    while others and shutil.disk_usage(copy.parent).free < wanted:
+        shutil.rmtree(others.pop(0), ignore_errors=True)
     if (free := shutil.disk_usage(copy.parent).free) < size:
         missing = f"no room for a copy of {copy.name}: {size:,} bytes are needed and {free:,} are free"
         raise OSError(errno.ENOSPC, missing, str(copy))
+
+
+def _unused(folder: Path) -> list[Path]:
+    """The folders of other copies that no task has used for a while, the least recently used first."""
+    used = dict[Path, float]()
+    for other in folder.parent.iterdir():
+        with suppress(FileNotFoundError, NotADirectoryError):  # another task has removed it
+            used[other] = (other / "lock").stat().st_mtime
+    recent = time.time() - _RECENT_S
+    return sorted((it for it, when in used.items() if it != folder and when < recent), key=used.__getitem__)
 
 
 def _remove(cache: str) -> None:

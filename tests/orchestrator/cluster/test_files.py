@@ -3,10 +3,12 @@
 import os
 import shutil
 import signal
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import ray
@@ -125,6 +127,28 @@ def test_a_disk_without_room_for_a_copy_is_an_error_of_the_system(
     files = replace(share(image), cache="empty")
     with pytest.raises(OSError, match=r"a\.jpg: 256,000 bytes are needed and 255,999 are free"):
         files(image)
+
+
+def test_copies_leave_a_part_of_the_disk_free(
+    share: Share, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The least recently used go, as those of blocks that are done; what was used just now stays."""
+    size, copies = len(CONTENT), dict[int, Path]()
+
+    def usage(folder: Path) -> Any:  # of a disk for six files, which leaves room for five
+        used = size * sum(copy.exists() for copy in copies.values())
+        return real(folder)._replace(total=6 * size, free=6 * size - used)
+
+    real = shutil.disk_usage
+    monkeypatch.setattr(shutil, "disk_usage", usage)
+    for number in range(8):
+        path = tmp_path / f"{number}.jpg"
+        path.write_bytes(CONTENT)
+        copies[number] = replace(share(path), cache="bounded")(path)
+        hour = 3600 * (24 - number)
+        if number < 6 and number != 1:  # 1 is in use
+            os.utime(copies[number].parent / "lock", (time.time() - hour,) * 2)
+    assert [number for number, copy in copies.items() if copy.exists()] == [1, 4, 5, 6, 7]
 
 
 def test_a_large_file_comes_in_pieces(share: Share, image: Path, monkeypatch: pytest.MonkeyPatch) -> None:
