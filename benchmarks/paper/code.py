@@ -12,11 +12,11 @@ from pathlib import Path
 
 import panolog
 from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.info import fingerprint
 from panolog.workers.training.recipes import RECIPES
 
 _ROOT = Path(panolog.__file__).parent
 _PACKAGES = ("scene", "renderer", "partition", "workers", "orchestrator/driver")
-_SUFFIXES = (".py", ".cpp", ".h", ".cu", ".cuh")
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,7 @@ class Code:
 
 def present(root: Path = _ROOT) -> Code:
     """The code that a run would be trained with now. Args: root, the folder of the package."""
-    digest = sha256()
-    for package in _PACKAGES:
-        folder = (root / package).resolve()
-        for path in sorted(path for path in folder.rglob("*") if path.suffix in _SUFFIXES):
-            digest.update(f"{package}/{path.relative_to(folder)}\0".encode() + path.read_bytes() + b"\0")
-    sources = digest.hexdigest()[:12]
+    sources = fingerprint(_PACKAGES, root)
     return Code(sources, _commit(root, sources))
 
 

@@ -35,8 +35,10 @@ from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, Mess
 from panolog.orchestrator.resources.scaling import NO_GROWTH, Growth
 from panolog.orchestrator.resources.usage import Usage, with_usage
 from panolog.orchestrator.run import log
+from panolog.orchestrator.run.info import own_code
 from panolog.orchestrator.run.records import Failure
 from panolog.renderer.process import prepare
+from panolog.scene.errors import RunError
 from panolog.scene.files import Locate, here
 from panolog.scene.stores.cache import variables
 from panolog.workers import stopping
@@ -131,7 +133,7 @@ class RayPool:
             _generator_backpressure_num_objects=_UNREAD,
         )
         self._agents.start(placement.node)
-        self._running[spec.task] = _Task(placement, remote.remote(spec, placement.threads))
+        self._running[spec.task] = _Task(placement, remote.remote(spec, placement.threads, own_code()))
 
     @reported
     def stop(self, task: TaskId) -> None:
@@ -231,15 +233,25 @@ def _environment(placement: Placement) -> dict[str, Any] | None:
     return {"env_vars": names} if names else None
 
 
-def _run(spec: TaskSpec, threads: int) -> Iterator[Hello | Event | Calibration | Usage | Large]:
-    """What runs on the worker."""
+def _run(spec: TaskSpec, threads: int, code: str) -> Iterator[Hello | Event | Calibration | Usage | Large]:
+    """What runs on the worker. Args: code, the driver's."""
     os.environ["OMP_NUM_THREADS"] = str(threads)
     log.configure()
     prepare(threads)
     _send_tensors_as_arrays()
     stopping.listen()
     yield Hello(socket.gethostname(), os.getpid(), oom_kills())
-    yield from announced(with_usage(guarded(spec.task, run_remotely(spec))), _UNREAD)
+    yield from announced(with_usage(guarded(spec.task, _with_code(code, spec))), _UNREAD)
+
+
+def _with_code(code: str, spec: TaskSpec) -> Iterator[Event | Calibration | Usage]:
+    """What a spec yields. Raises RunError if the code is not the driver's: parts of a model would differ."""
+    if (own := own_code()) != code:
+        raise RunError(
+            f"{socket.gethostname()} has another PanoLOG than the driver (sources {own}, not {code}):"
+            " install the same version on all machines"
+        )
+    yield from run_remotely(spec)
 
 
 def _send_tensors_as_arrays() -> None:

@@ -6,6 +6,8 @@ import shutil
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import cache
+from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
@@ -21,6 +23,8 @@ from panolog.scene.files import SUFFIX
 from panolog.scene.model import NO_OFFSET, Vector
 
 _PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
+_ROOT = Path(__file__).parents[2]  # of the package, or of its checkout
+_SUFFIXES = (".py", ".cpp", ".h", ".cu", ".cuh")  # of sources
 PENDING = ""  # fingerprint of a scene that the run has still to make
 _FORERUNNERS = ("lock", "prepare", "store")  # what a driver or its mirror makes before run.json
 
@@ -146,3 +150,22 @@ def read_info(folder: RunFolder) -> RunInfo:
         raise RunFolderError(
             f"{folder.info}: is not of this PanoLOG's format: {key}: {first['msg']}"
         ) from error
+
+
+@cache
+def own_code() -> str:
+    """The fingerprint of what workers run, of the version that this process has started with."""
+    return fingerprint(("scene", "renderer", "partition", "workers"))
+
+
+def fingerprint(packages: Sequence[str], root: Path = _ROOT) -> str:
+    """Twelve hexadecimal digits for the sources of some packages, as they are on disk.
+
+    Args: root, the folder that has the packages.
+    """
+    digest = sha256()
+    for package in packages:
+        folder = (root / package).resolve()
+        for path in sorted(path for path in folder.rglob("*") if path.suffix in _SUFFIXES):
+            digest.update(f"{package}/{path.relative_to(folder)}\0".encode() + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:12]

@@ -161,11 +161,8 @@ class RunState:
 
     def following(self, id: TaskId) -> tuple[tuple[TaskId, ...], ...]:
         """The stages from the blocks to the merge that make something of a task's model."""
-        between = self.between
-        begins = [at for at, stage in enumerate(between, 1) if stage and stage[0].stage is id.stage]
-        if len(begins) > 1:  # by kind alone where that is enough: a pass has thousands of tasks
-            begins = [at for at in begins if id in between[at - 1]]
-        return (*between[begins[0] if begins else 0 :], (MERGE,))
+        begin = next((at for at, stage in enumerate(self.between, 1) if _has(stage, id)), 0)
+        return (*self.between[begin:], (MERGE,))
 
     def joined(self, id: TaskId) -> bool:
         """Whether a task's model, or what stands for it, is already a part of another."""
@@ -234,8 +231,7 @@ def _apply(state: RunState, stored: Stored) -> RunState:
     state = _with_money(_with_nodes(state, record, stored.time), stored)
     if isinstance(record, OfTask) and record.task is not None:
         task = state.task(record.task)
-        changes = _changes(task, record, stored.time)
-        if changes:
+        if changes := _changes(task, record, stored.time):
             state.tasks[task.id] = replace(task, **changes)
             state = replace(state, step="") if state.step else state
     return state
@@ -345,9 +341,8 @@ def _excuse(state: RunState, record: NodeQuarantined) -> None:
             losses=max(0, task.losses - losses),
             failures=tuple(failure for failure in task.failures if failure[0] != record.node),
         )
-    state.notices[Noticed(None, f"{record.host} ({record.node[:8]}) is in quarantine: {record.reason}")] = (
-        None
-    )
+    why = f"{record.host} ({record.node[:8]}) is in quarantine: {record.reason}"
+    state.notices[Noticed(None, why)] = None
 
 
 # A new driver may have other machines: earlier failures do not count.
@@ -367,16 +362,12 @@ def _request(task: TaskState, record: PauseRequested | UnpauseRequested | RetryR
 def _take_over(state: RunState, record: RunBegan, time: float) -> RunState:
     """Whatever another driver had running is waiting again, and what had failed gets new attempts."""
     end = record.previous or state.ended  # runs of older versions do not have the former
-    tasks = {
-        name: task
-        if task.status == Status.DONE
-        else replace(_interrupted(task, end), status=task.at_rest, **_FRESH)
-        for name, task in state.tasks.items()
-    }
+    left = {id: task for id, task in state.tasks.items() if task.status != Status.DONE}
+    fresh = {id: replace(_interrupted(it, end), status=it.at_rest, **_FRESH) for id, it in left.items()}
     away = (*state.away, (end, time)) if state.began is not None and end is not None else state.away
     began = time if state.began is None else state.began
     kept = {} if state.outcome == Outcome.FAILED and not state.transient else take_over(state.nodes)
-    state = replace(state, tasks=tasks, began=began, driver=record, away=away, nodes=kept)
+    state = replace(state, tasks=state.tasks | fresh, began=began, driver=record, away=away, nodes=kept)
     return replace(state, outcome=None, reason="", transient=False, ended=None, step="", waiting="")
 
 
@@ -391,13 +382,15 @@ def _interrupted(task: TaskState, time: float | None) -> TaskState:
     return replace(task, status=task.at_rest, spent=spent) if task.status == Status.RUNNING else task
 
 
-def _outdate(state: RunState, task: TaskId) -> RunState:
-    """A new model makes what was made of older ones worthless: unions, what trained on, the merge.
+def _has(stage: Sequence[TaskId], id: TaskId) -> bool:
+    """Whether a task is one of a stage; of a pass, which has thousands, by their kind."""
+    return id in stage[:1] or (len(stage) > 1 and stage[0].stage is id.stage)
 
-    Whatever follows it begins with the next stage, or with the merge if a limit has left out stages.
-    """
-    stages = state.following(task)
-    if MERGE not in state.tasks and state.tasks.keys().isdisjoint(stages[0]):
+
+def _outdate(state: RunState, task: TaskId) -> RunState:
+    """A new model makes what was made of older ones worthless: unions, what trained on, the merge."""
+    first, *_ = stages = state.following(task)
+    if MERGE not in state.tasks and state.tasks.keys().isdisjoint(first):  # then nothing else has begun
         return state
     return _without(state, {EVAL, DELIVER, *state.measures, *(id for stage in stages for id in stage)})
 

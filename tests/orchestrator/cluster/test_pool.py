@@ -76,6 +76,18 @@ def test_a_failure_says_of_which_kind_it_is_and_is_not_cancelled(
     assert (failed.kind, failed.reason[: len(reason)]) == (kind, reason)
 
 
+def test_a_machine_with_another_version_does_not_train(
+    pool: RayPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor one whose version was replaced during the run."""
+    monkeypatch.setattr("panolog.orchestrator.cluster.pool.own_code", lambda: "0123456789ab")
+    hello, failed = messages(pool, Works())
+    assert isinstance(hello, Hello)
+    assert isinstance(failed, Failed)
+    assert "has another PanoLOG than the driver (sources " in failed.reason
+    assert failed.reason.endswith("not 0123456789ab): install the same version on all machines")
+
+
 def test_a_kill_for_want_of_memory_is_told_from_others(
     pool: RayPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
