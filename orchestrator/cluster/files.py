@@ -43,7 +43,8 @@ _FOLDER = "panolog"  # in Ray's temporary folder
 _READS = 4  # pieces of files that the server reads at a time
 _PIECE = 2**26  # bytes sent at a time: a merged model may be larger than the object store
 _SIGN_S = 20.0  # between two signs that files arrive
-_ANSWER_S = 5.0  # in which the server must answer, which reads pieces meanwhile
+_ANSWER_S = 30.0  # in which the server must answer
+_ANSWERS = "answers"  # the concurrency group of these: they do not wait for what it reads
 _SPARE = 0.1  # of a disk, which copies leave free
 _RECENT_S = 600.0  # since its last use, in which a copy stays: its task may be about to open it
 _TIMEOUT_S = 10.0  # in which the machines must have removed their copies
@@ -76,8 +77,9 @@ class FileServer:
         process.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(process, str(os.getpid()).encode())
 
+    @ray.method(concurrency_group=_ANSWERS)
     def answer(self) -> None:
-        """Shows that it works."""
+        """Shows that it works, also while it reads."""
 
     def read(self, path: Path, stamp: Stamp, start: int, count: int) -> NDArray[np.uint8]:
         """At most `count` bytes of a file from `start` on. Raises RunError if it has changed or is gone."""
@@ -173,6 +175,9 @@ class FileSharing:
         self._cache = key_of(root)
         folder = Path(ray.get_runtime_context().get_temp_dir()) / _FOLDER
         self._process = folder / f"{self._cache}.server"  # a file with the id of the server's process
+        self._asked: tuple[Any, float] | None = (
+            None  # an answer of the server, and until when it must be here
+        )
 
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> NodeFiles:
         """What finds files of the scene, and files that the run has made.
@@ -183,7 +188,7 @@ class FileSharing:
             self._process.unlink(missing_ok=True)
             here = NodeAffinitySchedulingStrategy(self._home, soft=False)
             self._server = (
-                ray.remote(FileServer)
+                ray.remote(concurrency_groups={_ANSWERS: 1})(FileServer)  # type: ignore[call-overload]
                 .options(
                     num_cpus=0,
                     max_concurrency=_READS,
@@ -200,11 +205,24 @@ class FileSharing:
         stamps |= {path: Stamp.of(path, dated=True) for path in run}
         return NodeFiles(self._server, self._home, self._cache, stamps, stored)
 
-    def check(self) -> None:
-        """Ends the file server if it hangs: Ray starts it again, and repeats what was requested of it."""
-        if self._server is None or not self._process.exists():
+    def suspect(self) -> None:
+        """Requests an answer of the file server: a task has failed that may have waited for a file."""
+        if self._server is not None and self._process.exists() and self._asked is None:
+            self._asked = self._server.answer.remote(), time.monotonic() + _ANSWER_S
+
+    def review(self) -> None:
+        """Ends the file server if it is suspected and does not answer, without waiting for it.
+
+        Ray starts it again, and repeats what was requested of it.
+        """
+        if self._asked is None:
             return
-        if not ray.wait([self._server.answer.remote()], timeout=_ANSWER_S)[0]:
+        answer, until = self._asked
+        here, _ = ray.wait([answer], timeout=0)
+        if not here and time.monotonic() < until:
+            return
+        self._asked = None
+        if not here:
             with suppress(ProcessLookupError):
                 os.kill(int(self._process.read_text()), signal.SIGKILL)
 

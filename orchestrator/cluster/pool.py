@@ -165,6 +165,8 @@ class RayPool:
 
         Args: but, tasks that do not count: Ray fetches the messages of the others, so theirs stay remote.
         """
+        if self._sharing is not None:
+            self._sharing.review()
         others = {task: running for task, running in self._running.items() if task not in but}
         if not others:
             time.sleep(seconds)  # until a machine joins, which Ray does not report
@@ -212,7 +214,7 @@ class RayPool:
     def _forget(self, task: TaskId) -> None:
         del self._running[task]
         if self._sharing is not None:  # what the task has waited for may be a file
-            self._sharing.check()
+            self._sharing.suspect()
 
     def _killed_for_memory(self, task: _Task, error: RayError) -> bool:
         """Whether the kernel has killed a process of its machine, for want of memory, since it began."""

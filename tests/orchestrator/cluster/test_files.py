@@ -25,6 +25,7 @@ from panolog.scene.stores.store import Version
 from panolog.workers.events import Checkpoint, Event, Preview, Progress, Transfer
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.scripted import Scripted
+from tests.ray_head import wait_until
 
 pytestmark = pytest.mark.system
 
@@ -171,12 +172,28 @@ def test_a_file_that_has_changed_or_gone_is_refused(share: Share, image: Path) -
 
 
 def test_a_file_server_that_hangs_is_ended_and_another_one_serves(
-    share: Share, sharing: FileSharing, image: Path
+    share: Share, sharing: FileSharing, image: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    files = share(image)
+    """The driver does not wait for its answer, and one that answers stays."""
+    files, process = share(image), sharing._process.read_text
+    sharing.suspect()
     ray.get(files.server.answer.remote())
-    os.kill(int(sharing._process.read_text()), signal.SIGSTOP)
-    sharing.check()
+    first = process()
+
+    def answered() -> bool:
+        sharing.review()
+        return sharing._asked is None
+
+    wait_until(answered, "the answer")
+    assert process() == first
+    os.kill(int(first), signal.SIGSTOP)
+    sharing.suspect()
+    sharing.review()  # it has time
+    assert sharing._asked is not None
+    sharing._asked = None
+    monkeypatch.setattr(node_files, "_ANSWER_S", 0.0)
+    sharing.suspect()
+    sharing.review()
     assert files(image).read_bytes() == CONTENT
 
 
