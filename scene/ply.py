@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.scene.errors import PlyError
-from panolog.scene.files import StrPath, atomic
+from panolog.scene.files import StrPath, atomic, write_all
 from panolog.scene.gaussians import SH_REST, Gaussians
 from panolog.scene.model import NO_OFFSET, Vector
 from panolog.scene.ply_table import Table, exact_of, offset_of, read_table, sky_of
@@ -89,7 +89,7 @@ def write_ply_parts(
 
 def join_ply(
     path: Path,
-    parts: Sequence[tuple[Path, range]],
+    parts: Sequence[tuple[Path, range | NDArray[np.int64]]],
     *,
     sky: int,
     offset: Vector = NO_OFFSET,
@@ -99,7 +99,7 @@ def join_ply(
 
     Args:
         path: the file to appear.
-        parts: files that `write_ply` wrote, each with the rows to take (a range with step 1).
+        parts: files that `write_ply` wrote, each with the rows to take: a range with step 1, or (n,) numbers.
         sky: how many rows, at the end of all, are sky.
         offset: as in `write_ply`.
         exact: `Gaussians.exact` of all of them.
@@ -114,7 +114,10 @@ def join_ply(
             table = read_table(source)
             if table.dtype != _ROW:
                 raise PlyError(f"{source}: has other columns than PanoLOG writes; write it again")
-            _copy_rows(table, rows, file)
+            if isinstance(rows, range):
+                _copy_rows(table, rows, file)
+            else:
+                _copy_some(table, rows, file)
 
 
 def read_ply(path: StrPath) -> Gaussians:
@@ -209,6 +212,13 @@ def _copy_rows(table: Table, rows: range, file: FileIO) -> None:
             if not copied:
                 raise PlyError(f"{table.path}: truncated while it was read; copy it again")
             start += copied
+
+
+def _copy_some(table: Table, rows: NDArray[np.int64], file: FileIO) -> None:
+    """Appends single rows to an unbuffered file; of the others no more is read than shares their pages."""
+    records = np.memmap(table.path, table.dtype, "r", table.offset, (table.count,))
+    for start in range(0, len(rows), CHUNK):
+        write_all(file, memoryview(records[rows[start : start + CHUNK]].tobytes()))
 
 
 def _encode(part: Gaussians, rows: slice) -> NDArray[np.float32]:

@@ -1,5 +1,6 @@
 """The merge in a run: which files make up the final model."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -7,15 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Merged, ModelSaved, Noticed, Record
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.stages.scenes import save_captured
 from panolog.partition.cells import Volume
+from panolog.partition.contraction import contract
 from panolog.partition.districts import Districts
 from panolog.partition.plan import Plan
 from panolog.partition.regions import Regions
+from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.ply import (
@@ -191,20 +195,51 @@ def copy_coarse(folder: RunFolder) -> Merged:
 
 
 def _block_plys(folder: RunFolder, state: RunState, plan: Plan, early: Early | None = None) -> list[Path]:
-    """The files of all blocks that have Gaussians."""
-    return [_block_ply(folder, state, plan, int(block), early) for block in np.flatnonzero(plan.gaussians)]
+    """The files of all blocks that have Gaussians; made from Stage I for those not trained, or in vain."""
+    blocks: list[int] = np.flatnonzero(plan.gaussians).tolist()
+    found = {block: _trained_ply(folder, state, plan, block, early) for block in blocks}
+    _keep_coarse(folder, plan, [block for block, path in found.items() if path is None])
+    return [path or folder.kept(block) for block, path in found.items()]
 
 
-def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int, early: Early | None) -> Path:
-    """The latest file of a block; made from the Stage I model if the block was not trained, or in vain."""
+def _trained_ply(
+    folder: RunFolder, state: RunState, plan: Plan, block: int, early: Early | None
+) -> Path | None:
+    """The latest file of a block; None if it keeps Stage I."""
     for task in (TaskId.round(block), TaskId.block(block)):
         if state.status(task) == Status.DONE:
             return folder.model(task)
     if early is not None and early.uses(folder, state, task):
         return write_saved(folder, task, early.scene, plan.cell(block), early.least)
-    coarse, cell, path = folder.model(COARSE), plan.cell(block), folder.kept(block)
-    _write(path, lambda: _kept(coarse, cell), 0, coarse)
-    return path
+    return None
+
+
+def _keep_coarse(folder: RunFolder, plan: Plan, blocks: Sequence[int]) -> None:
+    """Writes what the Stage I model has in the cells of some blocks, after one look at all of it.
+
+    Raises RunError if a Gaussian has a position that is not finite.
+    """
+    if not blocks:
+        return
+    coarse = folder.model(COARSE)
+    labels = np.concatenate([_labels(piece, plan) for piece in read_ply_chunks(coarse)])
+    offset, exact = ply_offset(coarse), ply_exact(coarse)
+    for block in blocks:
+        path = folder.kept(block)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        join_ply(path, [(coarse, np.flatnonzero(labels == block))], sky=0, offset=offset, exact=exact)
+
+
+def _labels(piece: Gaussians, plan: Plan) -> NDArray[np.int64]:
+    """(N,) the block of each Gaussian; -1 for what no block keeps: sky, and what is fully transparent."""
+    labels = np.full(len(piece), -1)
+    seen = (piece.opacities[piece.scene] > -math.inf).numpy()
+    try:
+        blocks = plan.grid.block_of(contract(piece.means[piece.scene].numpy(), plan.aabb))
+    except ValueError as error:
+        raise RunError(f"the Stage I model cannot be cut: {error}") from error
+    labels[piece.scene] = np.where(seen, blocks, -1)
+    return labels
 
 
 def _kept(coarse: Path, cell: Volume) -> Iterator[Gaussians]:
