@@ -11,7 +11,7 @@ With affine projection it takes 6 % less, which is not counted:
     screen position, and its gradient          8 + 8
     tiles met, where they end, state, depth       17    and of a pair of a splat and a tile 5
     statistics of densification                    8
-    units of positions                            12
+    units of two rates                             8
 
 Each moment is a sum of such terms, and the need is that of the largest one. A densification holds the old and
 the new parameters or moments of one kind at a time, without gradients: less than an iteration.
@@ -32,7 +32,7 @@ CONTEXT = 512 * 2**20
 # at 1024 x 512 (here 4.0), 8 at 2048 x 1024 (10), 23 at 4096 x 2048 (34).
 _PAIRS, _PAIRS_OF_PIXEL = 2.0, 0.4
 
-_STATE = 3 * VALUES + 8 + 12  # parameters, moments, statistics, units of positions
+_STATE = 3 * VALUES + 8 + 8  # parameters, moments, statistics, units of two rates
 _SPLAT = 64 + 64 + 4  # and its rays, and the number of its tiles
 _IMAGES = 12 + 4 + 4  # colour, alpha, inverse depth
 _VIEW = 3 + 1 + 1 + 4  # a panorama with its layers

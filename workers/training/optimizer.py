@@ -43,7 +43,11 @@ class ModelState:
             Gaussians(**{name: tensors[name] for name in names}, sky=int(tensors["sky"]), exact=exact),
             {name: tensors[f"{MOMENT}{name}"] for name in names},
             {name: tensors[f"exp_avg_sq.{name}"] for name in names},
-            {name.removeprefix(UNITS): it for name, it in tensors.items() if name.startswith(UNITS)},
+            {
+                name.removeprefix(UNITS): it if it.dim() == 1 else it[:, 0].contiguous()  # in older ones
+                for name, it in tensors.items()
+                if name.startswith(UNITS)
+            },
         )
 
     def tensors(self) -> dict[str, Tensor]:

@@ -48,7 +48,7 @@ class Place:
     """Where a task may grow."""
 
     cell: Volume | None  # of a block
-    start: int  # scene Gaussians inside before the first iteration
+    start: int  # what the budget follows: `Trainer.start`
     pixels: int  # of a panorama
     centers: Floats  # (K, 3) of the task's cameras, world units
 

@@ -172,10 +172,9 @@ class Schedule:
         """Learning rates by parameter; those of means and of SH of higher degrees in `ModelState.units`."""
         rates, rate = self.config.optimizer, self.config.stage2.rate if self.refine else 1.0
         shapes, colors = rate * self.length, rate * math.sqrt(self.length)
+        unit = 1.0 if rates.unit == "distance" else self.extent
         return {
-            "means": self.length**2
-            * self.position(iteration)
-            * (1 if rates.unit == "distance" else self.extent),
+            "means": self.length**2 * self.position(iteration) * unit,
             "quats": shapes * rates.rotation,
             "scales": shapes * rates.scale,
             "opacities": rates.opacity * rate,

@@ -150,7 +150,7 @@ class Trainer:
         self.iteration = 0
         self.state: ModelState
         self.statistics: Statistics
-        self.start = 0  # scene Gaussians of the cell before the first iteration
+        self.start = 0  # what the budget follows: sparse points, or scene Gaussians that a cell begins with
 
     def begin(self) -> Iterator[Progress]:
         """Start from points and the sky (Stage I) or the Stage I model (Stage II), with signs of work."""
