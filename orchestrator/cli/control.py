@@ -19,8 +19,9 @@ def stop(run: RunArg) -> None:
     from panolog.orchestrator.run.folder import RunFolder
 
     _request(run, "stop")
+    folder = RunFolder(run)
     with progress_bar("waiting until the checkpoints are written"):
-        while lock.held(RunFolder(run).lock):
+        while lock.held(folder.lock) or lock.held(folder.supervisor):
             time.sleep(_POLL)
     say(f"stopped; {command('resume', run)} resumes it")
 

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from typing import Any
 from panolog.orchestrator.preparation.notes import result_path
 from panolog.orchestrator.preparation.settings import Step
 from panolog.orchestrator.resources.children import bound_to_parent, signals_blocked
+from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.folder import RunFolder, command_line
 from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.run.state import RunState, Status, replay
@@ -30,7 +31,7 @@ from panolog.scene.errors import RunFolderError
 from panolog.workers.tasks import TaskId
 
 _PROGRAM = (sys.executable, "-m", "panolog.orchestrator.cli")
-_POLL_S = 1.0  # between two looks at the driver, should its end not be reported
+_POLL_S = 1.0  # between two looks at the driver, should its end not be reported, and at requests
 _FIRST_S, _LONGEST_S = 2.0, 300.0  # pauses before a resume: twice as long after each without progress
 _HEAD_S, _HEAD_POLL_S = 1800.0, 2.0  # that the head of a lost cluster gets to come back; between two looks
 _CONNECT_S = 10.0  # in which a head must answer
@@ -134,10 +135,12 @@ class _Supervisor:
         return taken.si_signo
 
     def _wait(self, seconds: float) -> None:
-        """Waits so long, or until a request to stop."""
-        end = time.monotonic() + seconds
-        while not self.stopping and (left := end - time.monotonic()) > 0:
-            self._taken(left)
+        """Waits so long, or until a request to stop: by a signal, or as `panolog stop` leaves one."""
+        folder, end = RunFolder(self.run.root), time.monotonic() + seconds
+        with lock.hold(folder.supervisor) if folder.control.is_dir() else nullcontext():
+            while not self.stopping and (left := end - time.monotonic()) > 0:
+                self._taken(min(left, _POLL_S))
+                self.stopping = self.stopping or control.stop_requested(folder)
 
     def _head_answers(self) -> bool:
         """Waits for the head of the cluster, but not for ever. True if it answers, or need not."""

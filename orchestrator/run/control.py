@@ -12,6 +12,7 @@ import secrets
 import stat
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -94,7 +95,7 @@ def request(action: Any, block: Any = None, node: Any = None) -> ControlRequest:
 
 def allowed(folder: RunFolder) -> str | None:
     """Why the run takes no requests now; None if it does."""
-    if not lock.held(folder.lock):
+    if not lock.held(folder.lock) and not lock.held(folder.supervisor):
         return "no driver is at work on the run"
     if not folder.control.is_dir():
         return "its driver takes no requests yet"
@@ -127,6 +128,18 @@ def take(folder: RunFolder) -> list[ControlRequest | Noticed]:
     except FileNotFoundError:
         return []
     return [_take_one(folder, name) for name in names]
+
+
+def stop_requested(folder: RunFolder) -> bool:
+    """Whether a stop is among the requests that no driver has taken. Takes none.
+
+    Raises OSError if they cannot be read.
+    """
+    for path in folder.control.glob("*.json"):
+        with suppress(InputError, ValueError, FileNotFoundError):
+            if _parse(_content(path)).action == Action.STOP:
+                return True
+    return False
 
 
 def begin(folder: RunFolder) -> list[Noticed]:

@@ -52,6 +52,11 @@ class RunFolder:
         return self.root / "lock"
 
     @property
+    def supervisor(self) -> Path:
+        """What a supervisor has locked while it waits before a resume."""
+        return self.root / "supervisor"
+
+    @property
     def presence(self) -> Path:
         """What the live driver says without its database."""
         return self.root / "driver"

@@ -12,9 +12,13 @@ import pytest
 
 from panolog.orchestrator.commands import supervise
 from panolog.orchestrator.commands.supervise import Supervised, cause
+from panolog.orchestrator.run import control, lock
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Outcome, RunBegan
 from panolog.orchestrator.run.state import RunState, ignore
+from panolog.orchestrator.run.store import Database
 from tests.orchestrator.cli.program import call, one_line
+from tests.ray_head import wait_until
 
 # A driver that records its beginning, perhaps a checkpoint and its end, and then ends as its line says.
 DRIVER = """
@@ -210,6 +214,20 @@ def test_a_stop_between_two_drivers(tmp_path: Path) -> None:
     process.terminate()
     assert process.communicate(timeout=300)[0].split()[0] == "stopped;"
     assert process.returncode == 130
+
+
+def test_panolog_stop_between_two_drivers(tmp_path: Path) -> None:
+    """It was refused, as no driver was at work, and then the run was resumed."""
+    folder = RunFolder(tmp_path)
+    folder.info.write_text('{"scene": {"path": "scene"}, "config": {"width": 64}}')
+    Database(folder.database).close()
+    control.begin(folder)
+    process, _ = launch(tmp_path, "import os; os.kill(os.getpid(), 9)")
+    wait_until(lambda: lock.held(folder.supervisor), "its pause")
+    assert call("stop", tmp_path).exit_code == 0
+    assert process.communicate(timeout=300)[0].split()[0] == "stopped;"
+    assert process.returncode == 130
+    assert "no driver is at work" in one_line(call("stop", tmp_path))
 
 
 def test_a_supervisor_that_is_killed_stops_its_driver(tmp_path: Path) -> None:
