@@ -119,9 +119,7 @@ def live(paths: Paths, load: Load, epoch: float, now: float, number: int) -> Non
         clock.on_tick, cluster.on_message = world.on_tick, world.on_message
         journal.on_change = world.on_change
         try:
-            Driver(
-                Job(folder, scene_of(info, folder), info.config), journal, cluster, stop=Stop(), clock=clock
-            ).run()
+            Driver(Job(folder, scene_of(info, folder), info.config), journal, cluster, stop=Stop()).run()
         except KeyboardInterrupt:
             raise SystemExit(STOPPED) from None
         finally:

@@ -27,7 +27,6 @@ from panolog.orchestrator.resources.delivery import Large, payload
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
 from panolog.orchestrator.resources.usage import Usage
-from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.money.records import BudgetReached
 from panolog.orchestrator.run.presence import Presence
@@ -99,12 +98,11 @@ class Driver:
         pool: Pool,
         hooks: Hooks | None = None,
         stop: Stop | None = None,
-        clock: Clock = CLOCK,
     ) -> None:
         self._job = job
         self._journal = journal
         self._pool = pool
-        self._clock = clock
+        self._clock = clock = journal.clock
         self._hooks = hooks or Hooks()
         self._stop = stop or Stop()
         self._specs = Specs(job, pool)

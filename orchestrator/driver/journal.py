@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from panolog.orchestrator.run import lock
-from panolog.orchestrator.run.clock import CLOCK, Clock
+from panolog.orchestrator.run.clock import CLOCK, Clock, Steady
 from panolog.orchestrator.run.presence import Presence, why_waiting
 from panolog.orchestrator.run.reading import TIMEOUT_S
 from panolog.orchestrator.run.records import (
@@ -117,14 +117,14 @@ class Backlog:
 class Journal:
     """The only way in which a driver changes the state of its run."""
 
-    def __init__(self, database: Database, on_change: OnChange = ignore, clock: Clock = CLOCK) -> None:
-        """Args: on_change, called after each record that is stored, and often without one."""
+    def __init__(self, database: Database, on_change: OnChange = ignore, clock: Clock | None = None) -> None:
+        """Args: on_change, called after each record that is stored, often without; clock, the driver's."""
         self.database = database
         self.on_change = on_change
         self.state: RunState = replay(database.milestones())
         self.patience: Patience | None = None  # without one every error is raised at once
-        self._clock = clock
-        self._backlog = Backlog(database, clock)
+        self.clock = clock or Steady()
+        self._backlog = Backlog(database, self.clock)
         self._since: float | None = None  # Clock.monotonic() from which on the disk has taken nothing
 
     def record(self, records: Sequence[Record]) -> None:
@@ -169,7 +169,7 @@ class Journal:
         """Shows that the run waits, if an error has a reason that may pass; else returns False."""
         if self.patience is None or not (reason := why_waiting(error, self.patience.root, size)):
             return False
-        self._since = self._clock.monotonic() if self._since is None else self._since
+        self._since = self.clock.monotonic() if self._since is None else self._since
         if reason != self.state.waiting:
             _LOG.info("%s", reason)
             self.patience.presence.say(reason)
@@ -184,7 +184,7 @@ class Journal:
         """Records that the disk takes data again."""
         if self._since is None or self.patience is None:
             return
-        seconds, self._since = self._clock.monotonic() - self._since, None
+        seconds, self._since = self.clock.monotonic() - self._since, None
         _LOG.info("the disk takes data again, after %.0f s", seconds)
         self.patience.presence.say("")
         self.record([RunContinued(seconds)])
@@ -193,4 +193,4 @@ class Journal:
         for _ in range(math.ceil(patience.seconds / _STEP_S)):
             patience.poll()
             self.on_change(self.state, ())
-            self._clock.sleep(min(_STEP_S, patience.seconds))
+            self.clock.sleep(min(_STEP_S, patience.seconds))

@@ -18,3 +18,30 @@ class Clock(Protocol):
 
 
 CLOCK: Clock = time
+_JUMP_S = 60.0  # by which the clock of the machine may be adjusted
+
+
+class Steady:
+    """The time of one driver: that of its machine, as long as it does not jump.
+
+    From then on it is the time of the begin and the seconds since, so that neither a clock that is set nor a
+    machine that sleeps makes a run reach a limit. The next driver begins with the machine's clock again.
+    """
+
+    def __init__(self, clock: Clock = CLOCK) -> None:
+        """Begins now. Args: clock, of the machine."""
+        self._clock = clock
+        self._began = clock.time() - clock.monotonic()
+
+    def time(self) -> float:
+        """Seconds since the epoch, for records."""
+        steady, now = self._began + self._clock.monotonic(), self._clock.time()
+        return now if abs(now - steady) < _JUMP_S else steady
+
+    def monotonic(self) -> float:
+        """Seconds that never jump, for durations."""
+        return self._clock.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Waits where nothing reports an end."""
+        self._clock.sleep(seconds)

@@ -246,7 +246,7 @@ class Harness:
         with closing(database(self.folder.database, self.clock)) as opened:
             opened.append([RunBegan("host", 1, resumed)])
             journal = Journal(opened, on_change, self.clock)
-            return Driver(self.job, journal, pool, hooks, self.stop, self.clock).run()
+            return Driver(self.job, journal, pool, hooks, self.stop).run()
 
     def at(self, root: Path) -> "Harness":
         """A harness of this job in another run folder."""
