@@ -114,7 +114,7 @@ class Driver:
         self._presence = Presence(job.folder.presence)
         retry = job.config.disk.retry
         self._requests = Requests(job.folder, journal, self._stop)
-        journal.patience = Patience(job.folder.root, retry, self._presence, self._requests.poll)
+        journal.patience = Patience(job.folder.root, retry, self._presence, self._while_it_waits)
         self._writers = Writers(self._save, journal, retry, clock)
         self._machines = Machines(pool, journal, job, clock)
         self._purse = Purse(journal, clock)
@@ -141,8 +141,7 @@ class Driver:
         Raises InputError if a worker found the input wrong, unless for a block, RunError if the run failed.
         Any end is recorded, also by another error; that by a full disk, if it still takes that.
         """
-        root = self._job.folder.root
-        resume = command_line("resume", root)
+        resume = command_line("resume", root := self._job.folder.root)
         try:
             with end_recorded(self._journal):
                 self._journal.record(self._journal.until_done(lambda: tidy(self._job.folder, self._state)))
@@ -177,6 +176,11 @@ class Driver:
             if (reached := self._purse.reached(saving, self._machines.idle)) is not None:
                 self._end_training(reached)
         return end
+
+    def _while_it_waits(self) -> None:
+        """A wait for the disk outlasts neither a request to stop nor a limit. Raises as both."""
+        self._requests.poll()
+        self._purse.require(self._machines.idle)
 
     def _end_training(self, reached: BudgetReached) -> None:
         """Ends all tasks with fresh checkpoints: what follows is made of what there is."""

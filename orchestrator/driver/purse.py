@@ -28,7 +28,7 @@ from panolog.orchestrator.run.money.records import (
 from panolog.orchestrator.run.records import Record, TaskFailed
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.units import duration
-from panolog.scene.errors import ConfigError
+from panolog.scene.errors import ConfigError, RunError
 from panolog.workers.tasks import MERGE, Stage
 
 _AFTER = (Stage.MERGE, Stage.MEASURE, Stage.EVAL, Stage.DELIVER)  # the stages after the training
@@ -150,6 +150,12 @@ class Purse:
             self._journal.record([found])
             return None
         return found
+
+    def require(self, idle: float | None = None) -> None:
+        """Raises RunError at a limit while the disk takes nothing: the run ends. Args: as `verdict`."""
+        found = verdict(self._journal.state, self._clock.time(), 0.0, idle)
+        if isinstance(found, BudgetReached):
+            raise RunError(f"{self._journal.state.waiting}, and {found.reason}")
 
     def with_lost(self, records: Sequence[Record]) -> list[Record]:
         """Records, and before each failure what is lost by it."""

@@ -1,5 +1,6 @@
 """A driver with limits of cost and time, by a clock that the test sets."""
 
+import errno
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -9,11 +10,13 @@ from typing import Any
 import pytest
 import torch
 
+from panolog.orchestrator.driver import driver, saving
 from panolog.orchestrator.driver.purse import require_enough, verdict
 from panolog.orchestrator.estimates.costs import slowness
 from panolog.orchestrator.money.losses import lost_with_driver
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.scaling import STARTUP_S
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.money.records import (
     BudgetNear,
     BudgetReached,
@@ -24,9 +27,10 @@ from panolog.orchestrator.run.money.records import (
 from panolog.orchestrator.run.records import Outcome, PreflightSaved, Record, RunBegan, Stored
 from panolog.orchestrator.run.state import Status, replay
 from panolog.orchestrator.run.store import Database
-from panolog.scene.errors import ConfigError
+from panolog.scene.errors import ConfigError, RunError
+from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
-from panolog.workers.events import Checkpoint, Event, Progress
+from panolog.workers.events import Checkpoint, Event, Preview, Progress
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, MERGE, TaskId
 from panolog.workers.training.optimizer import ModelState
@@ -80,6 +84,34 @@ def saved(spec: TrainSpec, iteration: int = 20_000) -> Checkpoint:
     gaussians = trained(spec)
     darker = replace(gaussians, sh0=gaussians.sh0 - 7)
     return Checkpoint(spec.task, iteration, ModelState.start(darker).tensors())
+
+
+def test_a_limit_is_not_outlasted_by_a_wait_for_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that was full for eight hours cost eight hours of all machines, whatever the limit."""
+    harness, real = Limited(tmp_path, BudgetSet(max_cost=100.0, prices=PRICES)), saving.save
+    full = harness.clock.time() + 8 * 3600
+
+    def save(folder: RunFolder, event: Event, scene: Scene, keep: int = 1) -> Record:
+        if isinstance(event, Preview) and harness.clock.time() < full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(folder, event, scene, keep)
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == COARSE:
+            harness.passes(10)
+            yield Progress(COARSE, 1, 2, 3.0)
+            yield Preview(COARSE, 1, "a.jpg", b"picture")
+        yield from well(spec)
+
+    monkeypatch.setattr(driver, "save", save)
+    with pytest.raises(RunError, match=r"space.*, and the limit of 100 USD is reached"):
+        harness.drive(script)
+    assert 85 <= harness.state.money.used.cost <= 100
+    harness.passes(full - harness.clock.time())
+    harness.begin(BudgetSet(max_cost=1e6, prices=PRICES))
+    assert harness.drive(script, resumed=True).outcome == "done"
 
 
 def test_a_limit_merges_what_there_is_and_a_higher_one_completes_the_run_with_the_same_bytes(
