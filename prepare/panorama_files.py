@@ -1,5 +1,6 @@
 """The panoramas of an unfinished scene: files of images and layers, before it can be read as a scene."""
 
+import os
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from panolog.scene.files import natural_key, stem_of
 from panolog.scene.image_files import decode, decode_used, decode_with_alpha, read_info
 from panolog.scene.read import check_names, image_folder, model_folder
 
+_ADDED = ("@eaDir", "__MACOSX")  # folders of Synology's thumbnails and of macOS's archives
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
 In = TypeVar("In")
 Out = TypeVar("Out")
@@ -40,8 +42,18 @@ class PanoramaFile:
 
 
 def find_image_files(folder: Path) -> list[Path]:
-    """The image files below a folder, in the natural order of their paths."""
-    found = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    """The image files below a folder, in the natural order of their paths, also behind links to folders.
+
+    Without what systems add: hidden files, such as macOS's `._NAME.jpg`, and thumbnails of network disks.
+    """
+    found, seen = list[Path](), set[Path]()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        here = Path(place)
+        known = here.resolve() in seen  # a link to a folder above
+        seen.add(here.resolve())
+        folders[:] = [] if known else [it for it in folders if not it.startswith(".") and it not in _ADDED]
+        files = [here / name for name in names if not known and not name.startswith(".")]
+        found += [path for path in files if path.suffix.lower() in SUFFIXES and path.is_file()]
     return sorted(found, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
 
 

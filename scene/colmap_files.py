@@ -9,6 +9,7 @@ import mmap
 import struct
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -241,15 +242,12 @@ def _text_cameras(path: Path) -> Iterator[ColmapCamera]:
 
 
 def _text_images(path: Path, observations: bool) -> Iterator[ImageRecord]:
-    """Every image has two lines: its pose, then its points, which may be empty."""
-    lines = _lines(path)
-    for where, line in _records(lines):
+    for where, line, below, second in _image_lines(path):
         words = line.split(None, 9)
         if len(words) < 10:
             raise SceneError(f"{where}: cannot read the image line `{line[:60]}`; export the model again")
         pose = _numbers(where, words[1:8])
         number, camera = _numbers(where, [words[0], words[8]])
-        below, second = next(lines, (where, ""))
         if "\ufffd" in words[9]:
             raise SceneError(f"{where}: the image name `{_ascii(words[9])}` is not UTF-8; rename it")
         entries = second.split()
@@ -262,8 +260,38 @@ def _text_images(path: Path, observations: bool) -> Iterator[ImageRecord]:
         yield ImageRecord(int(number), words[9], int(camera), pose, values[:, :2], ids)
 
 
+def _image_lines(path: Path) -> Iterator[tuple[str, str, str, str]]:
+    """Where and what the lines of each image are: its pose, then its points, which may be empty.
+
+    Some programs write no line for the points; they are empty then.
+    """
+    lines = _lines(path)
+    pose = next(_records(lines), None)
+    while pose is not None:
+        below = next(lines, (pose[0], ""))
+        if _is_image(below[1]):
+            yield *pose, below[0], ""
+            pose = below
+        else:
+            yield *pose, *below
+            pose = next(_records(lines), None)
+
+
+def _is_image(line: str) -> bool:
+    """Whether a line is of an image, which has a name, and not of points, which are triples of numbers."""
+    words = line.split()
+    return len(words) > 9 and (not _is_number(words[9]) or len(words) == 10)
+
+
+def _is_number(word: str) -> bool:
+    with suppress(ValueError):
+        float(word)
+        return True
+    return False
+
+
 def _text_points(path: Path) -> PointRecords:
-    found = PointRecords()
+    found, colors = PointRecords(), array("f")
     for where, line in _records(_lines(path)):
         words = line.split()
         number, *position, red, green, blue = _numbers(where, words[:7]) if len(words) > 6 else [-1.0] * 4
@@ -276,15 +304,23 @@ def _text_points(path: Path) -> PointRecords:
             raise SceneError(f"{where}: the track of point {int(number)} is damaged") from error
         if len(track) % 2:
             raise SceneError(f"{where}: the track of point {int(number)} is truncated")
-        found.add(int(number), position, map(int, color), track.tobytes())
+        colors.extend(color)
+        found.add(int(number), position, (), track.tobytes())
+    found.colors = _bytes_of(np.asarray(colors))
     return found
+
+
+def _bytes_of(colors: NDArray[np.float32]) -> bytearray:
+    """Colours of a text model as bytes; some programs write them from 0 to 1."""
+    fractions = len(colors) and colors.max() <= 1 and (colors % 1).any()
+    return bytearray((np.rint(255 * colors) if fractions else colors).astype(np.uint8).tobytes())
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
     """("PATH: line N", line without its end) of a text file."""
     if path.stat().st_size > _LONGEST_TEXT:
         raise SceneError(f"{path}: too large to be read safely as text; convert the model to binary")
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), ""), start=1):
             if len(line) == _LONGEST_LINE:
                 raise SceneError(f"{path}: line {number} is not terminated; export the model again")

@@ -11,6 +11,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeAlias
 
@@ -20,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from panolog.scene.errors import ConfigError
+from panolog.scene.errors import ConfigError, ImageError
 from panolog.scene.files import Locate, here
 from panolog.scene.image_files import decode, decode_used, decode_with_alpha, resize, resize_used
 from panolog.scene.model import Panorama, Scene
@@ -30,6 +31,7 @@ MOST_THREADS = 8  # for a GPU: each holds a pinned view and has one more on the 
 PASSING = 2  # views on a GPU beyond one for each thread: the one in use, and a preview's
 _ALIGNMENT = 16  # bytes between beginnings of layers, a multiple of every element
 _LAYERS = ("image", "mask", "sky", "inverse_depth", "exposure")
+_HALF = 128  # of a mask, from which on it is white
 CURVE, TOE = 2.4, 0.055  # of sRGB (IEC 61966-2-1), above its linear part
 _LOG = logging.getLogger(__name__)
 
@@ -311,8 +313,8 @@ def _load_layers(
         used = given if used is None else given & used
     mask = None if used is None else torch.from_numpy(used)
     if panorama.sky_mask:
-        foreground = decode(locate(panorama.sky_mask), cv2.IMREAD_GRAYSCALE)
-        sky = torch.from_numpy(resize(foreground, size) < 128)
+        foreground = _foreground(locate(panorama.sky_mask))
+        sky = torch.from_numpy(resize(foreground, size) < _HALF)
     if panorama.depth:
         raw = decode(locate(panorama.depth), cv2.IMREAD_UNCHANGED)
         depth = torch.from_numpy(_resize_depth(raw, size))
@@ -322,6 +324,18 @@ def _load_layers(
         mask = still if mask is None else mask & still
     exposure = None if panorama.exposure is None else exposure_affine(torch.from_numpy(panorama.exposure))
     return View(row, torch.zeros((0, 0, 3), dtype=torch.uint8), mask, sky, depth, exposure)
+
+
+def _foreground(path: Path) -> NDArray[np.uint8]:
+    """A sky mask, 255 or 1 = no sky. Raises ImageError for a map of classes, where all would be sky."""
+    values = decode(path, cv2.IMREAD_GRAYSCALE)
+    most = int(values.max())
+    if 1 < most < _HALF:
+        raise ImageError(
+            f"{path}: its largest value is {most}, so all of it would be sky: in a sky mask that is 0"
+        )
+    foreground: NDArray[np.uint8] = 255 * values if most == 1 else values
+    return foreground
 
 
 def _resize_depth(raw: NDArray[np.uint16], size: tuple[int, int]) -> NDArray[np.float32]:

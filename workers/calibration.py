@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from panolog.renderer import ops
-from panolog.scene.images import load_view, view_bytes
+from panolog.scene.errors import SceneError
+from panolog.scene.images import View, load_view, view_bytes
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
 from panolog.workers.evaluation import evaluate_view
@@ -77,6 +78,7 @@ def calibrate(spec: CalibrateSpec) -> Iterator[Progress | Calibration]:
     each = view_bytes(scene.panoramas[views[0]], spec.width)
     started = time.monotonic()
     with open_cache(spec, scene, views, len(views) * each) as cache:
+        _require_pixels(scene, [cache.get(row) for row in views])
         trainer = Trainer(trial, scene, cache)
         yield from trainer.begin()
         begin = time.monotonic() - started
@@ -103,6 +105,15 @@ def calibrate(spec: CalibrateSpec) -> Iterator[Progress | Calibration]:
         single=single,
         look=evaluation,
     )
+
+
+def _require_pixels(scene: Scene, views: Sequence[View]) -> None:
+    """Raises SceneError if nothing of any of the views is used."""
+    if all(view.mask is not None and not bool(view.mask.any()) for view in views):
+        raise SceneError(
+            f"{scene.root}: the masks leave nothing of {len(views)} panoramas that were looked at: white is"
+            " used, black is left out"
+        )
 
 
 def _decode_seconds(spec: CalibrateSpec, scene: Scene) -> float:

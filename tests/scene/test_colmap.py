@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 
 from panolog.scene.colmap import read_panoramas, write_colmap
+from panolog.scene.colmap_files import read_cameras, read_image_records, read_point_records
 from panolog.scene.errors import InputError
 from panolog.scene.files import atomic
 from tests.data import shared
@@ -140,6 +141,51 @@ def patch(folder: Path, name: str, at: int, data: bytes) -> None:
     content = bytearray((folder / name).read_bytes())
     content[at : at + len(data)] = data
     (folder / name).write_bytes(content)
+
+
+def lines_of(path: Path) -> list[str]:
+    """Without comments."""
+    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
+
+
+def without_lines_of_points(folder: Path) -> None:
+    """images.txt with one line for each image, whose names have spaces, as some programs write it."""
+    as_text(folder)
+    poses = lines_of(folder / "images.txt")[::2]
+    (folder / "images.txt").write_text("\n".join(line.replace("pano_", "A B ") for line in poses) + "\n")
+
+
+def test_no_image_is_lost_without_lines_of_points(folder: Path) -> None:
+    """The second of two was read as the points of the first where its words are triples."""
+    expected = [
+        image.name.replace("pano_", "A B ") for image in read_image_records(folder, observations=False)
+    ]
+    without_lines_of_points(folder)
+    for observations in (False, True):
+        found = list(read_image_records(folder, observations=observations))
+        assert sorted(image.name for image in found) == sorted(expected)
+        assert not any(len(image.points) for image in found)
+
+
+def test_colours_from_0_to_1_are_as_bright_as_bytes(folder: Path) -> None:
+    expected = read_point_records(folder)
+    as_text(folder)
+    rows = [line.split() for line in lines_of(folder / "points3D.txt")]
+    scaled = [[*row[:4], *(f"{int(it) / 255:.4f}" for it in row[4:7]), *row[7:]] for row in rows]
+    (folder / "points3D.txt").write_text("\n".join(map(" ".join, scaled)) + "\n")
+    found = read_point_records(folder)
+    colors = {number: found.colors[3 * i : 3 * i + 3] for i, number in enumerate(found.ids)}
+    assert colors == {n: expected.colors[3 * i : 3 * i + 3] for i, n in enumerate(expected.ids)}
+
+
+def test_a_byte_order_mark_is_no_part_of_a_model(folder: Path) -> None:
+    expected = [image.name for image in read_image_records(folder, observations=False)]
+    as_text(folder)
+    for name in ("cameras.txt", "images.txt", "points3D.txt"):
+        path = folder / name
+        path.write_bytes(b"\xef\xbb\xbf" + "\n".join(lines_of(path)).encode())
+    assert sorted(image.name for image in read_image_records(folder, observations=True)) == sorted(expected)
+    assert len(read_cameras(folder)) == 1 and len(read_point_records(folder).ids) > 0
 
 
 def append(folder: Path, name: str, text: str) -> None:

@@ -9,8 +9,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from panolog.scene.errors import InputError
-from panolog.scene.images import PanoramaCache
+from panolog.scene.errors import ImageError, InputError
+from panolog.scene.images import PanoramaCache, load_view
 from panolog.scene.read import read_scene
 from tests.scenes import HEIGHT, WIDTH, write_scene
 
@@ -104,6 +104,21 @@ def test_layers_are_resized_without_mixing_in_what_has_no_value(root: Path) -> N
     np.testing.assert_allclose(values, [0, 40000 / 65535], rtol=1e-6)
     assert view.inverse_depth.shape == (HEIGHT // 2, WIDTH // 2)
     assert (view.inverse_depth[:6] == 0).all() and (view.inverse_depth[6:] > 0).all()
+
+
+def test_a_sky_mask_of_ones_is_one_of_255(root: Path) -> None:
+    """All was sky, and the geometry was lost."""
+    ground = np.zeros((HEIGHT, WIDTH), np.uint8)
+    ground[HEIGHT // 2 :] = 1
+    draw(root / "skymasks" / "0.png", ground)
+    draw(root / "skymasks" / "1.png", 255 * ground)
+    draw(root / "skymasks" / "2.png", 17 * ground)
+    scene = read_scene(root)
+    ones, whole = (load_view(scene.panoramas[row], row, WIDTH).sky for row in (0, 1))
+    assert ones is not None and whole is not None and torch.equal(ones, whole)
+    assert ones[0].all() and not ones[-1].any()
+    with pytest.raises(ImageError, match=r"2\.png: its largest value is 17, so all of it would be sky"):
+        load_view(scene.panoramas[2], 2, WIDTH)
 
 
 def test_an_exif_orientation_does_not_turn_a_panorama(tmp_path: Path) -> None:

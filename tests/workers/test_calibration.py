@@ -1,8 +1,13 @@
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from panolog.renderer import ops
+from panolog.scene.errors import InputError
+from panolog.scene.model import Scene
 from panolog.workers.calibration import CalibrateSpec, calibrate
 from panolog.workers.events import Calibration
 from panolog.workers.specs import Value
@@ -15,18 +20,14 @@ def calibrated(
     folder: Path, *, most: int = 1_000, gradient: float = 2e-4, seconds: float = 10.0
 ) -> Calibration:
     config = TrainConfig(sky=SkyConfig(count=50), densify=DensifyConfig(gradient=gradient))
-    spec = CalibrateSpec(
-        scene=Value(small_scene(folder)),
-        width=WIDTH,
-        iterations=300,
-        config=config,
-        seed=0,
-        seconds=seconds,
-        most=most,
-    )
-    *_, found = calibrate(spec)
+    *_, found = calibrate(spec_of(small_scene(folder), config=config, seconds=seconds, most=most))
     assert isinstance(found, Calibration)
     return found
+
+
+def spec_of(scene: Scene, **fields: Any) -> CalibrateSpec:
+    given = {"config": TrainConfig(), "seconds": 1.0, "most": 1_000} | fields
+    return CalibrateSpec(scene=Value(scene), width=WIDTH, iterations=300, seed=0, **given)
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -59,3 +60,14 @@ def test_without_time_each_model_still_has_an_iteration(tmp_path: Path) -> None:
     found = calibrated(tmp_path, seconds=0.0)
     assert found.initial.seconds > 0
     assert found.grown.seconds > 0
+
+
+def test_masks_that_leave_nothing_are_refused_before_anything_is_trained(tmp_path: Path) -> None:
+    """A run used to train on nothing, to a model without metrics."""
+    scene = small_scene(tmp_path)
+    for row in scene.train:
+        mask = scene.panoramas[row].mask
+        assert mask is not None
+        cv2.imwrite(str(mask), np.zeros((WIDTH // 2, WIDTH), np.uint8))
+    with pytest.raises(InputError, match="the masks leave nothing of 4 panoramas"):
+        list(calibrate(spec_of(scene)))

@@ -22,6 +22,7 @@ from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.surfaces import NO_POINTS, Points
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
+DARKEST = 0.25 / 255  # initial: colours are clamped at 0, where they have no gradient and would stay black
 OPACITY = 0.1  # initial, 3DGS
 NEIGHBOURS = 3  # whose distances set the size of a Gaussian, 3DGS
 # Initial sizes as fractions of the distance to the nearest camera. A lone point, far from its neighbours, may
@@ -54,8 +55,8 @@ def near_distance(scene: Scene, config: TrainConfig) -> float:
 
 
 def sh_of_color(colors: NDArray[np.float64]) -> torch.Tensor:
-    """(N, 3) RGB in [0, 1] to (N, 1, 3) coefficients of degree 0."""
-    return torch.from_numpy(((colors - 0.5) / SH_C0).astype(np.float32))[:, None, :]
+    """(N, 3) RGB in [0, 1] to (N, 1, 3) coefficients of degree 0; black is a little brighter."""
+    return torch.from_numpy(((np.maximum(colors, DARKEST) - 0.5) / SH_C0).astype(np.float32))[:, None, :]
 
 
 def isotropic(

@@ -10,6 +10,8 @@ from scipy.spatial import cKDTree
 
 from panolog.partition.bounds import Aabb
 from panolog.partition.cells import Cell, Grid
+from panolog.renderer.camera import Camera
+from panolog.renderer.render import render
 from panolog.scene.images import View, exposed, exposure_affine, load_view
 from panolog.scene.model import Scene
 from panolog.scene.projection import fibonacci_sphere
@@ -27,6 +29,20 @@ from panolog.workers.training.initialise import (
 )
 from tests.on_device import view_on_device
 from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH
+
+
+def test_black_points_learn_their_colours(scene: Scene) -> None:
+    """Many programs write no colours: at 0 they were clamped, and stayed black for ever."""
+    black = replace(scene, colors=np.zeros_like(scene.colors))
+    model = scene_gaussians(black)
+    leaves = model.with_tensors({n: t.clone().requires_grad_() for n, t in model.tensors().items()})
+    panorama = scene.panoramas[0]
+    camera = Camera.of(panorama.rotation, panorama.translation, WIDTH, WIDTH // 2)
+    rendered = render(leaves, camera, sh_degree=0, near=0.01)
+    assert float(rendered.color.detach().max()) < 0.5 / 255
+    (1 - rendered.color).square().sum().backward()  # type: ignore[no-untyped-call]
+    assert leaves.sh0.grad is not None
+    assert (leaves.sh0.grad[rendered.visible] < 0).float().mean() > 0.9
 
 
 def test_one_gaussian_for_each_point(scene: Scene) -> None:
@@ -146,8 +162,8 @@ def test_sky_has_the_colour_of_the_sky_pixels(scene: Scene) -> None:
     )
     above = torch.from_numpy(elevation < SKY_ELEVATION - 0.1)
     below = torch.from_numpy(elevation > SKY_ELEVATION + 0.1)
-    assert torch.allclose(color[above], torch.tensor([0.0, 0, 1]), atol=1e-5)
-    assert torch.allclose(color[below & torch.from_numpy(elevation < 1.2)], torch.zeros(3), atol=1e-5)
+    assert torch.allclose(color[above], torch.tensor([0.0, 0, 1]), atol=1e-3)
+    assert torch.allclose(color[below & torch.from_numpy(elevation < 1.2)], torch.zeros(3), atol=1e-3)
     assert torch.allclose(
         color[torch.from_numpy(elevation > 1.5)], torch.tensor(0.5), atol=1e-5
     )  # all masked
