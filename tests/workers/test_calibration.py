@@ -26,7 +26,7 @@ def calibrated(
 
 
 def spec_of(scene: Scene, **fields: Any) -> CalibrateSpec:
-    given = {"config": TrainConfig(), "seconds": 1.0, "most": 1_000} | fields
+    given: dict[str, Any] = {"config": TrainConfig(), "seconds": 1.0, "most": 1_000} | fields
     return CalibrateSpec(scene=Value(scene), width=WIDTH, iterations=300, seed=0, **given)
 
 
