@@ -170,7 +170,8 @@ class Trainer:
         chosen = points_of(scene, spec.views, spec.district, spec.width)
         self.start = len(chosen)
         surfaces, missing = Surfaces(scene), self.schedule.first(self.start, pixels) - self.start
-        for view in self.views.each(spec.views if missing else (), self.cache.ahead(PREFETCH)):
+        mapped = [row for row in spec.views if missing and scene.panoramas[row].depth]
+        for view in self.views.each(mapped, self.cache.ahead(PREFETCH)):
             surfaces.add(view, self.loss.depth.target(view))
             if self.meter.due():
                 yield self.meter.progress(0, self.start)

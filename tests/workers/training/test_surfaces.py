@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,11 @@ from torch import Tensor
 
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
+from panolog.workers.sound_views import SoundViews
 from panolog.workers.training.surfaces import Points, Surfaces
 from panolog.workers.training.trainer import TrainSpec
 from tests.on_device import view_on_device
-from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH, distance_along, rays_of
+from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH, distance_along, rays_of, small_scene
 from tests.workers.trainings import RELOCATED, begun, coarse_of, settings
 
 Target = tuple[Tensor, Tensor]
@@ -95,6 +97,15 @@ def first_of(spec: TrainSpec) -> tuple[int, int]:
     """Scene Gaussians before the first iteration, and those of the law of growth."""
     with begun(spec) as trainer:
         return trainer.state.gaussians.scene.stop, trainer.start
+
+
+def test_without_depth_images_nothing_is_decoded_for_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = small_scene(tmp_path, layers=False)
+    monkeypatch.setattr(SoundViews, "get", lambda *_: pytest.fail("decodes"))
+    config = settings(densify=RELOCATED, depth={"points": 0.8}, sky={"count": 0})
+    assert first_of(coarse_of(scene, config)) == (200, 200)
 
 
 def test_stage_one_begins_with_part_of_its_budget(scene: Scene) -> None:
