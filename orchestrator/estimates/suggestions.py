@@ -1,6 +1,9 @@
 """Why a job does not fit, and the settings with which it would."""
 
 import math
+import shutil
+import socket
+import tempfile
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -8,12 +11,15 @@ from typing import TypeAlias, TypeVar
 
 from panolog.orchestrator.estimates.costs import Estimate, StageEstimate
 from panolog.orchestrator.estimates.estimate import Estimator
+from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.resources.placement import USABLE
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.units import gib
 from panolog.partition.balance import balance
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 from panolog.workers.tasks import Stage
+from panolog.workers.training.exterior import Rooms
 
 _STEP = 64  # pixels between widths that are proposed
 _NARROWEST = 256  # pixels
@@ -154,7 +160,30 @@ def _shortage(estimator: Estimator, estimate: Estimate, free: int) -> _Short | N
     if estimate.disk > free:
         disk = f"the run folder needs about {gib(estimate.disk)}, and {gib(free)} of its disk are free"
         return _Short(memory=False, what=disk)
+    if (baked := _baked(estimator, estimate)) > (left := free_temporary(estimator.nodes)):
+        where = f"{tempfile.gettempdir()}, and {gib(int(left))} are free there (TMPDIR)"
+        files = f"what is baked for the panoramas of a block needs about {gib(baked)} in {where}"
+        return _Short(memory=False, what=files)
     return None
+
+
+def free_temporary(nodes: Sequence[Node]) -> float:
+    """Bytes that are free for temporary files where tasks run; inf where that is not only this machine."""
+    here = {node.host for node in nodes} == {socket.gethostname()}
+    return shutil.disk_usage(tempfile.gettempdir()).free if here else math.inf
+
+
+def _baked(estimator: Estimator, estimate: Estimate) -> int:
+    """Bytes in files of what is baked for blocks that train together, beyond what they keep in memory."""
+    stage = next((stage for stage in estimate.stages if stage.name is Stage.BLOCK), None)
+    if stage is None or not estimator.bakes:
+        return 0
+    cache, device, scene = estimator.config.cache, estimator.config.device, estimator.scene
+    if device != "cpu" and cache.device is None:  # as the driver gives it
+        left = max(0.0, USABLE * estimator.largest - stage.device) / 2**30
+        cache = cache.model_copy(update={"device": left})
+    room = Rooms.of(cache, device, scene.panoramas[scene.train[0]], estimator.width, bakes=True).baked
+    return stage.together * max(0, estimator.parts.block_cameras * estimator.baked_view - room)
 
 
 def _of(stage: StageEstimate) -> str:

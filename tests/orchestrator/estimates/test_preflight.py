@@ -1,4 +1,5 @@
 import re
+import socket
 from collections.abc import Iterator, Set
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from panolog.orchestrator.estimates import calibration
+from panolog.orchestrator.estimates import calibration, suggestions
 from panolog.orchestrator.estimates.calibration import Basis, calibrate
 from panolog.orchestrator.estimates.estimate import Estimator
 from panolog.orchestrator.estimates.preflight import Preflight, choose_blocks, examine
@@ -209,6 +210,21 @@ def test_a_full_disk_is_refused(scene: Scene) -> None:
     assert message is not None
     assert "of its disk are free" in message
     assert "densify.max_gaussians" in message
+
+
+def test_temporary_files_of_blocks_need_a_disk(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """236 MB for each panorama of 3,840 pixels: it was missing in Stage II, after hours."""
+    assert suggestions.free_temporary([node(PLENTY)]) == float("inf")  # of another machine
+    here = replace(node(PLENTY), host=socket.gethostname())
+    assert 0 < suggestions.free_temporary([here]) < float("inf")
+    monkeypatch.setattr(suggestions, "free_temporary", lambda _: float(10**6))
+    job = large(scene, PLENTY, recipe="panolog", blocks="2x1x1", cache={"memory": 0.1})
+    message = problem(job, PLENTY)
+    assert message is not None
+    assert re.match(
+        r"what is baked for the panoramas of a block needs about 1\.. GiB in .*\(TMPDIR\)", message
+    )
+    assert problem(replace(job, config=change(job.config, {"cache.memory": 2.0})), PLENTY) is None
 
 
 def test_nothing_is_proposed_where_nothing_helps(scene: Scene) -> None:
