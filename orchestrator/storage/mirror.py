@@ -64,7 +64,7 @@ class Mirror:
         self._cost = 0.0  # seconds that the last snapshot and manifest took
         self._swept = False
         self._begun = known is not None  # whether the store has anything of the run that took time
-        self._own: list[str] = []  # keys that this mirror has made, the pointer's first
+        self._own: list[str] = []  # keys that this mirror has made until then, in order
         for left in folder.mirror.parent.glob("*.part"):  # of a mirror that was killed
             left.unlink()
 
@@ -223,7 +223,7 @@ class Mirror:
         entry = Entry(key, status.st_size, digest_of(path), status.st_mtime_ns)
         if known is not None and (known.size, known.sha256) == (entry.size, entry.sha256):
             return known
-        self._own.append(key)
+        self._note(key)
         self._store.put(path, key)
         return entry
 
@@ -248,7 +248,8 @@ class Mirror:
         self._lease.require()
         manifest = Manifest(f"{MANIFESTS}/{time.time_ns():x}-{secrets.token_hex(4)}", files)
         packed = manifest.pack()
-        self._own = [numbered(POINTERS, self._lease.number), *self._own, manifest.name]
+        self._note(manifest.name)
+        self._note(numbered(POINTERS, self._lease.number))
         self._store.write(manifest.name, packed)
         self._say(announced=manifest.name)
         put_pointer(self._store, self._lease.number, manifest, packed)
@@ -290,9 +291,14 @@ class Mirror:
 
     def _withdraw(self) -> None:
         """Removes what this mirror has stored of a run that was refused before anything was made."""
-        for key in dict.fromkeys(self._own):
+        for key in dict.fromkeys(reversed(self._own)):  # the pointer first
             self._store.remove(key)
         self._say(complete=True)
+
+    def _note(self, key: str) -> None:
+        """Takes note of a key that this mirror makes, as long as the run may be withdrawn."""
+        if not self._begun:
+            self._own.append(key)
 
     def _say(self, **changes: object) -> None:
         with self._lock:
