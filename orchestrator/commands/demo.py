@@ -19,6 +19,8 @@ SETTINGS: dict[str, Any] = {
     "recipe": "paper",  # all that it describes, opacity resets too
     "iterations": 500,
     "optimizer.short_runs": 0.5,
+    "optimizer.position": 2e-5,  # of the extent: by `short_runs` 60 times that
+    "optimizer.position_final": 2e-7,
     "partition.tau_grad": 0.1,
     "reset.every_floor": 200,  # one reset in each stage
     "reset.recovery": 100,
