@@ -29,13 +29,13 @@ class Lasting:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """As `TextIO.write`."""
+        """Writes text, or drops it where writing fails; returns its length."""
         with suppress(OSError):
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """As `TextIO.flush`."""
+        """Flushes what was written, or drops it where that fails."""
         with suppress(OSError):
             self._stream.flush()
 

@@ -15,13 +15,13 @@ _POLL = 0.5  # seconds between two looks at a driver that stops
 
 def stop(run: RunArg) -> None:
     """Stop a run as Ctrl-C does; returns when its checkpoints are written."""
-    from panolog.orchestrator.run import lock
+    from panolog.orchestrator.run import control
     from panolog.orchestrator.run.folder import RunFolder
 
     _request(run, "stop")
     folder = RunFolder(run)
     with progress_bar("waiting until the checkpoints are written"):
-        while lock.held(folder.lock) or lock.held(folder.supervisor):
+        while control.at_work(folder):
             time.sleep(_POLL)
     say(f"stopped; {command('resume', run)} resumes it")
 

@@ -93,9 +93,14 @@ def request(action: Any, block: Any = None, node: Any = None) -> ControlRequest:
     return ControlRequest(Action(action), block, node)
 
 
+def at_work(folder: RunFolder) -> bool:
+    """Whether a driver, or the supervisor that starts the next one, is at work on the run."""
+    return lock.held(folder.lock) or lock.held(folder.supervisor)
+
+
 def allowed(folder: RunFolder) -> str | None:
     """Why the run takes no requests now; None if it does."""
-    if not lock.held(folder.lock) and not lock.held(folder.supervisor):
+    if not at_work(folder):
         return "no driver is at work on the run"
     if not folder.control.is_dir():
         return "its driver takes no requests yet"

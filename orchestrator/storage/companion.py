@@ -99,9 +99,8 @@ class _Keeper:
                 self._left = str(content.get("left", "")) or self._left
             if self._process.wait() == 0:
                 return
-            why = (
-                f"code {self._process.returncode}{self._process.complaint and f': {self._process.complaint}'}"
-            )
+            code, complaint = f"code {self._process.returncode}", self._process.complaint
+            why = f"{code}: {complaint}" if complaint else code
             self._left = killed = f"{self._plan.url}: its mirror was killed ({why})"
             if time.monotonic() - began > _LONGEST_S:
                 pause, tries = _AGAIN_S, 0

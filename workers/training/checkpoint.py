@@ -130,7 +130,7 @@ class SavedModel:
             raise RunError(f"{path} is not a whole checkpoint ({error})") from error
 
     def pieces(self, rows: int = _ROWS) -> Iterator[Gaussians]:
-        """All of them in order, sky last, at most `rows` at a time."""
+        """Yields the saved Gaussians in order, sky last, at most `rows` at a time."""
         with safe_open(self._path, framework="pt") as file:
             kind = AVERAGE if self.averaged else ""
             slices = {name: file.get_slice(f"{kind}{name}") for name in self.names}

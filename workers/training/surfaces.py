@@ -24,9 +24,7 @@ WIDTH = 256  # of a map that is kept, pixels, at most
 NEIGHBOURS = 6  # panoramas whose maps are compared
 SAME = 0.02  # of a distance: how far two maps differ at most on one surface
 PAST = 0.06  # from which part on a map sees past a point
-FARTHEST = (
-    5.0  # times as far from the centroid of cameras as the sparse cloud, at most; the sky: 10 times (eq. 3)
-)
+FARTHEST = 5.0  # times as far from the centroid of cameras as the sparse cloud; the sky: 10 times (eq. 3)
 _LEAST = 0.02  # radians that points are apart for the nearest camera, at least
 _ROUNDS = 12  # of halving an angle, to a thousandth
 _DIRECTIONS = fibonacci_sphere(RAYS)

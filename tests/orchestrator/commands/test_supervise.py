@@ -217,7 +217,7 @@ def test_a_stop_between_two_drivers(tmp_path: Path) -> None:
 
 
 def test_panolog_stop_between_two_drivers(tmp_path: Path) -> None:
-    """It was refused, as no driver was at work, and then the run was resumed."""
+    """`panolog stop` between two drivers was refused, and then the run was resumed."""
     folder = RunFolder(tmp_path)
     folder.info.write_text('{"scene": {"path": "scene"}, "config": {"width": 64}}')
     Database(folder.database).close()

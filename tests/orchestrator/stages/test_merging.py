@@ -42,7 +42,7 @@ def model() -> Gaussians:
 def test_blocks_that_keep_stage_one_are_cut_out_in_one_look(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It took as many looks at all of a model as there are blocks."""
+    """The Stage I model was read once for each block that keeps it."""
     coarse, folder = model(), RunFolder(tmp_path)
     means, centers = coarse.means[coarse.scene].numpy(), np.array([[-2.0, 0, 0], [2.0, 0, 1], [0, 1, -1]])
     options = {"rows": (0, 1, 2), "names": ("a", "b", "c")}

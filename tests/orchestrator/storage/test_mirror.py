@@ -127,7 +127,7 @@ def test_results_of_a_run_that_a_limit_has_ended_are_replaced_when_it_is_complet
 
 
 def test_a_run_that_was_refused_leaves_nothing(tmp_path: Path) -> None:
-    """Of its own: what others have put there is none of it."""
+    """A refused run removes the files of its own from a store, and keeps those of others."""
     store, driver = open_store(f"file://{tmp_path}/store"), Driver(tmp_path / "run")
     store.write("notes.txt", b"of a user")
     mirror, lease = mirror_of(driver, store)
