@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from panolog.orchestrator.run.money.records import BudgetSet
+from panolog.orchestrator.run.money.records import BudgetReached, BudgetSet
 from panolog.orchestrator.run.records import (
     BlockPlan,
     CheckpointSaved,
@@ -32,10 +32,12 @@ from tests.orchestrator.history import AGAIN, BEGAN, after, model, started
 
 PLAIN = {int: st.integers(0, 2**40), float: st.floats(0, 1e9), str: st.text(max_size=9)}
 TASKS = [COARSE, EVAL, TaskId.block(0), TaskId.block(1), TaskId.shard(0), TaskId.measure(0)]
+FEW = st.integers(0, 9)  # tasks that are made
 NAMES: dict[
     type, dict[str, st.SearchStrategy[Any]]
 ] = {  # of tasks in values that are text, and what is free in form
-    PlanSaved: {"passes": st.just((("round/000",), ("repair/000",)))},
+    PlanSaved: {"passes": st.just((("round/000",), ("repair/000",))), "measures": FEW},
+    BudgetReached: {"measures": FEW},
     NodeQuarantined: {"tasks": st.just(("block/000",))},
     BudgetSet: {"prices": st.just({"currency": "USD"})},
 }
