@@ -28,6 +28,7 @@ from panolog.orchestrator.cluster.files import FileSharing, RayValue, run_remote
 from panolog.orchestrator.cluster.nodes import RayNodes
 from panolog.orchestrator.cluster.places import Places
 from panolog.orchestrator.resources.delivery import Large, announced
+from panolog.orchestrator.resources.gpus import gpus_to_share
 from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.machine import oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
@@ -129,7 +130,7 @@ class RayPool:
             num_returns="streaming",
             max_retries=0,
             scheduling_strategy=NodeAffinitySchedulingStrategy(placement.node, soft=False),
-            runtime_env=_environment(placement),
+            runtime_env=_environment(placement, pin=placement.pinned or self._sharing is None),
             _generator_backpressure_num_objects=_UNREAD,
         )
         self._agents.start(placement.node)
@@ -143,11 +144,20 @@ class RayPool:
             self._agents.stop(running.placement.node, running.hello.pid)
 
     def waiting(self, task: TaskId) -> bool:
-        """Whether a task has no worker yet because other programs use the machine."""
-        running = self._running[task]
+        """Whether a task has no worker yet because others use the machine.
+
+        A whole GPU also waits for tasks of this run that Ray has put on parts of all GPUs.
+        """
+        running, others = self._running[task], self._running.values()
+        where = running.placement
+        if where.gpus == 1 and any(
+            other.hello and other.placement.node == where.node and 0 < other.placement.gpus < 1
+            for other in others
+        ):
+            return True
         if self._places is None:  # Ray is for this run alone
             return False
-        return self._places.waits(running.messages.completed().task_id().hex(), running.placement.node)
+        return self._places.waits(running.messages.completed().task_id().hex(), where.node)
 
     @reported
     def cancel(self, task: TaskId) -> None:
@@ -224,13 +234,10 @@ class RayPool:
         return kills is not None and kills > task.hello.oom_kills
 
 
-def _environment(placement: Placement) -> dict[str, Any] | None:
-    """The log level, the cache of object stores, and the GPU for CUDA where a node has unequal ones.
-
-    Ray would take any.
-    """
+def _environment(placement: Placement, *, pin: bool) -> dict[str, Any] | None:
+    """The log level, the cache of object stores, and if `pin` the GPU for CUDA: Ray would take any."""
     names = log.environment() | variables(os.environ)
-    if placement.uuid:
+    if pin and placement.uuid:
         names |= {"RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES": "1", "CUDA_VISIBLE_DEVICES": placement.uuid}
     return {"env_vars": names} if names else None
 
@@ -242,7 +249,8 @@ def _run(spec: TaskSpec, threads: int, code: str) -> Iterator[Hello | Event | Ca
     prepare(threads)
     _send_tensors_as_arrays()
     stopping.listen()
-    yield Hello(socket.gethostname(), os.getpid(), oom_kills())
+    cards = gpus_to_share() if spec.device == "cuda" else ()
+    yield Hello(socket.gethostname(), os.getpid(), oom_kills(), cards[0] if len(cards) == 1 else "")
     yield from announced(with_usage(guarded(spec.task, _with_code(code, spec))), _UNREAD)
 
 

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from panolog.orchestrator.driver import policy
 from panolog.orchestrator.resources import leaving, placement, quarantine
@@ -31,9 +31,13 @@ class Attempt:
     ready: bool = False  # it has sent Hello, and can be requested to stop
     stopping: bool = False  # it is requested to save a checkpoint and end
 
-    def started(self, hello: Hello) -> TaskStarted:
-        """The record of its Hello."""
-        spec = self.spec
+    def started(self, hello: Hello, nodes: Sequence[Node]) -> TaskStarted:
+        """The record of its Hello, after which it can be requested to stop. Args: nodes, those there are."""
+        self.ready, spec = True, self.spec
+        for node in nodes:
+            for gpu, card in enumerate(node.gpus):
+                if node.id == self.placement.node and card.uuid == hello.card != "":
+                    self.placement = replace(self.placement, gpu=gpu, uuid=card.uuid)
         return TaskStarted(
             spec.task,
             self.number,
@@ -45,6 +49,7 @@ class Attempt:
             self.placement.kind,
             None if isinstance(spec, EvaluateSpec) else spec.config.cache.memory,
             self.placement.node,
+            self.placement.card,
         )
 
     def failed(
@@ -63,7 +68,7 @@ class Attempt:
             memory=where.memory,
             largest=placement.largest(nodes, cuda=config.device == "cuda"),
         )
-        excused = quarantine.excuses(state, where.node, kind)
+        excused = quarantine.excuses(state, (where.node, where.card), kind)
         final = then.final and not excused
         _LOG.info("%s: attempt %d failed (%s): %s", task, self.number, kind, message.reason)
         _LOG.info("%s: %s", task, "no more attempts" if final else then.then or "will be retried")
@@ -79,4 +84,5 @@ class Attempt:
             where.node,
             excused,
             preempted,
+            where.card,
         )

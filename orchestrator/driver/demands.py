@@ -20,7 +20,7 @@ from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.placement import USABLE, Demand, Running
 from panolog.orchestrator.resources.scaling import Work
 from panolog.orchestrator.run.records import BlockPlan, Failure
-from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.run.state import RunState, Status
 from panolog.scene.ply import ply_header
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from panolog.workers.training.task_config import CacheConfig
@@ -72,8 +72,9 @@ class Demands:
         more_than = state.starved if state.shortages > 1 else 0
         memory = self._sizes.of(task, self._state)
         avoid = defaultdict[str, float](float)
-        for node, kind in state.failures:
-            avoid[node] += _OF_LOST if kind == Failure.LOST else 1
+        for failure in state.failures:
+            for where in filter(None, failure.where):
+                avoid[where] += _OF_LOST if failure.kind == Failure.LOST else 1
         alone = state.shortages > 0
         return Demand(task, memory, self._seconds(task), alone=alone, more_than=more_than, avoid=avoid)
 
@@ -83,6 +84,8 @@ class Demands:
 
     def _left(self, task: TaskId, where: Placement, now: float) -> float:
         state = self._state.task(task)
+        if state.status == Status.DONE:  # its result is saved, and its process ends
+            return 0.0
         return seconds_left(state, self._seconds(task)(where.kind), now - (state.since or now))
 
 

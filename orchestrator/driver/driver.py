@@ -334,8 +334,7 @@ class Driver:
         self._news = self._news or isinstance(message, _ENDS)
         match message:
             case Hello():
-                attempt.ready = True
-                return [attempt.started(message)]
+                return [attempt.started(message, self._nodes)]
             case Ended():
                 return self._ended(task)
             case Failed() if self._state.status(task) == Status.DONE:

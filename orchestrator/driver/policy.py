@@ -148,8 +148,8 @@ def after_failure(
     if task.errors >= retries:
         return Consequence(final=True)
     if failure == Failure.INPUT:
-        before = {where for where, kind in task.failures if kind == Failure.INPUT}
-        confirmed = before - {node} if others else before
+        before = [failure.where for failure in task.failures if failure.kind == Failure.INPUT]
+        confirmed = [where for where in before if node not in where] if others else before
         return Consequence(
             bool(confirmed), "" if confirmed else "tried again before the input counts as wrong"
         )

@@ -23,11 +23,16 @@ class Node:
     gpus: tuple[Gpu, ...] = ()
     instance: str = ""  # its type, as its provider calls it; "" if it does not say
     labels: tuple[tuple[str, str], ...] = ()  # Ray's, and its resources of the user's own
+    closed: tuple[int, ...] = ()  # those of its GPUs that are in quarantine
+
+    def card(self, gpu: int) -> str:
+        """The id of one of its GPUs: its UUID if that is known."""
+        return self.gpus[gpu].uuid or f"{self.id}/{gpu}"
 
     @property
-    def unequal(self) -> bool:
-        """Whether it matters which of its GPUs a task gets: another model, or a gibibyte more or less."""
-        return len({(gpu.name, round(gpu.memory / 2**30)) for gpu in self.gpus}) > 1
+    def differ(self) -> bool:
+        """Whether it matters which of its GPUs a task gets: one is in quarantine, or larger, or other."""
+        return bool(self.closed) or len({(gpu.name, round(gpu.memory / 2**30)) for gpu in self.gpus}) > 1
 
 
 @dataclass(frozen=True)
@@ -38,9 +43,15 @@ class Placement:
     cpus: float  # cores, below one where GPUs are many and cores are few
     memory: int  # bytes it may count on: of the GPU, or of the node for a task on the CPU
     gpus: float = 0.0  # 1, or the part of one that it shares with others
-    gpu: int | None = None  # which of Node.gpus the scheduler counts it on
-    uuid: str = ""  # the GPU that CUDA must use; "" = whichever Ray picks, the node's are equal
+    gpu: int | None = None  # which of Node.gpus
+    uuid: str = ""  # of that GPU; "" = unknown
+    pinned: bool = False  # it must be that one, also where Ray would pick another
     kind: str = "cpu"  # places of one kind are equally fast: "cpu", "NVIDIA L4" or "1/2 NVIDIA L4"
+
+    @property
+    def card(self) -> str:
+        """`Node.card` of its GPU; "" for a task on the CPU."""
+        return "" if self.gpu is None else self.uuid or f"{self.node}/{self.gpu}"
 
     @property
     def threads(self) -> int:

@@ -1,15 +1,16 @@
 """Which waiting tasks start now, and where: pure decisions over what waits, what runs and what there is.
 
 On GPUs: each is cut into as many equal slots as tasks of the size at hand fit into its memory, at most
-`_SHARED`. Tasks are assigned to these slots, to those that are busy too, so that the last ends as soon as
-possible (`assignment.assign_lpt`). Of those assigned to a free slot the longest starts. So a slot stays free
-only where others, busy now, will have done all the work sooner. Whenever a task ends, all is assigned anew.
+`_SHARED`, and no more than there are tasks for. Tasks are assigned to these slots, to those that are busy
+too, so that the last ends as soon as possible (`assignment.assign_lpt`). Of those assigned to a free slot the
+longest starts. So a slot stays free only where others, busy now, will have done all the work sooner. Whenever
+a task ends, all is assigned anew (docs/decisions/0014-the-driver-chooses-gpus.md).
 
 On CPUs: as many at once as there are cores and memory for, because one thread each wastes less than many
 threads for one; those that start together share a node's free cores evenly.
 
-A task avoids the nodes on which it has failed, as if it took `_PATIENCE_S` longer there for each failure: it
-waits so long at most for another, and where it has failed on all of them it starts where it did so least.
+A task avoids the nodes and GPUs on which it has failed, as if it took `_PATIENCE_S` longer there for each
+failure: it waits so long at most for others, and where it has failed on all it starts where it did so least.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -42,11 +43,12 @@ class Demand:
     seconds: Callable[[str], float] = _equal  # by kind of place
     alone: bool = False  # it has run out of memory: nothing else may run on its device
     more_than: int = 0  # bytes of memory that were not enough
-    avoid: Mapping[str, float] = field(default_factory=dict)  # how often it has failed, by Node.id
+    avoid: Mapping[str, float] = field(default_factory=dict)  # how often it has failed, by Node.id and card
 
     def avoids(self, device: "_Device") -> float:
         """How much it would rather start elsewhere, 0 = not at all."""
-        return self.avoid.get(device.node.id, 0.0)
+        card = "" if device.gpu is None else device.node.card(device.gpu)
+        return self.avoid.get(device.node.id, 0.0) + self.avoid.get(card, 0.0)
 
 
 @dataclass(frozen=True)
@@ -112,10 +114,11 @@ def free_times(
     demands: Sequence[Demand], nodes: Sequence[Node], running: Sequence[Running], *, cuda: bool
 ) -> list[float]:
     """Seconds until each place for one of such tasks is free, 0 for those that are."""
-    times = list[float]()
-    for number, device in enumerate(_devices(nodes, running, cuda=cuda)):
+    times, devices = list[float](), _devices(nodes, running, cuda=cuda)
+    shares = _shares(demands, devices)
+    for number, device in enumerate(devices):
         if cuda:
-            times += [slot.free_in for slot in _slots(number, device, _shares(device.memory, demands))]
+            times += [slot.free_in for slot in _slots(number, device, shares[number])]
         else:  # tasks share a node's cores, and take longer by as much: as one place for one after another
             times.append(sum(t.left * t.placement.cpus for t in device.tasks) / device.node.cpus)
     return times
@@ -131,7 +134,8 @@ def _devices(nodes: Sequence[Node], running: Sequence[Running], *, cuda: bool) -
     for task in running:
         busy.setdefault((task.placement.node, task.placement.gpu), []).append(task)
     if cuda:
-        return [_Device(n, i, gpu.memory, on(n, i)) for n in nodes for i, gpu in enumerate(n.gpus)]
+        cards = [(n, i) for n in nodes for i in range(len(n.gpus)) if i not in n.closed]
+        return [_Device(n, i, n.gpus[i].memory, on(n, i)) for n, i in cards]
     return [_Device(n, None, int(n.memory * USABLE), on(n, None)) for n in nodes if n.cpus]
 
 
@@ -162,7 +166,8 @@ def _part(device: _Device, shares: int) -> Placement:
         memory=gpu.memory // shares,
         gpus=int(1e4 / shares) / 1e4,
         gpu=device.gpu,
-        uuid=gpu.uuid if node.unequal else "",
+        uuid=gpu.uuid,
+        pinned=node.differ,
         kind=_kind(gpu, shares),
     )
 
@@ -185,8 +190,7 @@ class _Slot:
 
 def _assign_gpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[Placed]:
     """On every slot that is free, the longest of the tasks that are assigned to it."""
-    by_memory = {memory: _shares(memory, demands) for memory in {device.memory for device in devices}}
-    shares = [by_memory[device.memory] for device in devices]
+    shares = _shares(demands, devices)
     slots = sorted(slot for i, device in enumerate(devices) for slot in _slots(i, device, shares[i]))
     if not demands or not any(slot.now for slot in slots):
         return []
@@ -222,10 +226,20 @@ def _avoided(demands: Sequence[Demand], devices: Sequence[_Device]) -> Floats:
     return avoided
 
 
-def _shares(memory: int, demands: Sequence[Demand]) -> int:
-    """How many tasks a GPU takes: as many as there is memory for the largest that fits it at all."""
-    largest = max((demand.memory for demand in demands if demand.memory <= memory), default=memory)
-    return max(1, min(_SHARED, memory // max(1, largest)))
+def _shares(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[int]:
+    """How many tasks each GPU takes: as many as there is memory for the largest that fits it at all.
+
+    No more than it gets where all are equally many, unless some have parts of that node already: Ray may have
+    put these on any of its GPUs, and have no whole one left.
+    """
+    tasks = len(demands) + sum(task.left > 0 for device in devices for task in device.tasks)
+    most = -(-tasks // max(1, len(devices)))
+    cut = {device.node.id for device in devices for task in device.tasks if task.placement.gpus < 1}
+    found = dict[int, int]()
+    for memory in {device.memory for device in devices}:
+        largest = max((demand.memory for demand in demands if demand.memory <= memory), default=memory)
+        found[memory] = max(1, min(_SHARED, memory // max(1, largest)))
+    return [found[d.memory] if d.node.id in cut else min(found[d.memory], max(1, most)) for d in devices]
 
 
 def _slots(number: int, device: _Device, count: int) -> list[_Slot]:

@@ -35,6 +35,7 @@ class Hello:
     node: str
     pid: int
     oom_kills: int = 0  # `machine.oom_kills` at that moment
+    card: str = ""  # the UUID of its GPU, where another may have chosen that
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,7 @@ class TaskStarted:
     place: str = ""  # kind of place, all equally fast: see `nodes.Placement.kind`
     cache: float | None = None  # GiB of decoded panoramas it may keep
     node_id: str = ""  # Node.id, as in the records below
+    card: str = ""  # Node.card of its GPU
 
 
 @dataclass(frozen=True)
@@ -189,8 +190,9 @@ class TaskFailed:
     memory: int = 0  # bytes that its place had
     then: str = ""  # what is done about it, if there is more to say than whether it is tried again
     node: str = ""  # Node.id of its place
-    excused: bool = False  # its node is in quarantine, so it does not count against the task
+    excused: bool = False  # its place is in quarantine, so it does not count against the task
     preempted: bool = False  # its node had announced that it leaves: it counts apart
+    card: str = ""  # Node.card of its GPU
 
 
 @dataclass(frozen=True)
@@ -316,10 +318,10 @@ class RunContinued:
 
 @dataclass(frozen=True)
 class NodeQuarantined:
-    """Nothing more is placed on a node, because different tasks have failed there one after another."""
+    """Nothing more is placed on a node or a GPU, as different tasks have failed there one after another."""
 
-    node: str  # Node.id
-    host: str
+    node: str  # Node.id or Node.card
+    host: str  # with the GPU, if that alone is meant
     reason: str  # one line
     until: float  # seconds since the epoch
     tasks: tuple[str, ...] = ()  # whose failures there do not count
@@ -328,10 +330,10 @@ class NodeQuarantined:
 
 @dataclass(frozen=True)
 class NodeReleased:
-    """A node in quarantine is used again."""
+    """A node or a GPU in quarantine is used again."""
 
-    node: str  # Node.id
-    host: str
+    node: str  # Node.id or Node.card
+    host: str  # with the GPU, if that alone is meant
     reason: str = ""  # one line
     task: None = None
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from typing_extensions import assert_never
 
-from panolog.orchestrator.run.machines.nodes import Nodes, NodeState, by_host, follow, leave_text, take_over
+from panolog.orchestrator.run.machines import nodes as machines
 from panolog.orchestrator.run.money.records import BudgetReached, BudgetSet
 from panolog.orchestrator.run.money.spending import Spending, spend
 from panolog.orchestrator.run.records import (
@@ -72,7 +72,7 @@ class TaskState:
     checkpoint: int | None = None  # iteration of the last one on disk
     saved: float | None = None  # seconds since the epoch: when that was
     node: str = ""  # host of its latest attempt
-    node_id: str = ""  # Node.id of the same
+    where: tuple[str, str] = ("", "")  # Node.id and Node.card of the same
     progress: Progressed | None = None  # the latest
     seconds: float | None = None  # of the attempt that ended it
     spent: float = 0.0  # seconds of the attempts before
@@ -85,7 +85,7 @@ class TaskState:
     losses: int = 0  # attempts that were lost through no fault of it, in a row likewise
     preemptions: int = 0  # attempts that were lost with a node that had announced it, in a row likewise
     moves: int = 0  # attempts that have ended with a checkpoint because their node left
-    failures: tuple[tuple[str, Failure], ...] = ()  # Node.id and kind of both, shortages of memory aside
+    failures: tuple[machines.Misfortune, ...] = ()  # of both, shortages of memory aside
     shortages: int = 0  # attempts that ran out of memory, with this driver
     starved: int = 0  # bytes of memory that the last of these had
     received: int = 0  # bytes that other machines have sent to its attempts
@@ -121,7 +121,7 @@ class RunState:
     preparing: bool = False  # whether that is a part of making the scene
     waiting: str = ""  # why the run waits for its disk or a machine; "" if it does not
     estimate: dict[str, float | None] | None = None  # `PreflightSaved.seconds`
-    nodes: Nodes = field(default_factory=dict)
+    nodes: machines.Nodes = field(default_factory=dict)
     money: Spending = field(default_factory=Spending)
 
     @property
@@ -146,13 +146,13 @@ class RunState:
         """Blocks that have used up their attempts, and so keep their Stage I Gaussians."""
         return tuple(b.block for b in self.plan or () if self.status(TaskId.block(b.block)) == Status.FAILED)
 
-    def quarantined(self) -> tuple[NodeState, ...]:
+    def quarantined(self) -> tuple[machines.NodeState, ...]:
         """The nodes in quarantine, by host."""
-        return by_host(node for node in self.nodes.values() if node.until is not None)
+        return machines.by_host(node for node in self.nodes.values() if node.until is not None)
 
-    def leaving(self) -> tuple[NodeState, ...]:
+    def leaving(self) -> tuple[machines.NodeState, ...]:
         """The nodes that have announced that they leave, by host, until they have left."""
-        return by_host(node for node in self.nodes.values() if node.leave and not node.leave.over)
+        return machines.by_host(node for node in self.nodes.values() if node.leave and not node.leave.over)
 
     @property
     def between(self) -> tuple[tuple[TaskId, ...], ...]:
@@ -259,7 +259,7 @@ def _changes(task: TaskState, record: OfTask, time: float) -> dict[str, Any]:
                 "status": Status.RUNNING,
                 "attempts": record.attempt,
                 "node": record.node,
-                "node_id": record.node_id,
+                "where": (record.node_id, record.card),
                 "begun": record.iteration,
                 "since": time,
                 "place": record.place,
@@ -310,7 +310,7 @@ def _end(task: TaskState, record: TaskFailed | TaskYielded) -> dict[str, Any]:
     if record.kind == Failure.MEMORY:
         changes |= {"shortages": task.shortages + 1, "starved": record.memory}
     else:
-        changes["failures"] = (*task.failures, (record.node, record.kind))
+        changes["failures"] = (*task.failures, machines.Misfortune(record.kind, (record.node, record.card)))
     if record.kind == Failure.LOST:
         return changes | {"losses": task.losses + 1}
     return changes | {"errors": task.errors + 1}
@@ -318,20 +318,20 @@ def _end(task: TaskState, record: TaskFailed | TaskYielded) -> dict[str, Any]:
 
 def _with_nodes(state: RunState, record: Record, time: float) -> RunState:
     """What a record of some time changes of the nodes."""
-    where = state.task(record.task).node_id if isinstance(record.task, TaskId) else ""
+    where = state.task(record.task).where if isinstance(record.task, TaskId) else ()
     if isinstance(record, NodeQuarantined):
         _excuse(state, record)
     if isinstance(record, NodeLeaving):
-        state.notices[Noticed(None, leave_text(record))] = None
-    known = follow(state.nodes, record, where, time)
+        state.notices[Noticed(None, machines.leave_text(record))] = None
+    known = machines.follow(state.nodes, record, where, time)
     return state if known is state.nodes else replace(state, nodes=known)
 
 
 def _excuse(state: RunState, record: NodeQuarantined) -> None:
-    """Failures on the node count no longer, nor are they final unless the blocks are merged: in place."""
+    """Failures there count no longer, nor are they final unless the blocks are merged: in place."""
     for name in record.tasks:
         task = state.task(TaskId.parse(name))
-        kinds = [kind for node, kind in task.failures if node == record.node]
+        kinds = [failure.kind for failure in task.failures if record.node in failure.where]
         losses = kinds.count(Failure.LOST)
         revived = task.status == Status.FAILED and not state.joined(task.id)
         state.tasks[task.id] = replace(
@@ -339,7 +339,7 @@ def _excuse(state: RunState, record: NodeQuarantined) -> None:
             status=task.at_rest if revived else task.status,
             errors=max(0, task.errors - len(kinds) + losses),
             losses=max(0, task.losses - losses),
-            failures=tuple(failure for failure in task.failures if failure[0] != record.node),
+            failures=tuple(failure for failure in task.failures if record.node not in failure.where),
         )
     why = f"{record.host} ({record.node[:8]}) is in quarantine: {record.reason}"
     state.notices[Noticed(None, why)] = None
@@ -366,7 +366,7 @@ def _take_over(state: RunState, record: RunBegan, time: float) -> RunState:
     fresh = {id: replace(_interrupted(it, end), status=it.at_rest, **_FRESH) for id, it in left.items()}
     away = (*state.away, (end, time)) if state.began is not None and end is not None else state.away
     began = time if state.began is None else state.began
-    kept = {} if state.outcome == Outcome.FAILED and not state.transient else take_over(state.nodes)
+    kept = {} if state.outcome == Outcome.FAILED and not state.transient else machines.take_over(state.nodes)
     state = replace(state, tasks=state.tasks | fresh, began=began, driver=record, away=away, nodes=kept)
     return replace(state, outcome=None, reason="", transient=False, ended=None, step="", waiting="")
 

@@ -88,6 +88,7 @@ class FakePool(InProcess):
         self.started: list[tuple[Placement, TaskSpec]] = []
         self.stopped: set[TaskId] = set()
         self.leaving: dict[str, LeaveNotice] = {}  # by Node.id
+        self.card = ""  # the GPU that each task reports
         self.most = 0  # tasks that ran at the same time
         self._when_waiting: Callable[[], None] | None = None
 
@@ -159,7 +160,7 @@ class FakePool(InProcess):
         return message
 
     def _messages(self, spec: TaskSpec) -> Iterator[Message]:
-        yield Hello("node", 1)
+        yield Hello("node", 1, card=self.card)
         try:
             yield from announced(self._script(spec))
         except CrashError as crash:

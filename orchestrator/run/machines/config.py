@@ -22,13 +22,13 @@ class DeadlinesConfig(Group):
 
 
 class QuarantineConfig(Group):
-    """When nothing more is placed on a node."""
+    """When nothing more is placed on a node or a GPU."""
 
     failures: int = Field(
         default=3,
         ge=1,
-        description="failures of different tasks on a node, without a success there in between, after which"
-        " nothing is placed on it",
+        description="failures of different tasks on a node or a GPU, without a success there in between,"
+        " after which nothing is placed on it",
     )
     seconds: float = Field(default=3600.0, gt=0, description="seconds after which it is used again")
 

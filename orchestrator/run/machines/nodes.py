@@ -1,13 +1,13 @@
-"""What has happened on each node: failures of different tasks, quarantines, and whether it leaves.
+"""What has happened on each node and GPU: failures of different tasks, quarantines, whether a node leaves.
 
-A failure is the node's or the task's, and one alone does not show whose. So those of different tasks count
-against a node until something succeeds there. Where a task has failed in the same way on another node, whose
-last attempt before had succeeded, the cause is the task. What is lost with a node that has announced that it
-leaves is a failure of neither.
+A failure is the place's or the task's, and one alone does not show whose. So those of different tasks count
+against a node, and against its GPU, until something succeeds there. Where a task has failed in the same way
+at another place, whose last attempt before had succeeded, the cause is the task. What is lost with a node
+that has announced that it leaves is a failure of neither.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
@@ -35,10 +35,19 @@ MACHINE_GONE = "the machine died before the worker began"
 
 @dataclass(frozen=True)
 class TaskFailure:
-    """The last failure of a task on a node."""
+    """The last failure of a task at a place."""
 
     task: TaskId
     reason: str
+    card: str = field(default="", compare=False)  # Node.card of its GPU
+
+
+@dataclass(frozen=True)
+class Misfortune:
+    """A failure of a task, of which its place may be the cause."""
+
+    kind: Failure
+    where: tuple[str, str]  # Node.id and Node.card
 
 
 @dataclass(frozen=True)
@@ -52,10 +61,10 @@ class Leave:
 
 @dataclass(frozen=True)
 class NodeState:
-    """One node, as far as something has happened there."""
+    """One node or GPU, as far as something has happened there."""
 
-    id: str  # Node.id
-    host: str = ""  # of one in quarantine or that leaves
+    id: str  # Node.id or Node.card
+    host: str = ""  # of one in quarantine or that leaves, with the GPU if it is one
     failures: tuple[TaskFailure, ...] = ()  # of different tasks since the last success
     sound: bool = False  # what happened there last was a success
     until: float | None = None  # seconds since the epoch; None = it is not in quarantine
@@ -64,7 +73,7 @@ class NodeState:
     leave: Leave | None = None
 
 
-Nodes = Mapping[str, NodeState]  # by Node.id
+Nodes = Mapping[str, NodeState]  # by Node.id or Node.card
 
 
 def by_host(nodes: Iterable[NodeState]) -> tuple[NodeState, ...]:
@@ -93,16 +102,18 @@ def leave_text(record: NodeLeaving) -> str:
     return f"{record.host} ({record.node[:8]}) leaves{when}: {why_leaving(record.kind)}"
 
 
-def follow(nodes: Nodes, record: Record, where: str, time: float) -> Nodes:
+def follow(nodes: Nodes, record: Record, where: Iterable[str], time: float) -> Nodes:
     """The nodes after a record; the same object if it changes nothing of them.
 
-    Args: where, Node.id of the latest attempt at the record's task; time of the record, epoch seconds.
+    Args: where, Node.id and Node.card of the latest attempt at the record's task; time of the record, epoch
+    seconds.
     """
     match record:
         case TaskFailed():
             return _after_failure(nodes, record)
         case CheckpointSaved() | ModelSaved() | ScoresSaved() | MeasuresSaved() | EvaluationSaved():
-            return _after_success(nodes, where)
+            for id in filter(None, where):
+                nodes = _after_success(nodes, id)
         case NodeQuarantined():
             return _quarantine(nodes, record)
         case NodeReleased():
@@ -126,30 +137,40 @@ def _leave(nodes: Nodes, record: NodeLeaving | NodeStaying | NodeLeft, leave: Le
 
 
 def _after_failure(nodes: Nodes, record: TaskFailed) -> Nodes:
-    """A shortage of memory counts against no node, nor does wrong input."""
+    """A shortage of memory counts against no place, nor does wrong input."""
     if not record.node or record.kind == Failure.MEMORY or record.preempted:
         return nodes
-    here = nodes.get(record.node) or NodeState(record.node)
-    failure = TaskFailure(record.task, record.reason)
-    repeated = any(failure in node.failures for node in nodes.values() if node.id != here.id)
-    if (repeated and here.sound) or (record.kind == Failure.INPUT and record.final):
-        nodes = {id: replace(node, failures=_without(node, record.task)) for id, node in nodes.items()}
-        return {**nodes, here.id: replace(here, failures=_without(here, record.task), sound=False)}
-    return {**nodes, here.id: replace(here, failures=(*_without(here, record.task), failure), sound=False)}
+    failure, changed = TaskFailure(record.task, record.reason, record.card), dict(nodes)
+    for here in filter(None, (record.node, record.card)):
+        known = nodes.get(here) or NodeState(here)
+        elsewhere = (node for id, node in nodes.items() if id not in (record.node, record.card))
+        repeated = known.sound and any(failure in node.failures for node in elsewhere)
+        if repeated or (record.kind == Failure.INPUT and record.final):
+            changed = {id: replace(it, failures=_without(it, record.task)) for id, it in changed.items()}
+            changed[here] = replace(known, failures=_without(known, record.task), sound=False)
+        else:
+            changed[here] = replace(known, failures=(*_without(known, record.task), failure), sound=False)
+    return changed
 
 
 def _after_success(nodes: Nodes, id: str) -> Nodes:
     """After a checkpoint or a result of a task."""
     here = nodes.get(id) or NodeState(id)
     after = replace(here, failures=here.failures if here.until else (), sound=True, quarantines=0)
-    return nodes if after == here or not id else {**nodes, id: after}
+    return nodes if after == here else {**nodes, id: after}
 
 
 def _quarantine(nodes: Nodes, record: NodeQuarantined) -> Nodes:
+    """What has failed on a GPU does not count against its node any more."""
+    others = {id: replace(node, failures=_off(node, record.node)) for id, node in nodes.items()}
     here = nodes.get(record.node) or NodeState(record.node)
     count = here.quarantines + 1
     here = replace(here, host=record.host, until=record.until, reason=record.reason, quarantines=count)
-    return {**nodes, here.id: here}
+    return {**others, here.id: here}
+
+
+def _off(node: NodeState, card: str) -> tuple[TaskFailure, ...]:
+    return tuple(failure for failure in node.failures if failure.card != card)
 
 
 def take_over(nodes: Nodes) -> Nodes:

@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from subprocess import PIPE, Popen
 
 import psutil
@@ -27,6 +28,7 @@ from panolog.orchestrator.run.records import Failure
 from panolog.workers.events import Notice
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import TaskId
+from tests.nvidia_smi import print_gpus
 from tests.orchestrator import scripted
 from tests.orchestrator.scripted import TASK, Fails, Holds, OnGpu, Short, Works
 from tests.ray_head import wait_until
@@ -42,6 +44,9 @@ def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayPool]:
     with pytest.MonkeyPatch.context() as patch:
         init, more = ray.init, {"num_gpus": len(CARDS), "include_dashboard": True}
         patch.setattr(ray, "init", lambda **options: init(**options | more))
+        path, folder = os.environ["PATH"], tmp_path_factory.mktemp("bin")
+        print_gpus(folder, patch, "".join(f"{i}, GPU-{i}, NVIDIA L4, 22900, 23034\n" for i in range(8)))
+        patch.setenv("PATH", f"{folder}:{path}")
         patch.setenv("CUDA_VISIBLE_DEVICES", ",".join(CARDS))
         with connect(None, tmp_path_factory.mktemp("run")) as pool:
             yield pool
@@ -213,6 +218,20 @@ def message(pool: RayPool, task: TaskId) -> object:
     return found[0]
 
 
+def test_a_worker_reports_its_gpu(pool: RayPool) -> None:
+    """Where Ray may be others' too, it chooses."""
+    (node,) = pool.nodes()
+    assert [gpu.uuid for gpu in node.gpus] == ["GPU-4", "GPU-6"]
+    for gpu, uuid in enumerate(("", "GPU-6")):
+        where = Placement(node.id, 0.25, 2**30, gpus=1.0, gpu=gpu, uuid=uuid)
+        hello, notice = islice(scripted.messages(pool, OnGpu(device="cuda"), where), 2)
+        assert isinstance(hello, Hello)
+        assert isinstance(notice, Notice)
+        assert hello.card == "GPU-" + notice.message.removeprefix("GPU-")
+        assert not uuid or hello.card == uuid
+        pool.cancel(TASK)
+
+
 def start(pool: RayPool, gpus: float, *numbers: int, fails: str = "", uuid: str = "") -> list[Attempt]:
     """Starts blocks on so much of a GPU each, and waits until each has said where it is."""
     node = pool.nodes()[0].id
@@ -271,6 +290,25 @@ def test_each_has_a_card_and_a_process_and_one_that_has_broken_its_context_harms
     assert all(works(pool, attempt) for attempt in [again, *others])
     wait_until(lambda: not any(map(psutil.pid_exists, (faulty.pid, crashed.pid))), "the end of both")
     assert end(pool, again, *others) == [Ended()] * 3
-    (chosen,) = start(pool, 1.0, 2, uuid="GPU-bb22")  # as where cards are unequal
-    assert chosen.card == "GPU-bb22"
-    assert end(pool, chosen) == [Ended()]
+
+
+def test_parts_of_a_gpu_run_on_the_gpu_that_they_are_planned_for(pool: RayPool) -> None:
+    """Ray alone puts both halves on one."""
+    uuids = [gpu.uuid for gpu in pool.nodes()[0].gpus]
+    one, other = (start(pool, 0.5, number, uuid=uuid)[0] for number, uuid in enumerate(uuids))
+    assert [one.card, other.card] == uuids
+    assert end(pool, one, other) == [Ended()] * 2
+
+
+def test_a_whole_gpu_waits_for_parts_that_ray_has_spread(pool: RayPool) -> None:
+    halves = start(pool, 0.5, 0, 1, 2, 3)
+    first = {attempt.card: attempt for attempt in halves}
+    assert set(first) == set(CARDS)
+    assert end(pool, *first.values()) == [Ended()] * 2
+    rest, whole = [attempt for attempt in halves if attempt not in first.values()], TaskId.block(4)
+    pool.start(Placement(pool.nodes()[0].id, 0.25, 2**30, gpus=1.0, gpu=0), OnGpu(task=whole))
+    assert pool.waiting(whole)  # so it does not count as one that hangs
+    assert end(pool, *rest) == [Ended()] * 2
+    assert isinstance(message(pool, whole), Hello)
+    assert not pool.waiting(whole)
+    pool.cancel(whole)

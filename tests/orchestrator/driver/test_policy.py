@@ -4,6 +4,7 @@ from typing import Any
 import pytest
 
 from panolog.orchestrator.driver.policy import LOSSES, Consequence, after_failure, outcome, ready
+from panolog.orchestrator.run.machines.nodes import Misfortune
 from panolog.orchestrator.run.records import (
     BlockPlan,
     CheckpointSaved,
@@ -172,12 +173,14 @@ def test_retries_are_limited() -> None:
 
 
 def test_input_is_wrong_once_a_second_node_or_attempt_has_confirmed_it() -> None:
-    found = TaskState(COARSE, errors=1, failures=(("a", Failure.INPUT),))
+    found = TaskState(COARSE, errors=1, failures=(Misfortune(Failure.INPUT, ("a", "")),))
     assert not consequence(TaskState(COARSE), Failure.INPUT).final
     assert not consequence(found, Failure.INPUT, node="a").final
     assert consequence(found, Failure.INPUT, node="b").final
     assert consequence(found, Failure.INPUT, node="a", others=False).final
-    assert not consequence(replace(found, failures=(("b", Failure.ERROR),)), Failure.INPUT).final
+    assert not consequence(
+        replace(found, failures=(Misfortune(Failure.ERROR, ("b", "")),)), Failure.INPUT
+    ).final
 
 
 def test_a_death_is_not_held_against_the_task_but_not_for_ever() -> None:

@@ -58,13 +58,9 @@ def test_without_gpus_nobody_is_asked(monkeypatch: pytest.MonkeyPatch, tmp_path:
     assert describe_gpus(1) == (Gpu(),)
 
 
-def test_gpus_are_unequal_by_name_or_by_a_gibibyte() -> None:
-    def unequal(*gpus: Gpu) -> bool:
-        return Node("a", "host", 8, 2**30, gpus).unequal
-
-    assert unequal(LARGE, SMALL)
-    assert unequal(LARGE, Gpu(LARGE.name, LARGE.memory - 2 * 2**30))
-    assert not unequal(LARGE, Gpu(LARGE.name, LARGE.memory - MIB))
+def test_a_card_is_known_by_its_uuid_or_by_its_place() -> None:
+    machine = Node("a", "host", 8, 2**30, (LARGE, Gpu("MIG 1g")))
+    assert [machine.card(gpu) for gpu in range(2)] == [LARGE.uuid, "a/1"]
 
 
 @pytest.mark.parametrize(

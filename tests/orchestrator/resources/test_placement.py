@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -122,9 +123,35 @@ def test_who_ran_out_of_memory_again_gets_a_larger_gpu() -> None:
     assert where([again], nodes[:1]) == {"again": ("a", 0)}  # the larger one is gone: better than never
 
 
-def test_cuda_is_told_which_gpu_only_where_they_differ() -> None:
-    unequal, equal = (placed([block("x")], [node("a", gpu, FAST)]) for gpu in (SLOW, FAST))
-    assert (unequal["x"].uuid, equal["x"].uuid) == ("GPU-s", "")
+def test_gpus_are_shared_only_by_more_tasks_than_there_are_gpus() -> None:
+    two, three = ([block(str(i), gib=2) for i in range(count)] for count in (2, 3))
+    assert [p.kind for p in placed(two, [node("a", FAST, FAST)]).values()] == ["fast", "fast"]
+    assert [p.gpus for p in placed(three, [node("a", FAST, FAST)]).values()] == [0.5] * 3
+
+
+def test_no_whole_gpu_is_planned_where_parts_are_taken() -> None:
+    """Ray may have put these on any GPU of the node."""
+    part = on_gpu("a", 0, gpus=0.25)
+    (place,) = placed([block("x", gib=2)], [node("a", FAST, FAST)], part).values()
+    assert (place.gpu, place.gpus) == (1, 0.25)
+
+
+def test_a_gpu_is_pinned_only_where_they_differ() -> None:
+    def pinned(machine: Node) -> tuple[str, bool]:
+        (found,) = placed([block("x")], [machine]).values()
+        return found.uuid, found.pinned
+
+    assert pinned(node("a", SLOW, FAST)) == ("GPU-s", True)
+    assert pinned(node("a", FAST, FAST)) == ("GPU-f", False)
+    assert pinned(replace(node("a", FAST, FAST), closed=(1,))) == ("GPU-f", True)
+    assert not pinned(node("a", FAST, Gpu("fast", 24 * GIB - 2**20, "GPU-e")))[1]
+    assert pinned(node("a", FAST, Gpu("fast", 22 * GIB, "GPU-e")))[1]
+
+
+def test_no_task_gets_a_gpu_that_is_in_quarantine() -> None:
+    tasks = [block(str(i), gib=20) for i in range(3)]
+    machine = replace(node("a", FAST, FAST), closed=(0,))
+    assert where(tasks, [machine]) == {"0": ("a", 1)}
 
 
 def test_cores_go_with_gpus() -> None:
