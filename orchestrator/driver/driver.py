@@ -63,6 +63,7 @@ from panolog.workers.training.trainer import TrainSpec
 
 _WAIT_S = 0.5  # after which the display is refreshed without a message
 _TURN_S = 0.05  # the same while something large is written
+_STARTS_S = 1.0  # of a turn in which tasks are started: what blocks begin with may take minutes to cut
 _REVIEW_S = 60.0  # after which it is decided anew whether a task waits for another node than where it failed
 _LOOK_S = 10.0  # the same while machines are on their way
 _ENDS = (Trained, Scored, Ended, Failed)  # after these messages another task may start
@@ -218,7 +219,7 @@ class Driver:
         there, changed = self._machines.review()
         nodes, job = tuple(there), self._job
         self._news = self._news or changed
-        while self._news or nodes != self._nodes or self._clock.monotonic() >= self._again:
+        if self._news or nodes != self._nodes or self._clock.monotonic() >= self._again:
             self._nodes, self._news, self._again = nodes, False, math.inf
             if (end := job.outcome(self._state)) is not None:
                 return end
@@ -240,16 +241,17 @@ class Driver:
         self._journal.record(records)
 
     def _place(self, tasks: Sequence[TaskId]) -> None:
-        """Starts those of the tasks for which there is room now."""
+        """Starts those of the tasks for which there is room, as far as messages need not wait for long."""
         demands = Demands(self._sizes, self._state)
-        placements = {task: attempt.placement for task, attempt in self._attempts.items()}
-        running = demands.running(placements, self._clock.time())
+        running = demands.running({t: it.placement for t, it in self._attempts.items()}, self._clock.time())
         nodes = quarantine.usable(self._state, self._nodes)
         waiting = demands.of(tasks)
-        placed = self._machines.place(waiting, lambda: demands.work(tasks), running, nodes)
-        for task, where in placed:
+        turn = self._clock.monotonic() + _STARTS_S
+        for task, where in self._machines.place(waiting, lambda: demands.work(tasks), running, nodes):
             self._start(task, where)
-        _LOG.debug("%d tasks wait for free resources", len(tasks) - len(placed))
+            if self._clock.monotonic() > turn:
+                self._news = True
+                break
         if any(self._state.task(task).failures and task not in self._attempts for task in tasks):
             self._again = self._clock.monotonic() + _REVIEW_S
         if self._machines.expecting:
@@ -271,8 +273,7 @@ class Driver:
             token, attempt = self._presence.token, state.attempts + 1
             outbox = self._journal.until_done(lambda: make_outbox(self._job.folder, task, attempt, token))
             spec = replace(spec, outbox=outbox)
-        now = self._clock.monotonic()
-        self._attempts[task] = Attempt(spec, state.attempts + 1, iteration, where, now)
+        self._attempts[task] = Attempt(spec, state.attempts + 1, iteration, where, self._clock.monotonic())
         self._pool.start(where, self._hooks.on_start(spec))
         place = f"node {where.node[:8]}, {where.kind}, {where.threads} threads, {gib(where.memory)}"
         _LOG.info("%s: attempt %d from iteration %d on %s", task, state.attempts + 1, iteration, place)
@@ -300,7 +301,7 @@ class Driver:
             held_up = written | self._writers.held_up()  # what follows relies on what is recorded
             for task in held_up & self._attempts.keys():
                 self._attempts[task].latest = self._clock.monotonic()
-            ready = self._pool.ready(0 if records or self._writers.busy else _WAIT_S, held_up)
+            ready = self._pool.ready(0 if records or self._writers.busy or self._news else _WAIT_S, held_up)
             self._deadlines.turn(self._attempts.values(), ready)
             for task in ready:
                 records += self._take(task)

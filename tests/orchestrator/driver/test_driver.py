@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.dashboard import pictures
 from panolog.orchestrator.dashboard.discovery import RunEntry
+from panolog.orchestrator.driver.attempts import WorkerSpec
+from panolog.orchestrator.driver.driver import Hooks
+from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Failed
 from panolog.orchestrator.run.records import (
     Failure,
@@ -34,7 +37,7 @@ from panolog.workers.seams.schema import parse_seams
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.trainer import TrainSpec
-from tests.orchestrator.fakes import DIED, CrashError, Harness, begins, fails, well
+from tests.orchestrator.fakes import DIED, CrashError, Harness, SetClock, begins, fails, well
 
 TRUNCATED = Failed("a.jpg is truncated", Failure.INPUT)
 
@@ -53,6 +56,23 @@ def test_a_run_ends_with_everything_in_its_place(harness: Harness) -> None:
     assert harness.records(SeamEvaluated) == [SeamEvaluated(EVAL, "0|1", face.seam)]
     assert not list(harness.folder.root.rglob("checkpoint.safetensors"))
     assert harness.state == state
+
+
+def test_messages_are_handled_between_two_starts_that_take_long(tmp_path: Path) -> None:
+    """Else a notice that a machine leaves would expire while hundreds of blocks are started."""
+    harness = Harness(tmp_path, (Node("node", "host", 8, 2**40),), blocks="2x2x1")
+    harness.clock = clock = SetClock()
+    begun = list[int]()
+
+    def slow(spec: WorkerSpec) -> TaskSpec:
+        if spec.task.stage is Stage.BLOCK:
+            running = [task for task in harness.state.tasks.values() if task.status == Status.RUNNING]
+            begun.append(len(harness.pool.running) - len(running))
+            clock.sleep(60)
+        return spec
+
+    assert harness.drive(hooks=Hooks(on_start=slow)).outcome == "done"
+    assert begun == [0] * 4  # when one is started, all before it have said Hello
 
 
 def test_of_many_previews_the_first_the_latest_and_some_between_are_kept(harness: Harness) -> None:
