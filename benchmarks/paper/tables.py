@@ -70,7 +70,7 @@ def _of_group(results: Results, group: Group, scene: Path, *, first: bool) -> Ta
     base = group.variants[0]
     rows = [row for name in group.variants if (row := _row(results, scene.name, name, base))]
     notes = [group.note] if group.note and first else []
-    found = [reference.TABLES[group.source]] if group.source else []
+    found = [reference.PUBLISHED[f"table/{group.source}"]] if group.source else []
     if group.name == "main" and (known := reference.published(scene)):
         found.append(known)
     none = (None,) * 3
