@@ -16,10 +16,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks import report
-from benchmarks.dashboard.simulated_run import RunSize
 from benchmarks.driver_scale.__main__ import Load
 from benchmarks.paper.curves import standalone
-from benchmarks.scale import cities, driver, laws, machines, models
+from benchmarks.scale import cities, driver, laws, merging, models
 from benchmarks.scale.page import page
 from panolog.orchestrator.run.folder import write_json
 from panolog.scene.errors import ConfigError
@@ -63,27 +62,15 @@ class Parts:
         load = Load(12, 4, 10.0, 0.5) if self._quick else Load(10_000, 2_000, 0.2, 60.0)
         return {"driver": asdict(driver.measure(self._disk, load))}
 
-    def dashboard(self) -> Found:
-        """The dashboard of as many blocks."""
-        if self._quick:
-            found = driver.show(self._disk, RunSize(12, 500, 4, 40), clients=1, records=2)
-        else:
-            found = driver.show(self._disk, RunSize(10_000, 1_000_000, 2_000, 400), clients=5, records=5)
-        return {"dashboard": asdict(found)}
-
     def merge(self) -> Found:
         """The merge."""
         sizes, each = ([1000, 2000], 500) if self._quick else ([2_500_000, 10_000_000, 40_000_000], 200_000)
-        return {"merge": [asdict(row) for row in models.merges(self._disk, sizes, each)]}
+        return {"merge": [asdict(row) for row in merging.merges(self._disk, sizes, each)]}
 
     def levels(self) -> Found:
         """The levels of detail."""
         sizes, each = ([150, 300], 20) if self._quick else ([75, 300, 1200, 2400], 500)
         return {"levels": [asdict(row) for row in models.hierarchies(self._disk, sizes, each)]}
-
-    def machines(self) -> Found:
-        """Which machine, and how many hours."""
-        return {"machines": [asdict(row) for row in machines.hours(2900 if self._quick else 100_000)]}
 
     def all(self) -> dict[str, Callable[[], Found]]:
         """By name, in the order of the page."""
@@ -91,10 +78,8 @@ class Parts:
             "cities": self.cities,
             "laws": self.laws,
             "driver": self.driver,
-            "dashboard": self.dashboard,
             "merge": self.merge,
             "levels": self.levels,
-            "machines": self.machines,
         }
 
 

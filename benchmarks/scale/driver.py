@@ -1,6 +1,5 @@
-"""The driver with very many blocks and workers, killed in the middle and resumed; then the run's pages."""
+"""The driver with very many blocks and workers, killed in the middle and resumed."""
 
-import asyncio
 import os
 import socket
 import subprocess
@@ -13,9 +12,6 @@ from statistics import median
 
 import numpy as np
 
-from benchmarks.dashboard.__main__ import DashboardMeasurement
-from benchmarks.dashboard.__main__ import measure as measure_dashboard
-from benchmarks.dashboard.simulated_run import RunSize, write_run
 from benchmarks.driver_scale.__main__ import Load, Stopwatch, prepare
 from benchmarks.driver_scale.simulated_pool import SimulatedPool
 from benchmarks.processes import in_fresh_process, peak_memory
@@ -77,14 +73,6 @@ class DriverScale:
     decision: Decision
 
 
-@dataclass(frozen=True)
-class DashboardScale:
-    """The dashboard of a run whose history was written without running it."""
-
-    size: RunSize
-    measured: DashboardMeasurement
-
-
 class _Watch(Stopwatch):
     """Ends the driver when so many blocks are done, and notes when all workers have work."""
 
@@ -120,12 +108,6 @@ def measure(folder: Path, load: Load) -> DriverScale:
     decision = in_fresh_process(decide, load.blocks - load.workers, load.workers)
     database = RunFolder(root).database.stat().st_size / 1e6
     return DriverScale(load, first, resumed, status, database, decision)
-
-
-def show(folder: Path, size: RunSize, clients: int, records: int) -> DashboardScale:
-    """Args: clients, those besides the measured one; records whose delay is measured."""
-    made = write_run(folder / "run", size)
-    return DashboardScale(size, asyncio.run(measure_dashboard(made, size, clients, records)))
 
 
 def _seconds(command: Sequence[str]) -> float:

@@ -1,15 +1,13 @@
-"""Models on disk: merge and levels of detail of more and more Gaussians, and the law that they follow."""
+"""Levels of detail of larger and larger cities."""
 
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from benchmarks.merge_scale import measure as measure_merge
 from benchmarks.processes import in_fresh_process, peak_memory, resident_memory
 from benchmarks.scale.places import city
 from panolog.orchestrator.estimates.suggestions import balanced
@@ -29,18 +27,6 @@ _CUTS = 4  # blocks whose files are measured
 
 
 @dataclass(frozen=True)
-class MergeRow:
-    """One merge. Speeds are of `cat` of the same files before and after it."""
-
-    blocks: int
-    gaussians: int
-    seconds: float
-    speed: float  # 1e6 bytes per second
-    cat: float
-    memory: float  # 1e6 bytes of its process beyond what it had before
-
-
-@dataclass(frozen=True)
 class LevelsRow:
     """The levels of detail of a city's Stage I model, as the driver makes and uses them."""
 
@@ -51,17 +37,6 @@ class LevelsRow:
     memory: float  # bytes of a Gaussian, at the peak, beyond the model itself
     cut: float  # seconds to write what a block starts from
     starts: int  # Gaussians of others in that, on average
-
-
-def merges(folder: Path, sizes: Sequence[int], each: int) -> Iterator[MergeRow]:
-    """Merges of so many Gaussians in blocks of `each`, one after another. Raises as `merge_scale`."""
-    for size in sizes:
-        blocks = max(2, size // each)
-        with TemporaryDirectory(dir=folder) as root:
-            first, merge, last = measure_merge(Path(root), blocks, size, seed=0)
-        memory = (merge.peak or 0.0) - (merge.before or 0.0)
-        cat = (first.speed + last.speed) / 2
-        yield MergeRow(blocks, size, merge.seconds, merge.speed, cat, memory)
 
 
 def hierarchies(folder: Path, sizes: Sequence[int], each: int) -> Iterator[LevelsRow]:
@@ -111,9 +86,3 @@ def _cameras(scene: Scene, config: RunConfig, block: int) -> list[int]:
     box = config.partition.box(scene.centers[train])
     rows: list[int] = train[config.grid.block_of(contract(scene.centers[train], box)) == block].tolist()
     return rows
-
-
-def exponent(sizes: Sequence[float], values: Sequence[float]) -> tuple[float, float]:
-    """(factor, exponent) of the power law through positive values, least squares of the logarithms."""
-    slope, offset = np.polyfit(np.log(sizes), np.log(values), 1)
-    return float(np.exp(offset)), float(slope)

@@ -4,26 +4,17 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.contention import Phase, rows
-from benchmarks.dashboard.simulated_run import RunSize, write_run
 from benchmarks.driver_scale.__main__ import lost
-from benchmarks.merge_scale import SKY, _check, fill, measure
 from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.runs import clock, stage_seconds
+from benchmarks.scale.merging import SKY, _check, fill, measure
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Progressed, Stored
-from panolog.orchestrator.run.state import Status, replay
-from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.run.thinning import DENSE
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import join_ply, ply_header
 from panolog.workers.tasks import TaskId
 from tests.benchmarks.histories import ONE, ZERO, written
-
-
-def test_rates_among_other_processes_have_medians_spread_and_ratios() -> None:
-    phases = [Phase(0, 2, (9.0, 10.0, 12.0)), Phase(1, 2, (5.0, 7.0, 4.0))]
-    assert rows(phases) == [(0, 2, 10.0, 9.0, 12.0, 1.0), (1, 2, 5.0, 4.0, 7.0, 0.5)]
 
 
 def test_lost_repeated_and_late_events_are_counted() -> None:
@@ -35,12 +26,6 @@ def test_lost_repeated_and_late_events_are_counted() -> None:
     kept = [Stored(i, 0.0, Progressed(ZERO, i, 300, 1.0)) for i in (*range(1, DENSE + 1), 200, 300)]
     assert lost({ZERO: 300}, kept) == 0
     assert lost({ZERO: 300}, kept[:-1]) == 1
-
-
-def test_a_simulated_run_is_a_run(tmp_path: Path) -> None:
-    state = replay(read_milestones(write_run(tmp_path / "run", RunSize(8, 400, 3)).database))
-    statuses = [state.status(TaskId.block(block)) for block in range(8)]
-    assert statuses == [Status.DONE] * 6 + [Status.RUNNING] * 2
 
 
 def test_a_wrong_merge_and_a_full_disk_are_noticed(tmp_path: Path) -> None:

@@ -1,6 +1,4 @@
-"""What the merge of a very large run needs: its peak memory, and its speed compared with a plain copy.
-
-    python -m benchmarks.merge_scale [--blocks 200] [--gaussians 40000000] [--folder FOLDER] [--json]
+"""The merge of a very large run: its peak memory, its speed compared with a plain copy, and a power law.
 
 A run folder is filled with random models, as a driver leaves it when all blocks are trained. Then one process
 joins the files with `cat`, another merges the run as the driver does, and a third runs `cat` again. Each turn
@@ -10,17 +8,15 @@ begins with the files out of the page cache and ends when its result is on the d
 import os
 import shutil
 import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks import report
 from benchmarks.processes import drop_from_page_cache, in_fresh_process, peak_memory
 from benchmarks.rasterizer.cases import street
 from panolog.orchestrator.run.folder import RunFolder, write_json
@@ -38,35 +34,47 @@ from panolog.workers.tasks import COARSE, TaskId
 
 SKY = 100_000  # the default of `sky.count`
 ROW = 4 * len(COLUMNS)  # bytes
-HEAD = ("turn", "seconds", "MB/s", "peak MB", "peak MB before it began")
 _PIECE = 2**20  # bytes compared at a time
 
 
 @dataclass(frozen=True)
-class JoinMeasurement:
-    """One way to join all files into one."""
+class MergeRow:
+    """One merge."""
 
-    name: str
+    blocks: int
+    gaussians: int
     seconds: float
     speed: float  # 1e6 bytes of the result per second
-    peak: float | None = None  # 1e6 bytes of resident memory of the process that did it
-    before: float | None = None  # the same after the imports, before it read anything
+    cat: float  # the same of `cat` of the same files, before and after it
+    memory: float  # 1e6 bytes of its process beyond what it had before
 
 
-def measure(root: Path, blocks: int, gaussians: int, seed: int) -> list[JoinMeasurement]:
+def merges(folder: Path, sizes: Sequence[int], each: int) -> Iterator[MergeRow]:
+    """Merges of so many Gaussians in blocks of `each`, one after another. Raises as `measure`."""
+    for size in sizes:
+        with TemporaryDirectory(dir=folder) as root:
+            yield measure(Path(root), max(2, size // each), size, seed=0)
+
+
+def measure(root: Path, blocks: int, gaussians: int, seed: int) -> MergeRow:
     """Fills the folder `root` and measures the three turns.
 
     Raises InputError if the disk is too small, RunError if the merged model is not what the blocks hold.
     """
     size = (gaussians + SKY) * ROW
     if shutil.disk_usage(root).free < 2.1 * size:
-        raise InputError(f"{root}: needs {gib(2.1 * size)} of free disk; make room or give --folder")
+        raise InputError(f"{root}: needs {gib(2.1 * size)} of free disk; make room or give another folder")
     folder = RunFolder(root)
     sources = fill(folder, blocks, gaussians, seed)
     output = folder.point_cloud
-    before, merged = _cat(sources, output), _merge(root, sources, output)
+    first = _cat(sources, output)
+    _reset(sources, output)
+    # in a fresh process, which has the memory of a driver that does nothing else
+    seconds, before, peak = in_fresh_process(merge, folder)
     _check(sources, output)
-    return [before, merged, _cat(sources, output)]
+    mega = output.stat().st_size / 1e6
+    cat = (first + _cat(sources, output)) / 2
+    return MergeRow(blocks, gaussians, seconds, mega / seconds, cat, (peak - before) / 1e6)
 
 
 def fill(folder: RunFolder, blocks: int, gaussians: int, seed: int) -> list[Path]:
@@ -107,21 +115,14 @@ def _reset(sources: Sequence[Path], output: Path) -> None:
         drop_from_page_cache(path)
 
 
-def _cat(sources: Sequence[Path], output: Path) -> JoinMeasurement:
+def _cat(sources: Sequence[Path], output: Path) -> float:
+    """1e6 bytes of the result per second."""
     _reset(sources, output)
     started = time.perf_counter()
     with output.open("wb") as file:
         subprocess.run(["cat", *sources], stdout=file, check=True)
         os.fsync(file.fileno())
-    seconds = time.perf_counter() - started
-    return JoinMeasurement("cat", seconds, output.stat().st_size / seconds / 1e6)
-
-
-def _merge(root: Path, sources: Sequence[Path], output: Path) -> JoinMeasurement:
-    """In a fresh process, which has the memory of a driver that does nothing else."""
-    _reset(sources, output)
-    seconds, before, peak = in_fresh_process(merge, RunFolder(root))
-    return JoinMeasurement("merge", seconds, output.stat().st_size / seconds / 1e6, peak / 1e6, before / 1e6)
+    return output.stat().st_size / (time.perf_counter() - started) / 1e6
 
 
 def merge(folder: RunFolder) -> tuple[float, int, int]:
@@ -148,26 +149,7 @@ def _check(sources: Sequence[Path], output: Path) -> None:
                         raise RunError(f"{output} differs from {path}")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The program; returns its exit code."""
-    parser = report.parser("merge_scale", __doc__)
-    parser.add_argument("--blocks", type=int, default=200)
-    parser.add_argument("--gaussians", type=int, default=40_000_000, help="of all blocks together")
-    parser.add_argument("--folder", type=Path, help="on the disk to measure; by default that of TMPDIR")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args(arguments)
-    if options.quick:
-        options.blocks, options.gaussians = 8, 20_000
-
-    def work() -> report.Report:
-        with tempfile.TemporaryDirectory(prefix="merge-", dir=options.folder) as folder:
-            turns = measure(Path(folder), options.blocks, options.gaussians, options.seed)
-        title = f"{options.blocks} blocks, {options.gaussians + SKY:,} Gaussians"
-        table = report.markdown(HEAD, [astuple(turn) for turn in turns])
-        return report.Report({"turns": [asdict(turn) for turn in turns]}, f"{title}\n\n{table}")
-
-    return report.run("merge_scale", options, work)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def exponent(sizes: Sequence[float], values: Sequence[float]) -> tuple[float, float]:
+    """(factor, exponent) of the power law through positive values, least squares of the logarithms."""
+    slope, offset = np.polyfit(np.log(sizes), np.log(values), 1)
+    return float(np.exp(offset)), float(slope)

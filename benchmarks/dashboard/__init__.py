@@ -1,1 +1,0 @@
-"""The dashboard of a very large run."""
