@@ -50,13 +50,6 @@ ITERATION = """## One training iteration
 Random streets with the distribution of a trained model, and the trained model. The photographs have 2,048
 pixels; for the widest rows they are enlarged, which does not change the time. The last table says what
 forward and backward are made of."""
-LONG = """## A long run
-
-    python -m benchmarks.three_days --plot CURVES.svg
-
-The driver over three simulated days of 1,000 blocks on 80 GPUs that fail: its memory, descriptors, CPU and
-files against their bounds, and the makespan against that of list scheduling.
-[benchmarks/README.md](../benchmarks/README.md) says what is simulated."""
 DETAILS = """<details>
 <summary>All measurements: {} rows</summary>
 
@@ -124,7 +117,6 @@ def page(rows: Sequence[Row]) -> str:
         READING,
         ITERATION,
         DETAILS.format(len(rows), tables(rows)),
-        *([LONG] if on_cpu else []),
     ]
     return "\n\n".join(parts) + "\n"
 

@@ -3,7 +3,7 @@
 import socket
 import subprocess
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +16,7 @@ from panolog.scene.errors import RunError
 from tests.ray_head import BIN, all_end, cluster_environment, free_ports
 
 HEAD, SECOND, DRIVER = GROUPS = "head", "second", "driver"  # of processes that have faults in common
-THIRD, FOURTH = "third", "fourth"
+_NODES = HEAD, SECOND
 _TMP = "/tmp"  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _NO_WORK = ("ray::IDLE", "ray::Agent", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
 _TIMEOUT_S = 600.0  # for a node to start, also on a busy machine
@@ -29,17 +29,9 @@ def two_nodes(hidden: Path) -> Iterator["LocalCluster"]:
 
     Args: hidden, a folder that the second node does not see, if namespaces can be made.
     """
-    with laid(hidden) as cable, started(cable, {HEAD: 1, SECOND: 1}) as cluster:
-        yield cluster
-
-
-@contextmanager
-def started(
-    cable: Cable | None, cores: Mapping[str, int], variables: Mapping[str, Mapping[str, str]] | None = None
-) -> Iterator["LocalCluster"]:
-    """A cluster for as long as the context lasts. Args: as `LocalCluster`. Raises as `two_nodes`."""
-    with TemporaryDirectory(prefix="chaos-", dir=_TMP, ignore_cleanup_errors=True) as folder:
-        cluster = LocalCluster(Path(folder), cable, cores, variables or {})
+    temporary = TemporaryDirectory(prefix="chaos-", dir=_TMP, ignore_cleanup_errors=True)
+    with laid(hidden) as cable, temporary as folder:
+        cluster = LocalCluster(Path(folder), cable)
         with all_end():  # the children of a killed node or driver too
             cluster.keep()
             cluster.wait()
@@ -47,18 +39,11 @@ def started(
 
 
 class LocalCluster:
-    """A head and other nodes, whose processes take faults, as do drivers."""
+    """A head and a second node of one core each, whose processes take faults, as do drivers."""
 
-    def __init__(
-        self,
-        folder: Path,
-        cable: Cable | None,
-        cores: Mapping[str, int],
-        variables: Mapping[str, Mapping[str, str]],
-    ) -> None:
+    def __init__(self, folder: Path, cable: Cable | None) -> None:
         """The second node is at the end of the cable if there is one.
 
-        Args: cores of each node by its name, HEAD first; variables, environment of nodes besides.
         Raises RunError if the library of `shim` cannot be built.
         """
         self._folder = folder
@@ -66,8 +51,7 @@ class LocalCluster:
         (self._port,) = free_ports(1)
         self._environment = cluster_environment()
         self._library = build(folder)
-        self._cores, self._variables = cores, variables
-        self.controls = {name: Control(folder / f"{name}.control") for name in (*cores, DRIVER)}
+        self.controls = {name: Control(folder / f"{name}.control") for name in GROUPS}
         self._nodes: dict[str, subprocess.Popen[bytes]] = {}
 
     @property
@@ -86,19 +70,18 @@ class LocalCluster:
 
     def environment(self, group: str) -> dict[str, str]:
         """Of a node or of DRIVER."""
-        faults = self.controls[group].environment(self._library)
-        return {**self._environment, **faults, **self._variables.get(group, {})}
+        return {**self._environment, **self.controls[group].environment(self._library)}
 
     def keep(self) -> None:
         """Starts the nodes that do not run, as a service manager would; returns before they have joined."""
-        for name in self._cores:
+        for name in _NODES:
             if name not in self._nodes or self._nodes[name].poll() is not None:
                 self._start(name)
 
     def wait(self) -> None:
         """Until all nodes have joined. Raises RunError if one does not."""
         end = time.monotonic() + _TIMEOUT_S
-        while not (_answers(self._host, self._port) and all(map(self.raylet, self._cores))):
+        while not (_answers(self._host, self._port) and all(map(self.raylet, _NODES))):
             if time.monotonic() > end:
                 raise RunError(f"the Ray cluster did not start; see {self._folder}")
             time.sleep(_POLL_S)
@@ -107,14 +90,6 @@ class LocalCluster:
     def raylet(self, node: str = SECOND) -> psutil.Process | None:
         """That of a node; without it, the node ends."""
         return self._process(node, "raylet")
-
-    def node_id(self, node: str) -> str:
-        """Node.id of a node; "" if it does not run now."""
-        raylet, option = self.raylet(node), "--node_id="
-        with suppress(psutil.Error):
-            words = raylet.cmdline() if raylet else ()
-            return next((word.removeprefix(option) for word in words if word.startswith(option)), "")
-        return ""
 
     def gcs(self) -> psutil.Process | None:
         """The head's record of the cluster; without it, the head ends."""
@@ -143,7 +118,7 @@ class LocalCluster:
             host, enter = self.cable.far, self.cable.enter
         agent, metrics = free_ports(2)
         command = [*enter, str(BIN / "ray"), "start", "--block", f"--node-ip-address={host}"]
-        command += [f"--num-cpus={self._cores[name]}", "--object-store-memory=100000000"]
+        command += ["--num-cpus=1", "--object-store-memory=100000000"]
         command += ["--min-worker-port=0", "--max-worker-port=0"]
         command += [f"--dashboard-agent-listen-port={agent}", f"--metrics-export-port={metrics}", *options]
         with (self._folder / f"{name}.log").open("ab") as log:

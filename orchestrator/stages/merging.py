@@ -36,7 +36,7 @@ from panolog.workers.merge import merge, retained
 from panolog.workers.tasks import COARSE, MERGE, TaskId
 from panolog.workers.training.checkpoint import SavedModel
 
-_TRAINED = 0.5  # of its iterations, from which on a checkpoint is used: `benchmarks.money.early_end`
+_TRAINED = 0.5  # of its iterations, from which on a checkpoint is used: measured in docs/money.md
 
 
 @dataclass(frozen=True, eq=False)

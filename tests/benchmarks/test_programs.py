@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.movers.__main__ import TRAININGS
 from benchmarks.runs import history
-from benchmarks.three_days.faults import Fault
 from panolog.orchestrator.run.records import ModelSaved, TaskStarted
 from panolog.scene.colmap import write_colmap
 from panolog.workers.tasks import Stage
@@ -32,26 +29,9 @@ def chaos(found: Found, _: Path) -> None:
     assert disturbed["digest"] == undisturbed["digest"], disturbed["end"]
 
 
-def notices(found: Found, _: Path) -> None:
-    calm, moved = (run for run in found["runs"] if run["nodes"] == 3)
-    assert moved["digest"] == calm["digest"], moved["end"]
-    assert moved["cost"]["redone"] == 0
-    assert moved["cost"]["checkpoint"] is not None
-
-
-def contention(found: Found, _: Path) -> None:
-    assert [phase["taken"] for phase in found["phases"]][:2] == [0, 1]
-    assert all(rate > 0 for phase in found["phases"] for rate in phase["rates"])
-
-
 def cuda_resources(found: Found, _: Path) -> None:
     names = {kernel["name"] for kernel in found["kernels"]}
     assert {"project_forward", "composite_backward", "loss_gradient", "adam_step"} <= names
-
-
-def dashboard(found: Found, _: Path) -> None:
-    measured = found["report"]
-    assert min(measured["warm"], *measured["alone"], *measured["among"]) > 0
 
 
 def driver_scale(found: Found, _: Path) -> None:
@@ -60,16 +40,6 @@ def driver_scale(found: Found, _: Path) -> None:
     assert measured["lost"] == 0
     assert set(measured["status"]) == {"function", "command"}
     assert all(times["median"] > 0 for times in measured["status"].values())
-
-
-def merge_scale(found: Found, _: Path) -> None:
-    assert [turn["name"] for turn in found["turns"]] == ["cat", "merge", "cat"]
-    assert 0 < found["turns"][1]["before"] <= found["turns"][1]["peak"]
-
-
-def movers(found: Found, _: Path) -> None:
-    trained = [(result["seed"], result["scene"], result["masks"]) for result in found["results"]]
-    assert trained == [(seed, *training) for seed, training in product((0, 1), TRAININGS)]
 
 
 def paper(found: Found, folder: Path) -> None:
@@ -93,11 +63,6 @@ def performance(found: Found, _: Path) -> None:
     assert "street" in Path(found["page"]).read_text()
 
 
-def saving(found: Found, _: Path) -> None:
-    assert [one["writers"] for one in found["measured"]] == [1, 2, 4]
-    assert all(one["most"] <= one["writers"] for one in found["measured"])
-
-
 def scale(found: Found, _: Path) -> None:
     first, resumed = found["driver"]["first"], found["driver"]["resumed"]
     assert first["messages"] > 0 and resumed["messages"] > 0
@@ -117,16 +82,6 @@ def sfm(found: Found, _: Path) -> None:
     assert (ours["registered"], ours["contradictions"]) == (5, 0)
     assert ours["drift"] < 1.0
     assert ours["step"] == pytest.approx(1.0, abs=0.05)
-
-
-def three_days(found: Found, folder: Path) -> None:
-    assert found["problems"] == []
-    assert [bound for bound in found["bounds"] if not bound["met"] and not bound["timed"]] == []
-    assert (found["faults"]["driver killed"], found["faults"]["driver stopped"]) == (3, 1)
-    assert all(found["faults"][kind.value] for kind in (Fault.NODE_LOST, Fault.BAD_NODE))
-    assert found["samples"][-1]["done"] > found["load"]["blocks"]
-    assert (folder / "curves.svg").stat().st_size > 10_000
-    assert [path.name for path in folder.iterdir()] == ["curves.svg"]
 
 
 @pytest.fixture(scope="module")
@@ -151,25 +106,18 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {"scene": noise, "street": street}
 
 
-PARTS = "cities,driver,dashboard,merge,levels"
+PARTS = "cities,driver,merge,levels"
 PAPER = (
     "{scene} -o {folder} --tables ablations,tau --width 32 --iterations 16 --set sky.count=20 --device cpu"
 )
 PROGRAMS: list[tuple[Callable[[Found, Path], None], str, str]] = [
     (chaos, "chaos", "--runs 1 --seed 4 --faults driver,eio"),
-    (notices, "chaos.notices", "--runs 1 --seconds 120 --nodes 3"),
-    (contention, "contention", "--quick"),
     (cuda_resources, "cuda_resources", "--arch sm_89"),
-    (dashboard, "dashboard", "--quick"),
     (driver_scale, "driver_scale", "--quick --folder {folder}"),
-    (merge_scale, "merge_scale", "--quick --folder {folder}"),
-    (movers, "movers", "{scene} -o {folder}/crowd --train --width 64 --iterations 20 --seeds 0,1"),
     (paper, "paper", PAPER),
     (performance, "performance", "--quick -o {folder}/performance.md"),
-    (saving, "saving", "--quick --folder {folder}"),
     (scale, "scale", f"--quick -o {{folder}} --only {PARTS}"),
     (sfm, "sfm", "{street}"),
-    (three_days, "three_days", "--quick --folder {folder} --plot {folder}/curves.svg"),
 ]
 
 

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.movers.__main__ import TRAININGS, Masks, Result, summary
 from benchmarks.movers.figures import Figure, Standpoint, draw
 from benchmarks.movers.paste import FIGURES, GROUP, chosen, paste
 from panolog.scene.errors import SceneError
@@ -52,20 +51,3 @@ def test_some_panoramas_with_figures_follow_each_other() -> None:
     assert len(rows) == len(set(rows)) == 12
     assert sorted(map(len, groups))[-2:] == [GROUP, GROUP]
     assert all(group == list(train[train.index(group[0]) :][: len(group)]) for group in groups)
-
-
-def test_differences_are_of_the_same_seed() -> None:
-    def result(scene: str, masks: Masks, seed: int, psnr: float) -> Result:
-        found = 0.5 if masks == "found" and scene == "figures" else None
-        return Result(scene, masks, seed, psnr, 0.0, 30.0, found, None, 1.0)
-
-    results = [
-        result(scene, masks, seed, 20 + 3 * seed + (0.5 + 0.1 * seed) * (scene == "figures"))
-        for seed in (0, 1)
-        for scene, masks in TRAININGS
-    ]
-    clean, _, crowd, found, _ = summary(results)
-    assert clean[:6] == ("clean", "none", 2, 21.5, 0, 0)
-    assert crowd[4:6] == pytest.approx((0.55, 0.05))
-    assert crowd[6:] == (30, None, None) and found[7] == 0.5
-    assert summary([one for one in results if one.seed == 0])[2][5] is None

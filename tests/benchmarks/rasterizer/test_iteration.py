@@ -5,7 +5,6 @@ import json
 import pytest
 import torch
 
-from benchmarks.rasterizer import pairs
 from benchmarks.rasterizer.cases import CaseSpec, street_case
 from benchmarks.rasterizer.iteration import TrainingStep, measure, stages
 from panolog.renderer import ops
@@ -61,10 +60,3 @@ def test_each_kernel_is_launched_once(capsys: pytest.CaptureFixture[str]) -> Non
     found = json.loads(capsys.readouterr().out)
     assert found["launches"] == dict.fromkeys(LAUNCHES, 1)
     assert 0 < found["fastest_ms"] <= found["median_ms"]
-
-
-def test_no_more_pairs_than_the_estimate_assumes(capsys: pytest.CaptureFixture[str]) -> None:
-    pairs.main(["--random", "2000,20000", "--width", "256,512", "--json"])
-    rows = json.loads(capsys.readouterr().out)
-    assert len(rows) == 4
-    assert all(1 < row["pairs"] < row["assumed"] for row in rows)

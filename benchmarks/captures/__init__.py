@@ -1,1 +1,0 @@
-"""Scenes as real cameras capture them, made of a scene without fault, and what is lost by that."""

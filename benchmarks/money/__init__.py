@@ -1,1 +1,0 @@
-"""What limits of cost and time do to a run."""

@@ -1,1 +1,0 @@
-"""Three days of a large run in minutes: the real driver, simulated machines that fail, a clock that jumps."""
