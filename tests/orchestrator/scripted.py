@@ -17,21 +17,9 @@ from panolog.scene.errors import DeviceError, InputError
 from panolog.scene.image_files import decode
 from panolog.scene.model import Scene
 from panolog.workers import stopping
-from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import (
-    Calibration,
-    Checkpoint,
-    CheckpointWritten,
-    Evaluated,
-    Event,
-    Notice,
-    Preview,
-    Scored,
-)
-from panolog.workers.scoring import ScoreSpec
+from panolog.workers.events import Checkpoint, Event, Notice, Preview
 from panolog.workers.specs import Source, TaskSpec, Value
 from panolog.workers.tasks import COARSE, TaskId
-from panolog.workers.training.trainer import TrainSpec
 
 TASK = COARSE
 NOTHING: Source[Scene] = Value(None)  # type: ignore[arg-type]
@@ -125,39 +113,6 @@ class HangsAtExit(Scripted):
     def run(self) -> Iterator[Event]:
         Thread(target=Flag().wait).start()  # not a daemon: the interpreter waits for it
         yield Notice(TASK, "")
-
-
-class _Stalls(TaskSpec):
-    """Waits for its end after its first checkpoint or view; before all else where it makes none."""
-
-    def run(self) -> Iterator[Event]:
-        for event in super().run():  # type: ignore[safe-super]  # of the spec that it is mixed with
-            if not isinstance(event, Scored | Calibration):
-                yield event
-            if isinstance(event, Checkpoint | CheckpointWritten | Evaluated | Scored):
-                Flag().wait()
-
-
-class _Trains(_Stalls, TrainSpec):
-    pass
-
-
-class _Scores(_Stalls, ScoreSpec):
-    pass
-
-
-class _Evaluates(_Stalls, EvaluateSpec):
-    pass
-
-
-def stalling(spec: TaskSpec) -> TaskSpec:
-    """A spec whose worker does not end by itself once it has something to lose."""
-    kinds: dict[type[TaskSpec], type[TaskSpec]] = {
-        TrainSpec: _Trains,
-        ScoreSpec: _Scores,
-        EvaluateSpec: _Evaluates,
-    }
-    return kinds[type(spec)](**vars(spec))
 
 
 def messages(pool: Pool, spec: TaskSpec, placement: Placement) -> Iterator[Message]:

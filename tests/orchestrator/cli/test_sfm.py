@@ -1,63 +1,40 @@
-"""panolog scene sfm, as a user calls it; tests/prepare/sfm interrupts it."""
+"""panolog scene sfm, as a user calls it; what it makes is proven in tests/prepare/sfm."""
 
 import json
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 
 from panolog.prepare.sfm import pipeline
-from panolog.prepare.sfm.report import SfmReport
-from panolog.scene.read import read_scene
 from tests.orchestrator.cli.program import call, one_line
-from tests.prepare.video.videos import render, walk
-
-pytestmark = pytest.mark.system
-
-WIDTH = 640
+from tests.prepare.sfm.reports import faulty
 
 
-@pytest.fixture(scope="module")
-def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five panoramas of a street."""
-    folder = tmp_path_factory.mktemp("walk")
-    for number, shot in enumerate(walk([0.9] * 5)):
-        cv2.imwrite(str(folder / f"{number}.jpg"), render(shot, WIDTH))
-    return folder
+def test_options_reach_the_job_and_its_report_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[tuple[Any, ...]] = []
+    report = faulty()
 
+    def make_scene(*arguments: Any) -> object:
+        given.append(arguments[:3])
+        return report
 
-def test_a_scene_and_its_report(images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    output, made, make_scene = tmp_path / "scene", list[SfmReport](), pipeline.make_scene
-
-    def keep(*given: Any) -> SfmReport:
-        made.append(make_scene(*given))
-        return made[0]
-
-    monkeypatch.setattr(pipeline, "make_scene", keep)
-    result = call("scene", "sfm", images, "-o", output, "--json")
+    monkeypatch.setattr(pipeline, "make_scene", make_scene)
+    output = tmp_path / "scene"
+    result = call("scene", "sfm", "images", "-o", output, "--json", "--partial", "--pairs", "exhaustive")
     assert result.exit_code == 0, result.output
-    shown = json.loads(result.stdout)
-    assert (shown["registered"], shown["missing"], shown["contradictions"]) == (5, [], [])
-    assert shown["world"]["frame"] == "upright"
-    assert shown["error"] < 0.6
-    kept = json.loads((output / "sfm.json").read_text())
-    assert kept == {key: value for key, value in shown.items() if key != "scene"}
-    assert cv2.imread(str(output / "sfm.png")) is not None
-    assert len(read_scene(output).panoramas) == 5
-    monkeypatch.setattr(pipeline, "make_scene", lambda *_: made[0])
-    result = call("scene", "sfm", "images", "-o", tmp_path)
+    assert json.loads(result.stdout) == {"scene": str(output), **report.as_json()}
+    wanted = pipeline.SfmSettings(partial=True, pairing="exhaustive")
+    assert given == [(Path("images"), output, wanted)]
+    result = call("scene", "sfm", "images", "-o", output)
     assert result.exit_code == 0
-    assert result.stdout.startswith("5 of 5 panoramas have a pose")
-    assert "the world: z up, units of no known scale" in result.stdout
+    assert result.stdout.splitlines()[: len(list(report.lines()))] == list(report.lines())
 
 
-def test_what_cannot_be_done_is_one_line(images: Path, tmp_path: Path) -> None:
-    source, output = tmp_path / "images", tmp_path / "scene"
-    source.mkdir()
-    for name in "ab":
-        cv2.imwrite(str(source / f"{name}.jpg"), np.full((WIDTH // 2, WIDTH, 3), 99, np.uint8))
-    assert one_line(call("scene", "sfm", source, "-o", output))
-    assert call("scene", "sfm", images, "-o", output, "--mapper", "magic").exit_code == 2
+def test_what_cannot_be_done_is_one_line(tmp_path: Path) -> None:
+    output = tmp_path / "scene"
+    assert one_line(call("scene", "sfm", tmp_path / "nothing", "-o", output))
+    assert call("scene", "sfm", tmp_path, "-o", output, "--mapper", "magic").exit_code == 2
     assert not output.exists()

@@ -1,5 +1,6 @@
 """From panoramas to a scene: a rendered street, the one place that `make test` reconstructs."""
 
+import json
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -78,7 +79,9 @@ def test_poses_are_those_of_the_street_in_metres(street: Made) -> None:
     assert made.world.frame == "upright" and made.world.metric
     spread = np.ptp(centers, axis=0)
     assert spread[2] < 0.05 * spread.max()  # z is up, but for the mean sway of the camera
-    assert len(made.found.missing) == 0
+    assert len(made.found.missing) == 0 and made.found.contradictions == []
+    assert json.loads((street.scene.root / "sfm.json").read_text()) == made.as_json()
+    assert cv2.imread(str(street.scene.root / "sfm.png")) is not None
     assert np.concatenate(made.found.model.errors(WIDTH)).mean() < 0.5
 
 

@@ -1,0 +1,43 @@
+"""A report of a reconstruction with faults."""
+
+from pathlib import Path
+
+import numpy as np
+
+from panolog.prepare.panorama_files import PanoramaFile
+from panolog.prepare.sfm.consistency.contradictions import Contradiction
+from panolog.prepare.sfm.links import Link
+from panolog.prepare.sfm.reconstruct import Reconstruction
+from panolog.prepare.sfm.report import SfmReport
+from panolog.prepare.sfm.sparse_model import SparseModel
+from panolog.prepare.world.georeference import georeference
+
+
+def faulty() -> SfmReport:
+    """Four of five panoramas have a pose; two links are weak, one pair contradicts itself."""
+    random = np.random.default_rng(0)
+    rows = np.arange(40)
+    model = SparseModel(
+        rows=(0, 1, 2, 4),
+        rotations=np.stack([np.eye(3)] * 4),
+        translations=np.array([[0.0, 0, -z] for z in range(4)]),
+        points=random.normal(0, 3, (40, 3)),
+        sightings=tuple((rows, random.uniform(0, 1, (40, 2))) for _ in range(4)),
+    )
+    found = Reconstruction(
+        panoramas=tuple(PanoramaFile(Path(), f"{name}.jpg", Path(f"{name}.jpg")) for name in "abcde"),
+        layers={},
+        size=(1024, 512),
+        model=model,
+        links=[
+            Link((0, 1), (0,), 0, float("inf")),
+            Link((2, 3), (3,), 9, 0.02),
+            Link((1, 2), (0, 1), 90, 0.001),
+        ],
+        contradictions=[Contradiction((1, 4), 300, 2)],
+        missing={3: (2, 17)},
+        features=1000,
+        pairs=10,
+    )
+    world = georeference(model.rotations, model.centers, [None] * 4, [None] * 4)
+    return SfmReport(found, world, ("the video ends early",))
