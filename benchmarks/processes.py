@@ -22,12 +22,12 @@ def in_fresh_process(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) ->
         return executor.submit(work, *args, **kwargs).result()
 
 
-def peak_memory(pid: int | None = None) -> int:
-    """Largest resident set so far of a process, by default this one, in bytes (`VmHWM`, so Linux only).
+def peak_memory() -> int:
+    """Largest resident set so far of this process, in bytes (`VmHWM`, so Linux only).
 
     `getrusage` would count the parent's memory too.
     """
-    status = Path(f"/proc/{pid or 'self'}/status").read_text()
+    status = Path("/proc/self/status").read_text()
     return int(status.partition("VmHWM:")[2].split()[0]) * 1024
 
 

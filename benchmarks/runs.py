@@ -2,19 +2,17 @@
 
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import dropwhile, pairwise
 from pathlib import Path
 from shutil import copytree, rmtree
-from typing import Any, TypeVar
+from typing import Any, cast
 
-from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.machine import cores
 from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import NONE, Message, Pool
-from panolog.orchestrator.resources.scaling import Growth
+from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.run.config import change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import make_info, read_info, write_info
@@ -30,74 +28,35 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.store import Database, read_records
 from panolog.scene.errors import RunError
-from panolog.scene.files import Locate
-from panolog.workers.specs import Source, TaskSpec
+from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
 _BEFORE = (Stage.CALIBRATE, Part.PREFLIGHT)  # of the records of a preflight
 BIN = Path(sys.executable).parent  # the programs of this environment
-T = TypeVar("T")
 
 
-@dataclass(frozen=True)
 class OneAtATime:
     """A pool whose tasks on the CPU run one after another, each with all cores of the machine.
 
     Otherwise blocks that start together share the cores, while Stage I has all of them: the seconds of a
-    block and those of Stage I would not compare. Tasks on GPUs are placed as ever.
+    block and those of Stage I would not compare. Tasks on GPUs are placed as ever; all else is the pool's.
     """
 
-    pool: Pool
+    def __init__(self, pool: Pool) -> None:
+        self._pool = pool
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._pool, name)
 
     def nodes(self) -> tuple[Node, ...]:
         """Those without a GPU with one core, as the placement sees them."""
         return tuple(
-            node if node.gpus else replace(node, cpus=min(node.cpus, 1)) for node in self.pool.nodes()
+            node if node.gpus else replace(node, cpus=min(node.cpus, 1)) for node in self._pool.nodes()
         )
-
-    def notices(self) -> Mapping[str, LeaveNotice]:
-        """As the pool."""
-        return self.pool.notices()
-
-    def growth(self) -> Growth:
-        """As the pool."""
-        return self.pool.growth()
-
-    def request(self, wanted: Mapping[str, int]) -> None:
-        """Requests machines of the pool."""
-        self.pool.request(wanted)
 
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         """Runs a spec with all cores, or on its GPU."""
-        self.pool.start(placement if placement.gpus else replace(placement, cpus=float(cores())), spec)
-
-    def put(self, value: T) -> Source[T]:
-        """As the pool, like all that follow."""
-        return self.pool.put(value)
-
-    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
-        """How a task finds files."""
-        return self.pool.share_files(scene, run)
-
-    def stop(self, task: TaskId) -> None:
-        """Requests the end of a task."""
-        self.pool.stop(task)
-
-    def waiting(self, task: TaskId) -> bool:
-        """Whether a task has no worker yet."""
-        return self.pool.waiting(task)
-
-    def cancel(self, task: TaskId) -> None:
-        """Ends a task by force."""
-        self.pool.cancel(task)
-
-    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
-        """The running tasks that have a message."""
-        return self.pool.ready(seconds, but)
-
-    def take(self, task: TaskId) -> Message:
-        """The next message of a task that is ready."""
-        return self.pool.take(task)
+        self._pool.start(placement if placement.gpus else replace(placement, cpus=float(cores())), spec)
 
 
 @contextmanager
@@ -106,7 +65,7 @@ def one_at_a_time(root: Path) -> Iterator[Pool]:
     from panolog.orchestrator.cluster.connection import connect  # noqa: PLC0415  # other benchmarks do without
 
     with connect(None, root) as pool:
-        yield OneAtATime(pool)
+        yield cast(Pool, OneAtATime(pool))
 
 
 def panolog(*arguments: str) -> str:

@@ -73,10 +73,6 @@ class Control:
         """Sets the wall clock of these processes forward, or back, from the true time."""
         struct.pack_into("=q", self._map, 0, seconds * 10**9)
 
-    def clear(self) -> None:
-        """Ends all faults."""
-        self._map[:] = bytes(len(self._map))
-
     def _switch(self) -> None:
         on = any(_RULE.unpack_from(self._map, _at(number))[0] for number in range(_RULES))
         struct.pack_into("=q", self._map, 8, on)

@@ -121,7 +121,7 @@ class SimulatedPool(InProcess):
         yield 0.0, Hello("simulated", 0)
         after = 0.0
         cell = spec.cell if isinstance(spec, TrainSpec) and isinstance(spec.cell, Cell) else None
-        for after, event in others(spec) if cell is None else self._block(spec.task, cell):
+        for after, event in _others(spec) if cell is None else self._block(spec.task, cell):
             yield after, event
         yield after, Ended()
 
@@ -133,14 +133,14 @@ class SimulatedPool(InProcess):
             yield i / self._rate, Progress(task, i, count, self._rate, 0.1, 20.0, 10, 2**30, rates=RATES)
             if i == count // 2:
                 yield i / self._rate, Checkpoint(task, i, {"iteration": torch.tensor(i)})
-        yield count / self._rate, Trained(task, middles([cell]), count, count / self._rate)
+        yield count / self._rate, Trained(task, _middles([cell]), count, count / self._rate)
 
 
-def others(spec: TaskSpec) -> Iterator[Timed]:
+def _others(spec: TaskSpec) -> Iterator[Timed]:
     """The messages of the tasks that are no blocks, at once."""
     match spec:
         case TrainSpec():
-            yield 0.0, Trained(spec.task, coarse_model(spec), 1, 0.0)
+            yield 0.0, Trained(spec.task, _coarse_model(spec), 1, 0.0)
         case EvaluateSpec():
             picture = np.zeros((spec.width // 2, spec.width, 3), np.uint8)
             png = bytes(cv2.imencode(".png", picture)[1])
@@ -152,17 +152,17 @@ def others(spec: TaskSpec) -> Iterator[Timed]:
             yield 0.0, Scored(spec.task, spec.views, scores)
 
 
-def coarse_model(spec: TrainSpec, counts: Sequence[int] | None = None) -> Gaussians:
-    """A Stage I model. Args: counts, Gaussians in each block; one by default."""
+def _coarse_model(spec: TrainSpec) -> Gaussians:
+    """A Stage I model with one Gaussian in each block."""
     config, scene = spec.config, spec.scene.load()
     if not isinstance(config, RunConfig):
         raise TypeError(f"{spec.task} is not of a run")
     box = config.partition.box(scene.centers[list(scene.train)])
-    return middles([Cell(box, config.grid, block) for block in range(config.grid.count)], counts)
+    return _middles([Cell(box, config.grid, block) for block in range(config.grid.count)])
 
 
-def middles(cells: Sequence[Cell], counts: Sequence[int] | None = None) -> Gaussians:
-    """Gaussians in the middle of each cell. Args: counts of each, one by default."""
+def _middles(cells: Sequence[Cell]) -> Gaussians:
+    """A Gaussian in the middle of each cell."""
     points = [expand([np.mean(cell.grid.bounds(cell.block), axis=0)], cell.aabb) for cell in cells]
-    means = np.repeat(np.concatenate(points), 1 if counts is None else counts, axis=0)
+    means = np.concatenate(points)
     return isotropic(means, np.ones(len(means)), np.full((len(means), 3), 0.5), 0.1)

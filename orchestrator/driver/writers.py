@@ -18,7 +18,7 @@ from panolog.orchestrator.run.state import RunState
 from panolog.workers.events import Checkpoint, Event, Trained
 from panolog.workers.tasks import TaskId
 
-LARGE = 2  # messages in memory, and as many threads: two use a disk better than one, see `benchmarks.saving`
+LARGE = 2  # messages in memory, and as many threads: two use a disk better (docs/design.md)
 GRACE_S = 60.0  # at least, in which tasks that are requested to stop must have yielded their checkpoints
 _UNMEASURED = 2**26  # bytes per second, expected of a disk before anything large was written
 

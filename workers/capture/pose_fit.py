@@ -35,23 +35,6 @@ class PoseFit:
     pixels: float  # root mean square of what it moves what the camera sees by
 
 
-def fit_pose(
-    model: Gaussians,
-    view: View,
-    rotation: Array,
-    translation: Array,
-    *,
-    points: Array,
-    near: float,
-    lambda_ssim: float = 0.2,
-) -> PoseFit:
-    """The last of `fit_steps`."""
-    *_, last = fit_steps(
-        model, view, rotation, translation, points=points, near=near, lambda_ssim=lambda_ssim
-    )
-    return last
-
-
 def fit_steps(
     model: Gaussians,
     view: View,

@@ -30,9 +30,8 @@ def _error(place: Square, found: Solution) -> float:
     return drift(np.stack([found.found.centers[row] for row in range(COUNT)]), place.centers)
 
 
-@pytest.mark.parametrize("ground", [True, False])
-def test_neighbours_in_order_outweigh_sides_that_look_the_same(ground: bool, tmp_path: Path) -> None:
-    place = square(tmp_path, count=COUNT, ground=ground)
+def test_neighbours_in_order_outweigh_sides_that_look_the_same(tmp_path: Path) -> None:
+    place = square(tmp_path, count=COUNT, ground=False)
     found = _solve(place)
     assert found.skeleton.ordered
     assert _error(place, found) < 0.002 * length(place.centers)
