@@ -12,6 +12,8 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import jinja2
+
 from benchmarks import report
 from benchmarks.rasterizer.cases import CaseSpec
 from benchmarks.rasterizer.rows import COUNTS, TIMES, WIDTHS, Row, benchmark, tables
@@ -20,42 +22,7 @@ from panolog.renderer.process import choose_device, prepare
 from panolog.scene.files import write_bytes
 
 GPU_ONLY = (1920, 1_000_000)  # width and Gaussians of a row that only a GPU has
-HEADING = """# Performance
-
-The command below writes this page. The scene has eleven photographs of a flat (openMVG's `ImageDataset`,
-CC BY-NC 4.0) with 3,850 sparse points; `--model` is a model of it that `panolog run` trained. The lines
-about random streets need no data.
-
-    python -m benchmarks.performance --scene FLAT --model RUN/point_cloud.ply -o docs/performance.md"""
-ON_A_CARD = """# Performance on an NVIDIA GPU
-
-The command below writes this page, and `python -m benchmarks.first_hour` runs it among others.
-
-    python -m benchmarks.performance --device cuda -o docs/performance-cuda.md"""
-SUMMARY = """## Summary
-
-One training iteration of the trained model and of the largest random street, on all measured threads."""
-READING = """## How to read the tables
-
-Times are medians of three after a warm-up, for the trained model means over three training panoramas.
-`forward` has projection, spherical harmonics, sorting and compositing; `loss` L1 and SSIM with their
-gradient; `backward` goes from the gradient of the image to those of all parameters; `Adam` is the check
-that all values are finite, and the step. The iteration is measured separately. `peak MB` is the memory of
-model, moments, target, image and buffers. Compare numbers of one run only: on a shared machine another run
-may differ by a tenth."""
-ITERATION = """## One training iteration
-
-    python -m benchmarks.rasterizer --model RUN/point_cloud.ply --scene FLAT --gaussians 50000,200000,1000000
-
-Random streets with the distribution of a trained model, and the trained model. The photographs have 2,048
-pixels; for the widest rows they are enlarged, which does not change the time. The last table says what
-forward and backward are made of."""
-DETAILS = """<details>
-<summary>All measurements: {} rows</summary>
-
-{}
-
-</details>"""
+TEMPLATE = Path(__file__).with_name("performance.md.j2")
 # Columns of the summary.
 _SUMMARY = ("model", "size", "Gaussians", "on", "iteration ms", "speed-up", "peak MB")
 
@@ -105,20 +72,18 @@ def measure(
 
 def page(rows: Sequence[Row]) -> str:
     """The page in Markdown."""
-    on_cpu = rows[0].device == "cpu"
     trained = [row for row in rows if row.model != "street"]
     narrow = [row for row in trained if row.width == min(row.width for row in trained)]
-    parts = [
-        HEADING if on_cpu else ON_A_CARD,
-        f"Measured on: {report.sentence(report.machine(rows[0].device))}.",
-        SUMMARY,
-        summary(rows),
-        *([report.markdown(("what", "goal", "measured", "met"), list(goals(narrow)))] if narrow else []),
-        READING,
-        ITERATION,
-        DETAILS.format(len(rows), tables(rows)),
-    ]
-    return "\n\n".join(parts) + "\n"
+    template = jinja2.Template(TEMPLATE.read_text(), trim_blocks=True, keep_trailing_newline=True)
+    written: str = template.render(
+        on_cpu=rows[0].device == "cpu",
+        measured_on=report.sentence(report.machine(rows[0].device)),
+        summary=summary(rows),
+        goals=report.markdown(("what", "goal", "measured", "met"), list(goals(narrow))) if narrow else "",
+        count=len(rows),
+        tables=tables(rows),
+    )
+    return written
 
 
 def main() -> int:

@@ -35,9 +35,9 @@ def test_one_row_for_each_number_of_threads_and_the_page_of_all(
     assert details.count("| street ") == details.count("| trained on tiny ") == 4  # in two tables
     shown = [line.split("|")[-3].strip() for line in details.splitlines() if line.startswith("| street ")]
     assert shown[0] == "–" and float(shown[1]) == pytest.approx(gain, rel=1e-2)
-    kept = (ROOT / "docs/performance.md").read_text()
-    for part in ("HEADING", "SUMMARY", "READING", "ITERATION"):
-        assert getattr(performance, part) in text and getattr(performance, part) in kept, part
+    kept = (ROOT / "docs/performance.md").read_text().splitlines()
+    fixed = set(performance.TEMPLATE.read_text().splitlines()) & set(text.splitlines())
+    assert len(fixed) > 20 and fixed <= set(kept)
 
 
 def test_a_goal_says_whether_it_is_met() -> None:
