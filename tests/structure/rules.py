@@ -17,7 +17,6 @@ MAX_MODULES, MAX_LINES, MAX_FUNCTION, MIN_LINES = 15, 400, 60, 40  # modules per
 
 CODE = (".py", ".js", ".css", ".html", ".cpp", ".h", ".cu", ".cuh")
 TEXT = (*CODE, ".md", ".pyi", ".j2", ".toml", ".yaml", ".yml", ".sh", ".txt", ".env", ".ts")
-TEXT_NAMES = ("Makefile", "Dockerfile", "run")
 # Words, then phrases that users read before a word of the trade replaced them.
 DIALECT = re.compile(
     r"\b(told|tells|asks|asked|hears|nobody|whoever|somebody|beside|mend)\b"
