@@ -29,6 +29,7 @@ _LOSS, _LATENCY_S = 0.1, 0.1  # of the packets of a bad network
 _START_S = 10.0  # in which a failure is noticed and a task has started again
 _SUPERVISOR_S = 2.0  # before it resumes
 _HEAD_S = 25.0  # in which a lost head is noticed and started again
+_ANEW_S = 30.0  # in which a task without a checkpoint comes as far again as it was
 # Holds the lock of a database until its stdin ends.
 _LOCKER = """
 import sqlite3, sys
@@ -56,6 +57,9 @@ class Kind(StrEnum):
     GCS = "gcs"  # SIGKILL for the head's record of the cluster, and a new head
     NET = "net"  # the second node's network loses and delays packets
     CLOCK = "clock"  # the wall clock of driver and workers jumps
+    TERMINAL = "terminal"  # SIGKILL for what reads the output of supervisor and driver
+    DAMAGE = "damage"  # the checkpoint of a busy worker is overwritten in part, and the worker killed
+    VANISH = "vanish"  # the run folder is elsewhere for a while, as where a disk is unmounted
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,9 @@ LIMITS = {
     Kind.GCS: Limits(_HEAD_S + _SUPERVISOR_S + _START_S),
     Kind.NET: Limits(_START_S, (5.0, 10.0)),
     Kind.CLOCK: Limits(_START_S),
+    Kind.TERMINAL: Limits(_START_S),
+    Kind.DAMAGE: Limits(_START_S + _ANEW_S),
+    Kind.VANISH: Limits(RETRY_S + _START_S, (3.0, 6.0)),
 }
 
 
@@ -132,6 +139,7 @@ class Victim:
     scene: Path
     root: Path
     driver: psutil.Process | None  # not its supervisor; None between two
+    terminal: subprocess.Popen[bytes]  # reads the output of both
 
 
 def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
@@ -162,6 +170,8 @@ def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
         case Kind.CLOCK:
             jump = DAY_S if choice < 1 / 2 else -DAY_S
             return f"clock {jump:+d} s", _move_clocks(cluster, jump)
+        case Kind.TERMINAL | Kind.DAMAGE | Kind.VANISH:
+            return _of_run(planned, victim)
         case _:
             assert_never(planned.kind)
 
@@ -190,6 +200,51 @@ def _signal(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
             process.send_signal(signal.SIGCONT)
 
     return f"{what} {planned.lasts:g} s" if planned.lasts else what, undo
+
+
+def nothing() -> None:
+    """What ends a fault that stays, or has ended."""
+
+
+def _of_run(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
+    """What happens to the files and the output of a run, on no machine."""
+    if planned.kind == Kind.TERMINAL:
+        victim.terminal.kill()
+        return "dead terminal", nothing
+    if planned.kind == Kind.DAMAGE:
+        return _damage(planned, victim)
+    return _move_away(f"no folder {planned.lasts:g} s", victim.root)
+
+
+def _damage(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
+    """Overwrites the middle of each checkpoint that there is, and kills a worker."""
+    found = list(victim.root.rglob("checkpoint.safetensors"))
+    worker = victim.cluster.busy_worker(planned.choice) if found else None
+    if worker is None:
+        return None
+    with suppress(psutil.NoSuchProcess):
+        worker.suspend()  # so that it replaces none before it is dead
+    for path in found:
+        with suppress(FileNotFoundError), path.open("r+b") as file:
+            file.seek(path.stat().st_size // 2)
+            file.write(bytes(64))
+    with suppress(psutil.NoSuchProcess):
+        worker.kill()
+    return "damage checkpoints, kill worker", nothing
+
+
+def _move_away(what: str, root: Path) -> tuple[str, Undo] | None:
+    """Renames the folder of a run that has begun; the end is its old name."""
+    if not RunFolder(root).presence.exists():
+        return None
+    away = root.with_name(f"{root.name}-away")
+    root.rename(away)
+
+    def undo() -> None:
+        if not root.exists():
+            away.rename(root)
+
+    return what, undo
 
 
 def _fail(cluster: LocalCluster, groups: Sequence[str], *rules: Rule) -> Undo:

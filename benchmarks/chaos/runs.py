@@ -65,16 +65,12 @@ class _Causing:
         for number, fault in enumerate(self.caused):
             if fault.until and fault.until <= now:
                 self.undoes[number]()
-                self.undoes[number] = _nothing
+                self.undoes[number] = faults.nothing
 
     def end(self) -> None:
         """Ends all faults."""
         for undo in self.undoes:
             undo()
-
-
-def _nothing() -> None:
-    """Ends a fault that has ended."""
 
 
 class ChaosRuns:
@@ -90,12 +86,13 @@ class ChaosRuns:
         folder = self.folder(number)
         self._cluster.wait()
         began = time.time()
-        supervisor = self._launch(folder)
+        supervisor, terminal = self._launch(folder)
         causing = _Causing(list(plan), began)
         try:
-            end = self._watch(supervisor, causing, folder)
+            end = self._watch(supervisor, terminal, causing, folder)
         finally:
             causing.end()
+            terminal.wait()
         ended, paths = time.time(), RunFolder(folder)
         digest = "" if end else hashlib.sha256(paths.point_cloud.read_bytes()).hexdigest()
         records = true_times(history(folder), began) if paths.database.exists() else []
@@ -112,26 +109,37 @@ class ChaosRuns:
         """The folder of a run."""
         return self._root / f"run-{number:03d}"
 
-    def _launch(self, folder: Path) -> subprocess.Popen[bytes]:
+    def _launch(self, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+        """The supervisor of a run, and what writes its output to a log."""
         command = [str(BIN / "panolog"), "run", str(self._scene), "-o", str(folder), *SETTINGS]
         command += ["--supervise", "--address", self._cluster.address]
         with (self._root / f"{folder.name}.log").open("ab") as log:
-            return subprocess.Popen(
+            terminal = subprocess.Popen("cat", stdin=subprocess.PIPE, stdout=log)
+        assert terminal.stdin is not None
+        with terminal.stdin as output:
+            supervisor = subprocess.Popen(
                 command,
                 env=self._cluster.environment(DRIVER),
-                stdout=log,
-                stderr=log,
+                stdout=output,
+                stderr=output,
                 stdin=subprocess.DEVNULL,
             )
+        return supervisor, terminal
 
-    def _watch(self, supervisor: subprocess.Popen[bytes], causing: _Causing, folder: Path) -> str:
+    def _watch(
+        self,
+        supervisor: subprocess.Popen[bytes],
+        terminal: subprocess.Popen[bytes],
+        causing: _Causing,
+        folder: Path,
+    ) -> str:
         """Until the run has ended. Returns its error, empty if it ended well."""
         while time.time() < causing.began + _TIMEOUT_S:
             try:
                 code = supervisor.wait(_POLL_S)
             except subprocess.TimeoutExpired:
                 self._cluster.keep()
-                victim = Victim(self._cluster, self._scene, folder, _driver(supervisor))
+                victim = Victim(self._cluster, self._scene, folder, _driver(supervisor), terminal)
                 causing.step(victim)
                 continue
             if not code:
