@@ -17,6 +17,7 @@ from panolog.orchestrator.resources.machine import (
     memory_of,
     memory_total,
     oom_kills,
+    share,
 )
 from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.run.records import Leaving
@@ -37,7 +38,7 @@ class RayNodes:
         self._known: dict[str, Node] = {}
         self._pending: dict[str, tuple[dict[str, Any], Any]] = {}
         self._alive: frozenset[str] = frozenset()
-        self._queried = float("-inf")
+        self.queried = float("-inf")  # time.monotonic() of the last query
         self._draining: dict[str, int] = {}  # deadlines in milliseconds since the epoch, 0 = none
         self._query()
         answers = [answer for _, answer in self._pending.values()]
@@ -46,7 +47,7 @@ class RayNodes:
 
     def alive(self) -> tuple[Node, ...]:
         """The machines that tasks can run on."""
-        if time.monotonic() - self._queried > _INTERVAL_S:
+        if time.monotonic() - self.queried > _INTERVAL_S:
             self._query()
         self._collect()
         nodes = (self._known[id] for id in sorted(self._alive) if id in self._known)
@@ -62,7 +63,7 @@ class RayNodes:
 
     def gone(self, id: str) -> bool:
         """Whether the cluster has given a machine up."""
-        if time.monotonic() - self._queried > _INTERVAL_S:
+        if time.monotonic() - self.queried > _INTERVAL_S:
             self._query()
         return id not in self._alive
 
@@ -78,7 +79,7 @@ class RayNodes:
 
     def refresh(self) -> None:
         """Queries Ray anew the next time: a machine may be gone."""
-        self._queried = float("-inf")
+        self.queried = float("-inf")
 
     def oom_kills(self, id: str) -> int | None:
         """`machine.oom_kills` of a machine now; None if that does not answer."""
@@ -92,7 +93,7 @@ class RayNodes:
 
     def _query(self) -> None:
         # If the head does not answer, Ray itself ends this process (gcs_rpc_server_reconnect_timeout_s).
-        self._queried = time.monotonic()
+        self.queried = time.monotonic()
         raw = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
         self._alive = frozenset(raw)
         # Ray's own libraries use this; its public list of nodes does not say it without a dashboard.
@@ -114,12 +115,13 @@ class RayNodes:
             try:
                 self._know(raw, *ray.get(answer))
             except RayError:  # gone again: if it comes back, it is queried again
-                self._queried = float("-inf")
+                self.queried = float("-inf")
 
     def _know(self, raw: dict[str, Any], free: int, gpus: tuple[Gpu, ...], instance: str) -> None:
         id, host = raw["NodeID"], raw["NodeManagerHostname"]
         cpus = int(raw["Resources"].get("CPU", 0))
-        self._known[id] = Node(id, host, cpus, free, gpus, instance, _labels(raw))
+        part = share() if id == self.home else 1.0
+        self._known[id] = Node(id, host, cpus, free, gpus, instance, _labels(raw), share=part)
 
 
 def _labels(raw: dict[str, Any]) -> tuple[tuple[str, str], ...]:

@@ -8,6 +8,7 @@ import os
 import socket
 import time
 import warnings
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ from panolog.orchestrator.cluster.autoscaler import Autoscaler
 from panolog.orchestrator.cluster.failures import CUT_OFF, failure_of, reported
 from panolog.orchestrator.cluster.files import FileSharing, RayValue, run_remotely
 from panolog.orchestrator.cluster.nodes import RayNodes
-from panolog.orchestrator.cluster.places import Places
+from panolog.orchestrator.cluster.places import Others, Places
 from panolog.orchestrator.resources.delivery import Large, announced
 from panolog.orchestrator.resources.gpus import gpus_to_share
 from panolog.orchestrator.resources.leaving import LeaveNotice
@@ -68,16 +69,31 @@ class RayPool:
         self._sharing = sharing
         self._name = f"panolog-{run}"  # of its tasks, and in the titles of their processes
         self._places = None if sharing is None else Places()
+        self._others = None if sharing is None else Others()
         self._nodes = RayNodes(self._name)
         self._agents = Agents(self._nodes.home)
         self._autoscaler = None if sharing is None else Autoscaler(self._name)
         self._running: dict[TaskId, _Task] = {}
+        self._looked = 0.0  # RayNodes.queried at the last look at what others have
 
     @reported
     def nodes(self) -> tuple[Node, ...]:
         """The machines that are there now, but those on which nothing runs and nothing is to start."""
         unused = self._nodes.draining().keys() - self._busy()  # the autoscaler removes them
-        return tuple(node for node in self._nodes.alive() if node.id not in unused)
+        nodes = tuple(node for node in self._nodes.alive() if node.id not in unused)
+        if self._others is None:
+            return nodes
+        if self._nodes.queried != self._looked:
+            self._looked = self._nodes.queried
+            self._others.look(nodes, self._held())
+        return tuple(replace(node, share=self._others.share(node.id)) for node in nodes)
+
+    def _held(self) -> dict[str, float]:
+        """GPUs, or cores of tasks without, that tasks have, by Node.id."""
+        held = defaultdict[str, float](float)
+        for where in (running.placement for running in self._running.values()):
+            held[where.node] += where.gpus or where.cpus
+        return held
 
     @reported
     def notices(self) -> dict[str, LeaveNotice]:

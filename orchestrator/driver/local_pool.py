@@ -24,7 +24,7 @@ import torch
 from panolog.orchestrator.resources.delivery import announced
 from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.leaving import LeaveNotice
-from panolog.orchestrator.resources.machine import cores, instance_type, memory, oom_kills
+from panolog.orchestrator.resources.machine import cores, instance_type, memory, oom_kills, share
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message, guarded
 from panolog.orchestrator.resources.usage import with_usage
@@ -56,7 +56,8 @@ class LocalPool(InProcess):
 
     def __init__(self) -> None:
         gpus = describe_gpus(torch.cuda.device_count())
-        self._node = Node("local", socket.gethostname(), cores(), memory(), gpus, instance_type())
+        host = socket.gethostname()
+        self._node = Node("local", host, cores(), memory(), gpus, instance_type(), share=share())
         self._watch = Watch()
         self._running: dict[TaskId, _Task] = {}
         forkserver.ensure_running()  # imports torch while the driver reads the scene

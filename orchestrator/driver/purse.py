@@ -134,12 +134,13 @@ class Purse:
         self._prices = prices.of_record(budget.prices) if budget else None
 
     def see(self, nodes: tuple[Node, ...]) -> None:
-        """Records which machines have come and gone."""
+        """Records which machines have come and gone, and of which another share is the run's."""
         if nodes == self._seen:
             return
-        before, now = {node.id for node in self._seen}, {node.id for node in nodes}
-        new = [prices.reserved(node, self._prices) for node in nodes if node.id not in before]
-        records: list[OfMoney] = [*new, *map(NodeReturned, sorted(before - now))]
+        before = {node.id: node.share for node in self._seen}
+        new = [prices.reserved(n, self._prices) for n in nodes if before.get(n.id) != n.share]
+        gone = before.keys() - {node.id for node in nodes}
+        records: list[OfMoney] = [*new, *map(NodeReturned, sorted(gone))]
         self._seen = nodes
         self._journal.record(records)
 

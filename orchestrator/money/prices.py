@@ -20,6 +20,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -100,10 +101,13 @@ def kind_of(node: Node) -> str:
 
 
 def reserved(node: Node, prices: PriceList | None) -> NodeReserved:
-    """The record of a machine, with its price if there are prices."""
+    """The record of a machine, with the price of its share if there are prices."""
     if prices is None:
         return NodeReserved(node.id, node.host, kind_of(node), None)
-    return prices.reserved(node)
+    whole = prices.reserved(node)
+    if node.share == 1 or whole.price is None:
+        return whole
+    return replace(whole, kind=f"{100 * node.share:.0f} % of {whole.kind}", price=node.share * whole.price)
 
 
 def price_by(prices: PriceList | None) -> Callable[[Node], float | None]:

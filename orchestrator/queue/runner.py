@@ -201,7 +201,7 @@ class _Runner:
                     stdout=log,
                     stderr=log,
                     cwd=entry.command.folder,
-                    env={**os.environ, **environment(share)},
+                    env={**os.environ, **environment(share, self.limits.machine)},
                     start_new_session=True,  # a terminal's Ctrl-C reaches it through the runner alone
                     preexec_fn=bound_to_parent(self.before),  # noqa: PLW1509  # there are no other threads
                 )

@@ -83,12 +83,17 @@ class Machine:
         )
 
 
-def environment(share: Share | None) -> dict[str, str]:
-    """The variables that limit a run to its share; its cores are the affinity of its process."""
+def environment(share: Share | None, whole: Machine) -> dict[str, str]:
+    """The variables that limit a run to its share, and say what it pays.
+
+    Its cores are the affinity of its process.
+    """
     if share is None:
         return {}
     values = {} if share.gpus is None else {"CUDA_VISIBLE_DEVICES": ",".join(share.gpus)}
-    return values | ({} if share.memory is None else {machine.MEMORY_VARIABLE: repr(share.memory / 2**30)})
+    values |= {} if share.memory is None else {machine.MEMORY_VARIABLE: repr(share.memory / 2**30)}
+    mine, every = (share.gpus, whole.gpus) if whole.gpus else (share.cores, whole.cores)
+    return values | ({} if mine is None else {machine.SHARE_VARIABLE: f"{len(mine) / len(every):g}"})
 
 
 def describe(entry: Entry) -> str:

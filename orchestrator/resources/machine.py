@@ -17,6 +17,7 @@ _PRODUCT = Path("/sys/class/dmi/id/product_name")  # on AWS the instance type
 _TYPE = re.compile(r"[a-z][a-z0-9-]*\.[a-z0-9-]+")  # other product names say nothing: "Standard PC", "KVM"
 _INSTANCE = "PANOLOG_INSTANCE"  # the variable that names it where that does not
 MEMORY_VARIABLE = "PANOLOG_MEMORY"  # GiB of this machine that a run may use
+SHARE_VARIABLE = "PANOLOG_SHARE"  # the part of this machine that a run pays
 
 
 def groups(controller: str, mount: Path = _MOUNT, own: Path = _OWN) -> Iterator[Path]:
@@ -92,6 +93,13 @@ def _limits(mount: Path, own: Path) -> Iterator[tuple[Path, int]]:
         limit = _read(group / "memory.max") or _read(group / "memory.limit_in_bytes")
         if limit.isdecimal():  # not "max", and not "" = no such file
             yield group, int(limit)
+
+
+def share() -> float:
+    """The part of this machine that is this run's. Raises ConfigError if PANOLOG_SHARE is no number."""
+    if os.environ.get(SHARE_VARIABLE) == "0":  # a run on the CPU next to those that have all GPUs
+        return 0.0
+    return min(1.0, positive(SHARE_VARIABLE, os.environ, 1.0, "the part of this machine that a run pays"))
 
 
 def instance_type(product: Path = _PRODUCT) -> str:

@@ -24,6 +24,7 @@ class Node:
     instance: str = ""  # its type, as its provider calls it; "" if it does not say
     labels: tuple[tuple[str, str], ...] = ()  # Ray's, and its resources of the user's own
     closed: tuple[int, ...] = ()  # those of its GPUs that are in quarantine
+    share: float = 1.0  # the part of it that no other program has: what a run pays
 
     def card(self, gpu: int) -> str:
         """The id of one of its GPUs: its UUID if that is known."""

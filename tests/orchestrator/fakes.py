@@ -106,7 +106,7 @@ class FakePool(InProcess):
     def leave(self, node: str) -> None:
         """It is gone; what runs there reports that itself."""
         self._nodes = [other for other in self._nodes if other.id != node]
-        self.leaving.pop(node)
+        self.leaving.pop(node, None)
 
     def lose(self, *nodes: str) -> None:
         """These are gone, and what runs there with them."""

@@ -212,6 +212,17 @@ def test_a_driver_that_dies_after_a_limit_leaves_the_rest_to_the_next(tmp_path: 
     assert (state.outcome, harness.tasks) == (Outcome.LIMITED, [EVAL])
 
 
+def test_another_share_of_a_machine_has_another_price(tmp_path: Path) -> None:
+    harness = Limited(tmp_path, BudgetSet(max_cost=1e9, prices=PRICES))
+
+    def begins_beside_us() -> None:
+        harness.pool.leave(MACHINE.id)
+        harness.pool.join(replace(MACHINE, share=0.5))
+
+    harness.drive(begins(COARSE, begins_beside_us))
+    assert [record.price for record in harness.records(NodeReserved)] == [3600.0, 1800.0]
+
+
 def test_what_attempts_and_killed_drivers_lose_is_recorded(tmp_path: Path) -> None:
     harness = Limited(tmp_path, BudgetSet(prices=PRICES))
     saved = (lambda: harness.passes(10)), Checkpoint(COARSE, 1, {"x": torch.arange(3)})

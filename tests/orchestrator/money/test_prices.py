@@ -50,6 +50,13 @@ def test_the_first_entry_counts_and_a_spot_machine_has_its_price(tmp_path: Path)
     assert (spot.kind, spot.price) == ("a spot", 0.5)
 
 
+def test_a_run_pays_its_share_of_a_machine(tmp_path: Path) -> None:
+    listed = prices(tmp_path, 'name = "a"\nhost = "*"\nprice = 2')
+    record = reserved(node(share=0.25), listed)
+    assert (record.kind, record.price) == ("25 % of a", 0.5)
+    assert reserved(node(share=0.25), None).price is None
+
+
 def test_a_machine_without_an_entry_costs_as_much_as_the_dearest(tmp_path: Path) -> None:
     listed = prices(tmp_path, 'name = "x.a"\nprice = 2', 'name = "x.b"\nprice = 9')
     record = reserved(node(), listed)

@@ -104,9 +104,11 @@ def test_more_runs_than_cores_share_them() -> None:
 
 def test_a_share_in_words_and_variables() -> None:
     share = Share(("GPU-a", "GPU-c"), (0,), 3 * GIB // 2)
-    assert environment(share) == {"CUDA_VISIBLE_DEVICES": "GPU-a,GPU-c", "PANOLOG_MEMORY": "1.5"}
-    assert environment(Share((), None, None)) == {"CUDA_VISIBLE_DEVICES": ""}
-    assert environment(Share()) == environment(None) == {}
+    limits = {"CUDA_VISIBLE_DEVICES": "GPU-a,GPU-c", "PANOLOG_MEMORY": "1.5"}
+    assert environment(share, FOUR) == {**limits, "PANOLOG_SHARE": "0.5"}
+    assert environment(Share(None, (0,), None), BARE) == {"PANOLOG_SHARE": "0.5"}
+    assert environment(Share((), None, None), FOUR) == {"CUDA_VISIBLE_DEVICES": "", "PANOLOG_SHARE": "0"}
+    assert environment(Share(), FOUR) == environment(None, FOUR) == {}
     assert describe(replace(entry(), share=share)) == "2 GPUs, 1 core, 1.5 GiB"
     assert describe(entry(Needs(0, 3))) == "3 cores"
     assert describe(entry()) == describe(entry(None)) == ""
