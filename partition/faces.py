@@ -125,9 +125,9 @@ def views_at(plan: Plan, face: Plane, checks: int) -> tuple[tuple[int, ...], tup
     They train one of its blocks and stand near it. Of others, every eighth does not train but checks, at most
     `checks` of them, the nearest ones first; as many that train check too.
     """
-    assigned = plan.assignment.assigned[:, [face.below, face.above]].any(axis=1)
+    assigned = np.union1d(*map(plan.assignment.cameras_of, (face.below, face.above)))
     near, distances = _near(plan, face)
-    training = np.intersect1d(near, np.flatnonzero(assigned))
+    training = np.intersect1d(near, assigned)
     order = training[np.argsort(distances[training], kind="stable")]
     held = order[_HELD // 2 :: _HELD][:checks]
     trained = np.setdiff1d(order, held)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
+from scipy.sparse import csr_array
 
 from panolog.partition import plan_json
 from panolog.partition.assignment import Assignment, assign
@@ -74,7 +75,7 @@ class PartitionConfig(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The decisions of G²PS for K training cameras and B blocks, with all of its inputs."""
+    """The decisions of G²PS for K training cameras and B blocks. Their scores have a file of their own."""
 
     config: PartitionConfig
     grid: Cells
@@ -83,48 +84,45 @@ class Plan:
     rows: tuple[int, ...]  # K rows of Scene.panoramas
     names: tuple[str, ...]  # K names of panoramas
     centers: NDArray[np.float64]  # (K, 3) world units
-    scores: NDArray[np.float64]  # (K, B) eq. 10
+    assignment: Assignment  # which cameras train which blocks, and why (eq. 11)
     gaussians: NDArray[np.int64]  # (B,) scene Gaussians of Stage I in each block
 
     def __post_init__(self) -> None:
         count, blocks = len(self.rows), self.grid.count
         if len(self.names) != count or self.centers.shape != (count, 3):
             raise ValueError(f"{count} rows need as many names and centres")
-        if self.scores.shape != (count, blocks) or self.gaussians.shape != (blocks,):
-            raise ValueError(
-                f"{count} cameras and {blocks} blocks do not fit scores of shape {self.scores.shape}"
-            )
+        shape = self.assignment.gradient.shape
+        if shape != (count, blocks) or self.gaussians.shape != (blocks,):
+            raise ValueError(f"{count} cameras and {blocks} blocks do not fit scores of shape {shape}")
 
-    @cached_property
+    @property
     def camera_blocks(self) -> NDArray[np.int64]:
         """(K,) the block that each camera is in."""
-        return self.grid.block_of(contract(self.centers, self.aabb))
-
-    @cached_property
-    def assignment(self) -> Assignment:
-        """Which cameras train which blocks, and why (eq. 11)."""
-        return assign(self.camera_blocks, self.scores, self.config.tau_grad)
+        return self.assignment.camera_blocks
 
     @cached_property
     def trained(self) -> NDArray[np.bool_]:
         """(B,) which blocks are trained: those with Gaussians and enough cameras; others keep Stage I's."""
-        seen = self.assignment.assigned.sum(axis=0)
-        enough: NDArray[np.bool_] = (seen >= self.config.min_cameras) & (self.gaussians > 0)
+        enough: NDArray[np.bool_] = self.assignment.counts >= self.config.min_cameras
+        enough &= self.gaussians > 0
         return enough
 
     def cameras(self, block: int) -> tuple[int, ...]:
         """The rows of Scene.panoramas that train a block, in the order of `rows`."""
-        return tuple(self.rows[k] for k in np.flatnonzero(self.assignment.assigned[:, block]))
+        return tuple(self.rows[k] for k in self.assignment.cameras_of(block))
 
-    def compared(self, block: int, count: int) -> tuple[int, ...]:
+    def compared(self, block: int, scores: NDArray[np.float64], count: int) -> tuple[int, ...]:
         """The rows of cameras on which a block can be compared with Stage I, those with high scores first.
 
         Of those that train it and of others that see it equally many, at most `count` of each.
+
+        Args: scores (K,) of eq. 10 for this block.
         """
-        order = np.argsort(-self.scores[:, block], kind="stable")
-        own, seen = self.assignment.assigned[order, block], self.scores[order, block] > 0
-        most = min(count, int(own.sum()), int((seen & ~own).sum()))
-        return tuple(self.rows[k] for part in (own, seen & ~own) for k in order[part][:most])
+        training = self.assignment.cameras_of(block)
+        others = np.setdiff1d(np.flatnonzero(scores), training)
+        most = min(count, len(training), len(others))
+        best = (part[np.argsort(-scores[part], kind="stable")][:most] for part in (training, others))
+        return tuple(self.rows[k] for part in best for k in part)
 
     def cell(self, block: int) -> Cell:
         """The part of space that belongs to a block. Raises ValueError if there is no such block."""
@@ -157,18 +155,19 @@ class Plan:
 
     def camera_json(self, k: int) -> plan_json.PlanCamera:
         """The entry of the k-th camera in plan.json."""
-        geometric, gradient = self.assignment.geometric[k], self.assignment.gradient[k]
         return plan_json.PlanCamera(
             row=self.rows[k],
             name=self.names[k],
             center=self.centers[k].tolist(),
             block=int(self.camera_blocks[k]),
-            scores=self.scores[k].tolist(),
-            assigned={
-                int(b): plan_json.reason(geometric=bool(geometric[b]), gradient=bool(gradient[b]))
-                for b in np.flatnonzero(geometric | gradient)
-            },
+            assigned=self.reasons(k),
         )
+
+    def reasons(self, k: int) -> dict[int, plan_json.Reason]:
+        """Why the k-th camera trains which blocks."""
+        own, gradient = int(self.camera_blocks[k]), set(self.assignment.by_gradient(k).tolist())
+        blocks: list[int] = self.assignment.blocks_of(k).tolist()
+        return {b: plan_json.reason(geometric=b == own, gradient=b in gradient) for b in blocks}
 
     @staticmethod
     def from_json(data: object) -> "Plan":
@@ -177,40 +176,45 @@ class Plan:
         Raises InputError if a value is missing, unknown, of the wrong kind, or contradicts another.
         """
         file = plan_json.parse(data)
-        plan = Plan.of_file(file, [camera.scores for camera in file.cameras])
         with plan_json.contradictions():
+            plan = Plan._of_file(file)
             again = plan.to_json()
-        for key, value in file.model_dump(mode="json").items():
+        for key, value in file.model_dump(mode="json", exclude={"version"}).items():
             if value != again[key]:
                 raise InputError(f"plan.json contradicts itself in {key!r}; make the plan again")
         return plan
 
     @staticmethod
-    def of_file(file: plan_json.PlanFile, scores: ArrayLike) -> "Plan":
-        """The plan of a file whose scores (K, B) may lie elsewhere; derived values are not compared.
-
-        Raises InputError if a value contradicts another.
-        """
-        with plan_json.contradictions():
-            grid = Grid(file.grid, file.cells) if file.grid else Cuts(file.cuts)
-            return Plan(
-                config=PartitionConfig(
-                    rho_tri=file.rho_tri,
-                    aspect=file.aspect,
-                    tau_grad=file.tau_grad,
-                    min_cameras=file.min_cameras,
-                    cells=file.cells,
-                    cuts=file.cuts,
-                ),
-                grid=grid,
-                baseline=file.baseline,
-                aabb=Aabb(np.array(file.aabb.lower), np.array(file.aabb.upper)),
-                rows=tuple(camera.row for camera in file.cameras),
-                names=tuple(camera.name for camera in file.cameras),
-                centers=np.array([camera.center for camera in file.cameras], np.float64).reshape(-1, 3),
-                scores=np.asarray(scores, np.float64),
-                gaussians=np.array([block.gaussians for block in file.blocks], np.int64),
-            )
+    def _of_file(file: plan_json.PlanFile) -> "Plan":
+        grid = Grid(file.grid, file.cells) if file.grid else Cuts(file.cuts)
+        box = Aabb(np.array(file.aabb.lower), np.array(file.aabb.upper))
+        centers = np.array([camera.center for camera in file.cameras], np.float64).reshape(-1, 3)
+        pairs = [
+            (k, block)
+            for k, camera in enumerate(file.cameras)
+            for block, why in camera.assigned.items()
+            if why != "geometry"
+        ]
+        places = np.array(pairs, np.int64).reshape(-1, 2).T
+        gradient = csr_array((np.ones(len(pairs), np.bool_), tuple(places)), shape=(len(centers), grid.count))
+        return Plan(
+            config=PartitionConfig(
+                rho_tri=file.rho_tri,
+                aspect=file.aspect,
+                tau_grad=file.tau_grad,
+                min_cameras=file.min_cameras,
+                cells=file.cells,
+                cuts=file.cuts,
+            ),
+            grid=grid,
+            baseline=file.baseline,
+            aabb=box,
+            rows=tuple(camera.row for camera in file.cameras),
+            names=tuple(camera.name for camera in file.cameras),
+            centers=centers,
+            assignment=Assignment(grid.block_of(contract(centers, box)), gradient),
+            gaussians=np.array([block.gaussians for block in file.blocks], np.int64),
+        )
 
 
 def read_plan(path: Path) -> Plan:
@@ -225,7 +229,7 @@ def read_plan(path: Path) -> Plan:
 def make_plan(
     centers: ArrayLike,
     means: ArrayLike,
-    scores: ArrayLike,
+    scores: ArrayLike | csr_array,
     grid: Cells,
     config: PartitionConfig,
     *,
@@ -235,13 +239,13 @@ def make_plan(
     """Bounds, cells and assignment in one (eqs. 7-9 and 11).
 
     Args: centers (K, 3) training camera centres and means (N, 3) scene Gaussians without sky, world units;
-    scores (K, B) of eq. 10 for the blocks of `grid` over `config.box(centers)`; rows (K,) of
+    scores (K, B) of eq. 10 for the blocks of `grid` over `config.box(centers)`, may be sparse; rows (K,) of
     Scene.panoramas and names (K,) of the cameras.
     Raises InputError as `aabb`, ValueError on shapes that disagree or values that are not finite.
     """
     points = np.asarray(centers, np.float64)
     box = config.box(points)
-    plan = Plan(
+    return Plan(
         config=config,
         grid=grid,
         baseline=baseline(points),
@@ -249,8 +253,6 @@ def make_plan(
         rows=tuple(int(row) for row in rows),
         names=tuple(names),
         centers=points,
-        scores=np.asarray(scores, np.float64),
+        assignment=assign(grid.block_of(contract(points, box)), scores, config.tau_grad),
         gaussians=np.bincount(grid.block_of(contract(means, box)), minlength=grid.count),
     )
-    assign(plan.camera_blocks, plan.scores, config.tau_grad)  # reports bad scores now, not at first use
-    return plan

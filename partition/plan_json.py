@@ -1,10 +1,10 @@
-"""The schema of plan.json, version 1."""
+"""The schema of plan.json, version 2. Version 1 also had all gradient scores, which are in scores.npz."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from panolog.partition.cells import Cut, Layout
 from panolog.scene.errors import InputError
@@ -40,14 +40,14 @@ class PlanCamera(_Strict):
     name: str
     center: Triple  # world units
     block: int  # that the camera is in
-    scores: list[float]  # s_{k,b} of eq. 10, one for each block
+    scores: Any = Field(default=None, exclude=True)  # of version 1; not used
     assigned: dict[int, Reason]  # by block
 
 
 class PlanFile(_Strict):
     """All of plan.json. Lengths are in world units."""
 
-    version: Literal[1] = 1
+    version: Literal[1, 2] = 2
     rho_tri: float
     aspect: float = 0.5  # before there was such a setting, it was this
     tau_grad: float
@@ -76,7 +76,7 @@ def parse(data: object) -> PlanFile:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the top level"
         raise InputError(
-            f"plan.json is not a plan of version 1: {place}: {first['msg']}; make the plan again"
+            f"plan.json is not a plan of version 2: {place}: {first['msg']}; make the plan again"
         ) from None
 
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
+from scipy.sparse import csr_array
 
 from benchmarks import report
 from benchmarks.paper import pages, study, tables
@@ -29,6 +29,7 @@ from panolog.orchestrator.resources.machine import cores
 from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.partition.plan import Plan, read_plan
+from panolog.partition.scores import read_scores
 from panolog.renderer.process import prepare
 from panolog.scene.errors import InputError
 from panolog.scene.ply import read_ply
@@ -152,13 +153,14 @@ def measure(options: argparse.Namespace, settings: Settings) -> Study:
 
 def _overlaps(bench: Bench) -> list[tables.Overlap]:
     """Of the recipes whose scores differ."""
-    plans: dict[str, Plan] = {}
+    plans: dict[str, tuple[Plan, csr_array]] = {}
     for name in _PLANS:
-        if name in bench.done and (path := RunFolder(bench.done[name].root).plan).exists():
-            plan = read_plan(path)
-            if not any(np.array_equal(plan.scores, other.scores) for other in plans.values()):
-                plans[name] = plan
-    return [row for name, plan in plans.items() for row in tables.overlaps(bench.scene.name, name, plan)]
+        if name in bench.done and (folder := RunFolder(bench.done[name].root)).plan.exists():
+            plan = read_plan(folder.plan)
+            scores = read_scores(folder.scores, plan.rows, plan.grid.count)
+            if all(scores.shape != other.shape or (scores != other).nnz for _, other in plans.values()):
+                plans[name] = (plan, scores)
+    return [row for name, found in plans.items() for row in tables.overlaps(bench.scene.name, name, *found)]
 
 
 def _words(options: argparse.Namespace) -> list[str]:

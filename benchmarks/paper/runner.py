@@ -343,7 +343,7 @@ def equal_plans(a: Plan, b: Plan) -> bool:
     """Whether both train the same cameras in the same cells."""
     same = a.grid == b.grid and np.array_equal(a.aabb.lower, b.aabb.lower)
     same = same and np.array_equal(a.aabb.upper, b.aabb.upper)
-    return bool(same and np.array_equal(a.assignment.assigned, b.assignment.assigned))
+    return bool(same and (a.assignment.assigned != b.assignment.assigned).nnz == 0)
 
 
 def peak_of(records: Sequence[Stored]) -> int | None:

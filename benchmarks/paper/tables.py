@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from scipy.sparse import csr_array
+
 from benchmarks import report
 from benchmarks.paper import reference
 from benchmarks.paper.results import METRICS, Result, Results, spread
@@ -142,17 +144,15 @@ def _same(result: Result, equal: bool) -> str:
     return f"same training or same plan as {result.same_as}, so the same model{none}"
 
 
-def overlaps(scene: str, variant: str, plan: Plan) -> list[Overlap]:
-    """What the scores of a plan assign at other τ."""
-    assigned = ((tau, assign(plan.camera_blocks, plan.scores, tau)) for tau in TAUS)
+def overlaps(scene: str, variant: str, plan: Plan, scores: csr_array) -> list[Overlap]:
+    """What the scores (K, B) of a plan assign at other τ."""
+    assigned = ((tau, assign(plan.camera_blocks, scores, tau)) for tau in TAUS)
     return [Overlap(scene, variant, tau, *overlap_of(found)) for tau, found in assigned]
 
 
 def overlap_of(assignment: Assignment) -> tuple[float, float]:
     """Blocks that a camera trains on average, and the share of all assignments that gradients add."""
-    count = int(assignment.assigned.sum())
-    added = int((assignment.gradient & ~assignment.geometric).sum())
-    return count / max(len(assignment.assigned), 1), added / max(count, 1)
+    return assignment.overlap, assignment.added / max(assignment.assigned.nnz, 1)
 
 
 def overlap_table(found: Sequence[Overlap]) -> Table:

@@ -18,7 +18,7 @@ from typing import Any
 from benchmarks import report
 from benchmarks.driver_scale.__main__ import Load
 from benchmarks.paper.curves import standalone
-from benchmarks.scale import cities, driver, laws, merging, models
+from benchmarks.scale import cities, driver, laws, merging, models, plans
 from benchmarks.scale.page import page
 from panolog.orchestrator.run.folder import write_json
 from panolog.scene.errors import ConfigError
@@ -62,6 +62,11 @@ class Parts:
         load = Load(12, 4, 10.0, 0.5) if self._quick else Load(10_000, 2_000, 0.2, 60.0)
         return {"driver": asdict(driver.measure(self._disk, load))}
 
+    def plans(self) -> Found:
+        """The plan, and the scores behind it."""
+        sizes = [(60, 12, 4)] if self._quick else [(6_000, 1_000, 50), (100_000, 1_333, 50)]
+        return {"plans": [asdict(plans.measure(self._disk, *size)) for size in sizes]}
+
     def merge(self) -> Found:
         """The merge."""
         sizes, each = ([1000, 2000], 500) if self._quick else ([2_500_000, 10_000_000, 40_000_000], 200_000)
@@ -78,6 +83,7 @@ class Parts:
             "cities": self.cities,
             "laws": self.laws,
             "driver": self.driver,
+            "plans": self.plans,
             "merge": self.merge,
             "levels": self.levels,
         }

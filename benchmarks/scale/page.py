@@ -1,6 +1,7 @@
 """docs/scale.md, from what the parts have found: the tables of `page.md.j2`."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from benchmarks.scale.cities import NAMES, City, growth
 from benchmarks.scale.laws import Calibrated, Law
 from benchmarks.scale.merging import MergeRow, exponent
 from benchmarks.scale.models import LevelsRow
+from benchmarks.scale.plans import PlanSize
 from panolog.orchestrator.estimates.suggestions import DETAIL
 
 TEMPLATE = Path(__file__).with_name("page.md.j2")
@@ -29,6 +31,8 @@ def page(found: dict[str, Any], measured_on: str, folder: str) -> str:
         tables["laws"] = laws([Law(**row) for row in found["laws"]])
     if "driver" in found:
         tables["driver"] = driver(found["driver"])
+    if "plans" in found:
+        tables["plans"] = plans([PlanSize(**row) for row in found["plans"]])
     if "merge" in found:
         tables["merge"] = merges([MergeRow(**row) for row in found["merge"]])
     if "levels" in found:
@@ -122,6 +126,21 @@ def driver(measured: dict[str, Any]) -> str:
 
 def _pair(first: dict[str, float], second: dict[str, float], name: str) -> str:
     return f"{first[name]:.1f}, {second[name]:.1f}"
+
+
+def plans(rows: Sequence[PlanSize]) -> str:
+    """Of cities of any size."""
+    head = (
+        "panoramas",
+        "blocks",
+        "in sight",
+        "plan.json, MB",
+        "scores.npz, MB",
+        "write, s",
+        "read, s",
+        "peak MB",
+    )
+    return report.markdown(head, [tuple(asdict(row).values()) for row in rows])
 
 
 def merges(rows: Sequence[MergeRow]) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from panolog.orchestrator.driver.job import Job, Specs
 from panolog.orchestrator.estimates.calibration import basis_of
@@ -23,6 +23,7 @@ from panolog.orchestrator.stages.scenes import learnt_scene, scene_of
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.partition.audit import audit
 from panolog.partition.plan import Plan, read_plan
+from panolog.partition.scores import read_scores
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_header, read_scene_means
@@ -36,6 +37,7 @@ class WhatIf:
     """A plan that was tried, what its Stage II would need on this machine, and the folder of its files."""
 
     plan: Plan
+    audit: tuple[str, ...]  # what there is to say about it
     blocks: Mapping[int, StageEstimate]  # those that are trained
     needs: StageEstimate | None  # of all of them; None if no block is trained
     written: Path | None
@@ -46,7 +48,7 @@ class WhatIf:
             has = f"{len(block['cameras'])} cameras, {block['gaussians']:,} Gaussians"
             needs = self.blocks.get(block["block"])
             yield f"block {block['block']}: {has}; {stage_line(needs) if needs else 'not trained'}"
-        yield from audit(self.plan)
+        yield from self.audit
         yield f"Stage II on this machine: {stage_line(self.needs) if self.needs else 'no block is trained'}"
         yield f"written to {self.written}" if self.written else "not written; give --output FOLDER to keep it"
 
@@ -90,30 +92,30 @@ def repartition(
     if output is not None:
         other = RunFolder(output)
         write_plan_picture(other.plan_picture, plan, means)
-        write_plan(other, plan)
-    cameras, own = plan.assignment.assigned.sum(axis=0), plan.gaussians
+        write_plan(other, plan, scores)
+    cameras, own = plan.assignment.counts, plan.gaussians
     blocks = {
         int(b): estimator.block(count, int(own[b]), int(cameras[b])) for b in np.flatnonzero(plan.trained)
     }
     most = int(cameras[plan.trained].max(initial=0))
     needs = estimator.refinement(count, len(blocks), most) if blocks else None
-    return WhatIf(plan, blocks, needs, output and RunFolder(output).plan.parent)
+    return WhatIf(plan, tuple(audit(plan, scores)), blocks, needs, output and RunFolder(output).plan.parent)
 
 
-def _scores_of(folder: RunFolder, config: RunConfig) -> NDArray[np.float64] | None:
+def _scores_of(folder: RunFolder, config: RunConfig) -> csr_array | None:
     """(K, B) scores of the run itself, if it has them for the same cells."""
     if not folder.plan.exists():
         return None
     plan = read_plan(folder.plan)
     box = config.partition.box(plan.centers)  # an older run may have bounded its own otherwise
     same = plan.grid == config.grid and np.array_equal(plan.aabb.half, box.half)
-    return plan.scores if same else None
+    return read_scores(folder.scores, plan.rows, plan.grid.count) if same else None
 
 
-def _score(job: Job, progress: StageProgress) -> NDArray[np.float64]:
+def _score(job: Job, progress: StageProgress) -> csr_array:
     for event in Specs(job, InProcess()).score(TaskId.shard(0), job.scene.train).run():
         if isinstance(event, Progress):
             progress("score", event.iteration, event.iterations)
         if isinstance(event, Scored):
-            scores: NDArray[np.float64] = event.scores.numpy()
+            scores = csr_array(event.scores.numpy())
     return scores

@@ -160,15 +160,16 @@ def _exposure_curve(entry: RunEntry) -> ExposureCurve | None:
 
 
 def _camera_view(run: Watch, row: int) -> CameraView | None:
-    camera = maps.camera_of(run.entry, row)
-    if camera is None:
+    found = maps.scored_camera_of(run.entry, row)
+    if found is None:
         return None
+    camera, scores = found
     try:
         pictures.open_panorama(_scene_of(run), camera.name).close()
         why = None
     except InputError as error:
         why = str(error)
-    return CameraView(**camera.model_dump(exclude={"center"}), no_picture=why)
+    return CameraView(**camera.model_dump(exclude={"center"}), scores=scores, no_picture=why)
 
 
 def _panorama(cache: pictures.PanoramaCache, run: Watch, row: int) -> Response:

@@ -1,7 +1,6 @@
-"""The map of a run's plan, and its cameras. Scores come from scores.npz: as JSON they would take seconds."""
+"""The map of a run's plan, and its cameras."""
 
 import json
-import re
 from collections import OrderedDict
 from threading import Lock
 from typing import Any
@@ -14,31 +13,25 @@ from panolog.orchestrator.dashboard.messages import BlockCamera, BlockCameras
 from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.views.figures import Figure, map_figure
 from panolog.orchestrator.views.plan_map import read_points
-from panolog.partition import plan_json
 from panolog.partition.plan import Plan
-from panolog.partition.plan_json import PlanCamera, reason
+from panolog.partition.plan_json import PlanCamera
+from panolog.partition.scores import read_scores
 from panolog.scene.errors import InputError
 from panolog.workers.seams.schema import by_blocks, parse_seams
 from panolog.workers.tasks import COARSE
 
 _MOST = 200_000_000  # bytes of plan.json at most
 _CACHED = 4  # maps, of about a megabyte
-_SCORES = re.compile(rb'"scores": \[[^\[\]"]*\]')  # no name can match: its quotes are escaped
 
 
 def _read_plan(entry: RunEntry) -> Plan:
     """The plan of a run. Raises InputError if there is none or it contradicts itself."""
     folder = entry.folder
-    with opened(folder.scores, folder.root) as file, np.load(file, allow_pickle=False) as arrays:
-        rows, scores = arrays["cameras"], arrays["scores"]
-    text = _SCORES.sub(b'"scores": []', read_below(folder.plan, folder.root, _MOST))
     try:
-        data = plan_json.parse(json.loads(text))
+        data = json.loads(read_below(folder.plan, folder.root, _MOST))
     except ValueError as error:
         raise InputError(f"plan.json: is not JSON: {error}") from error
-    if tuple(camera.row for camera in data.cameras) != tuple(rows.tolist()):
-        raise InputError("scores.npz: is of other cameras than plan.json")
-    return Plan.of_file(data, scores)
+    return Plan.from_json(data)
 
 
 class MapCache:
@@ -94,6 +87,17 @@ def camera_of(entry: RunEntry, row: int) -> PlanCamera | None:
     return plan.camera_json(plan.rows.index(row)) if row in plan.rows else None
 
 
+def scored_camera_of(entry: RunEntry, row: int) -> tuple[PlanCamera, tuple[float, ...]] | None:
+    """The same with its gradient scores, one for each block."""
+    plan, folder = _read_plan(entry), entry.folder
+    if row not in plan.rows:
+        return None
+    k = plan.rows.index(row)
+    with opened(folder.scores, folder.root) as file:
+        scores = read_scores(file, plan.rows, plan.grid.count)
+    return plan.camera_json(k), tuple(scores[[k], :].toarray()[0].tolist())
+
+
 def cameras_of(entry: RunEntry, block: int) -> BlockCameras | None:
     """The cameras that train a block, by row; None if the plan has no such block.
 
@@ -102,14 +106,9 @@ def cameras_of(entry: RunEntry, block: int) -> BlockCameras | None:
     plan = _read_plan(entry)
     if not 0 <= block < plan.grid.count:
         return None
-    geometric, gradient = plan.assignment.geometric[:, block], plan.assignment.gradient[:, block]
     cameras = [
-        BlockCamera(
-            row=plan.rows[k],
-            name=plan.names[k],
-            reason=reason(geometric=bool(geometric[k]), gradient=bool(gradient[k])),
-        )
-        for k in np.flatnonzero(geometric | gradient)
+        BlockCamera(row=plan.rows[k], name=plan.names[k], reason=plan.reasons(k)[block])
+        for k in plan.assignment.cameras_of(block)
     ]
     return BlockCameras(block=block, cameras=tuple(cameras))
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_array
 from typing_extensions import assert_never
 
 from panolog.orchestrator.driver import policy
@@ -25,6 +26,7 @@ from panolog.partition.districts import Districts
 from panolog.partition.faces import Plane, most_seen, seams_of, views_at
 from panolog.partition.plan import Plan, read_plan
 from panolog.partition.regions import Regions
+from panolog.partition.scores import read_scores
 from panolog.scene.files import Locate
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_scene_means
@@ -145,7 +147,7 @@ class Specs:
             case Stage.BLOCK | Stage.ROUND:
                 block = task.number
                 views, cell = self.plan.cameras(block), self.plan.cell(block)
-                compared = self.plan.compared(block, self._job.config.stage2.compare)
+                compared = self._compared(block, self._job.config.stage2.compare)
                 initial = self._initial(task, (block,), (*views, *compared))
                 return self._train(task, views, initial, cell, compared=compared)
             case Stage.REPAIR:
@@ -277,6 +279,20 @@ class Specs:
     def plan(self) -> Plan:
         """The partition, here."""
         return read_plan(self._job.folder.plan)
+
+    def _compared(self, block: int, count: int) -> tuple[int, ...]:
+        """At most so many panoramas that train a block, and as many others, on which it is compared."""
+        if not count:
+            return ()
+        start, stop = self._scores.indptr[block : block + 2]
+        scores = np.zeros(len(self.plan.rows))
+        scores[self._scores.indices[start:stop]] = self._scores.data[start:stop]
+        return self.plan.compared(block, scores, count)
+
+    @cached_property
+    def _scores(self) -> csc_array:
+        """(K, B) of the plan: read here, and only to compare blocks."""
+        return read_scores(self._job.folder.scores, self.plan.rows, self.plan.grid.count).tocsc()
 
     def _part(self, rows: tuple[int, ...]) -> Source[Scene]:
         """The scene as a task on some of its panoramas needs it."""

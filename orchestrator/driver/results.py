@@ -78,11 +78,12 @@ class Results:
 
     def _plan(self) -> list[Record]:
         job, means = self._specs.job, self._specs.means
-        shards = [job.folder.shard(TaskId.shard(shard)) for shard in range(len(job.shards))]
-        plan = decide_plan(job.scene, means, join_scores(shards, job.scene.train), job.config)
+        shards = ((job.folder.shard(TaskId.shard(i)), cameras) for i, cameras in enumerate(job.shards))
+        scores = join_scores(shards, job.config.grid.count)
+        plan = decide_plan(job.scene, means, scores, job.config)
         self._on_plan(plan, means)
-        write_plan(job.folder, plan)
-        return plan_records(job.folder, plan, self._specs.passes(), len(self._specs.measures))
+        write_plan(job.folder, plan, scores)
+        return plan_records(job.folder, plan, scores, self._specs.passes(), len(self._specs.measures))
 
     def _unite(self, task: TaskId, state: RunState) -> list[Record]:
         folder = self._job.folder

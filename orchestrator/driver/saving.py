@@ -8,7 +8,6 @@ import socket
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import numpy as np
 from typing_extensions import assert_never
 
 from panolog.orchestrator.resources.usage import INTERVAL_S, Usage
@@ -30,7 +29,8 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.stages.scenes import save_captured
-from panolog.scene.files import atomic, publish, remove_partial, write_bytes
+from panolog.partition.scores import write_scores
+from panolog.scene.files import publish, remove_partial, write_bytes
 from panolog.scene.model import Scene
 from panolog.scene.ply import write_ply
 from panolog.workers.events import (
@@ -241,7 +241,5 @@ def _save_model(folder: RunFolder, event: Trained, scene: Scene) -> ModelSaved:
 
 def _save_scores(folder: RunFolder, event: Scored) -> ScoresSaved:
     path = folder.shard(event.task)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, cameras=np.array(event.cameras, np.int64), scores=event.scores.numpy())
+    write_scores(path, event.cameras, event.scores.numpy())
     return ScoresSaved(event.task, folder.relative(path), len(event.cameras))

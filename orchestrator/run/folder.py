@@ -98,7 +98,7 @@ class RunFolder:
 
     @property
     def scores(self) -> Path:
-        """All gradient scores (eq. 10): arrays `cameras` (K,) and `scores` (K, B)."""
+        """All gradient scores (eq. 10), sparse: see `partition.scores`."""
         return self.root / "partition" / "scores.npz"
 
     @property

@@ -1,10 +1,11 @@
-"""G²PS in a run: from the scores on disk to plan.json and scores.npz."""
+"""G²PS in a run: from the scores of shards to plan.json and scores.npz."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array, vstack
 
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
@@ -12,8 +13,7 @@ from panolog.orchestrator.run.records import BlockPlan, Noticed, PlanSaved, Reco
 from panolog.partition.audit import audit
 from panolog.partition.contraction import contract
 from panolog.partition.plan import Plan, make_plan
-from panolog.scene.errors import RunError
-from panolog.scene.files import atomic
+from panolog.partition.scores import read_scores, write_scores
 from panolog.scene.model import Scene
 from panolog.workers.tasks import PLAN
 
@@ -30,9 +30,7 @@ def block_labels(scene: Scene, means: NDArray[np.float32], config: RunConfig) ->
     return labels
 
 
-def decide_plan(
-    scene: Scene, means: NDArray[np.float32], scores: NDArray[np.float64], config: RunConfig
-) -> Plan:
+def decide_plan(scene: Scene, means: NDArray[np.float32], scores: csr_array, config: RunConfig) -> Plan:
     """The partition (eqs. 7-11).
 
     Args: means (N, 3) of the scene Gaussians of Stage I; scores (K, B) of the training cameras, in order.
@@ -48,39 +46,37 @@ def decide_plan(
     )
 
 
-def write_plan(folder: RunFolder, plan: Plan) -> None:
-    """Writes scores.npz and plan.json."""
-    folder.scores.parent.mkdir(parents=True, exist_ok=True)
-    with atomic(folder.scores) as temporary, temporary.open("wb") as file:
-        np.savez(file, cameras=np.array(plan.rows, np.int64), scores=plan.scores)
+def write_plan(folder: RunFolder, plan: Plan, scores: csr_array) -> None:
+    """Writes scores.npz and plan.json. Args: scores (K, B) that the plan was made of."""
+    write_scores(folder.scores, plan.rows, scores)
     write_json(folder.plan, plan.to_json())
 
 
-def join_scores(shards: Sequence[Path], cameras: Sequence[int]) -> NDArray[np.float64]:
-    """(K, B) scores of all training cameras from the files of their shards.
+def join_scores(shards: Iterable[tuple[Path, Sequence[int]]], blocks: int) -> csr_array:
+    """(K, blocks) scores of all training cameras from the files of their shards, each with its cameras.
 
-    Raises RunError if the files hold other cameras.
+    Raises InputError if a file holds others.
     """
-    parts = [np.load(path) for path in shards]
-    found = np.concatenate([part["cameras"] for part in parts]).tolist()
-    if found != list(cameras):
-        raise RunError(f"the scores in {shards[0].parent} are of other cameras; remove the folder and resume")
-    return np.concatenate([part["scores"] for part in parts])
+    return vstack([read_scores(path, cameras, blocks) for path, cameras in shards], format="csr")
 
 
 def plan_records(
-    folder: RunFolder, plan: Plan, passes: tuple[tuple[str, ...], ...] = (), measures: int = 0
+    folder: RunFolder,
+    plan: Plan,
+    scores: csr_array,
+    passes: tuple[tuple[str, ...], ...] = (),
+    measures: int = 0,
 ) -> list[Record]:
     """The records of a plan, and of the tasks that follow its blocks.
 
-    Args: passes, their tasks; measures, shards of the evaluation.
+    Args: scores (K, B) that the plan was made of; passes, their tasks; measures, shards of the evaluation.
     """
-    cameras = plan.assignment.assigned.sum(axis=0).tolist()
+    cameras = plan.assignment.counts.tolist()
     blocks = tuple(
         BlockPlan(block, seen, count, train=train)
         for block, (seen, count, train) in enumerate(
             zip(cameras, plan.gaussians.tolist(), plan.trained.tolist(), strict=True)
         )
     )
-    notices = [Noticed(PLAN, line) for line in audit(plan)]
+    notices = [Noticed(PLAN, line) for line in audit(plan, scores)]
     return [*notices, PlanSaved(folder.relative(folder.plan), blocks, passes, measures)]

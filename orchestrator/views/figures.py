@@ -191,9 +191,8 @@ def _cameras(view: MapWindow, colors: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def _served(plan: Plan, k: int) -> list[int]:
-    """The blocks that a camera trains: its own first, then by score."""
-    blocks = np.flatnonzero(plan.assignment.assigned[k])
-    return sorted(blocks.tolist(), key=lambda b: (b != plan.camera_blocks[k], -plan.scores[k, b]))
+    """The blocks that a camera trains, its own first."""
+    return sorted(plan.assignment.blocks_of(k).tolist(), key=lambda b: b != plan.camera_blocks[k])
 
 
 def _listed(blocks: Sequence[int]) -> str:

@@ -93,12 +93,13 @@ def _draw_box(axes: Axes, plan: Plan, view: MapWindow) -> None:
 
 def _draw_cameras(axes: Axes, plan: Plan, places: NDArray[np.float64]) -> None:
     """A disc for each camera, with one sector in the colour of each block that it trains."""
-    assigned = plan.assignment.assigned
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for k in range(len(plan.rows)):
+        groups.setdefault(tuple(plan.assignment.blocks_of(k).tolist()), []).append(k)
     size = float(np.clip(9000 / max(len(places), 1), 12, 110))
     axes.scatter(places[:, 0], places[:, 1], s=size * 1.5, c="white", linewidths=0, zorder=5)
-    for served in np.unique(assigned, axis=0):
-        here = places[(assigned == served).all(axis=1)]
-        ids = np.flatnonzero(served)
+    for ids, group in sorted(groups.items()):
+        here = places[group]
         for i, block in enumerate(ids):
             sector = _sector(360 * i / len(ids), 360 * (i + 1) / len(ids))
             # A marker is scaled to its own extent: this keeps a sector as large as the disc it is part of.
@@ -191,10 +192,9 @@ def _draw_texts(figure: Figure, axes: Axes, view: MapWindow) -> None:
     """Title, parameters and the legend, each in a place of its own."""
     plan, third = view.plan, "xyz"[view.axes[2]]
     config = plan.config
-    overlap = plan.assignment.assigned.sum() / max(len(plan.rows), 1)
     title = f"{_count(plan.grid.count, 'block')} ({plan.grid}), {_count(len(plan.rows), 'camera')}"
     figure.suptitle(title, x=0.01, ha="left", fontsize=15, color=_INK)
-    text = f"seen along {third}   ·   {overlap:.2f} blocks per camera"
+    text = f"seen along {third}   ·   {plan.assignment.overlap:.2f} blocks per camera"
     if view.layers > 1:
         text += f"   ·   the layer through the middle, of {view.layers} along {third}"
     text += (

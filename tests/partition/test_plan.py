@@ -1,6 +1,8 @@
 import copy
 import json
+import pickle
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cells, Cuts, Grid
 from panolog.partition.contraction import contract
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
+from panolog.partition.scores import read_scores
 from panolog.scene.errors import InputError
 
 CENTERS = np.array([[float(x), 0.0, 0.1 * x] for x in range(6)])
@@ -41,32 +44,54 @@ def test_a_camera_on_a_face_belongs_to_the_upper_cell() -> None:
 
 def test_blocks_get_rows_of_the_scene() -> None:
     made = plan()
-    assigned = made.assignment.assigned
+    assigned = made.assignment.assigned.toarray()
     for block in range(GRID.count):
         assert made.cameras(block) == tuple(int(k) + 1 for k in np.flatnonzero(assigned[:, block]))
         inside = made.cell(block).contains(CENTERS)
-        np.testing.assert_array_equal(inside, made.assignment.geometric[:, block])
+        np.testing.assert_array_equal(inside, made.camera_blocks == block)
     assert made.gaussians.sum() == 500
 
 
 def test_a_block_is_compared_on_as_many_of_its_cameras_as_of_others() -> None:
     scores = np.ones((6, GRID.count))
     scores[:, 0] = [0.9, 0.1, 0.5, 0.0, 0.7, 0.5]
-    made = plan(scores)
+    made, first = plan(scores), scores[:, 0]
     assert made.cameras(0) == (1, 2, 3)  # by position and, the first, by its score
-    assert made.compared(0, 1) == (1, 5)
-    assert made.compared(0, 2) == made.compared(0, 8) == (1, 3, 5, 6)  # the fourth sees nothing of it
-    assert made.compared(0, 0) == () == made.compared(1, 8)  # all train the other
+    assert made.compared(0, first, 1) == (1, 5)
+    assert made.compared(0, first, 2) == made.compared(0, first, 8) == (1, 3, 5, 6)  # one sees nothing of it
+    assert made.compared(0, first, 0) == () == made.compared(1, scores[:, 1], 8)  # all train the other
 
 
 def test_plan_survives_its_file() -> None:
     stored = json.loads(json.dumps(plan().to_json(), allow_nan=False))
     again = Plan.from_json(stored)
     assert again.to_json() == plan().to_json()
-    np.testing.assert_array_equal(again.scores, plan().scores)
-    assert stored["version"] == 1
+    assert stored["version"] == 2
     reasons = {reason for camera in stored["cameras"] for reason in camera["assigned"].values()}
     assert reasons == {"geometry", "gradient", "both"}
+
+
+def test_a_plan_of_many_blocks_is_small_in_its_file_and_in_tasks() -> None:
+    """Neither grows with cameras times blocks: scores of all pairs are written once, elsewhere."""
+    centers = np.random.default_rng(0).uniform(-9, 9, (400, 3))
+    made = planned(centers, centers, np.random.default_rng(1).random((400, 1_000)) ** 99, Grid((10, 10, 10)))
+    per_pair = 1.0  # bytes: a digit of each score
+    assert len(json.dumps(made.to_json())) < 400 * 1_000 * per_pair
+    assert len(pickle.dumps(made)) < 400 * 1_000 * per_pair
+
+
+def test_a_plan_of_version_1_opens(tmp_path: Path) -> None:
+    """It has the scores in itself, and scores.npz has them densely."""
+    scores = np.random.default_rng(2).random((6, GRID.count)) * [1, 0, 1, 1]
+    made = plan(scores)
+    older = made.to_json() | {"version": 1}
+    for camera, row in zip(older["cameras"], scores, strict=True):
+        camera["scores"] = row.tolist()
+    again = Plan.from_json(json.loads(json.dumps(older)))
+    assert again.to_json() == made.to_json()
+    np.savez(tmp_path / "scores.npz", cameras=np.array(made.rows), scores=scores)
+    read = read_scores(tmp_path / "scores.npz", again.rows, again.grid.count)
+    np.testing.assert_array_equal(read.toarray(), scores)
 
 
 def test_a_plan_with_parts_of_the_box_survives_its_file() -> None:
@@ -111,16 +136,18 @@ def _change(data: dict[str, Any], path: list[Any], value: Any) -> dict[str, Any]
 @pytest.mark.parametrize(
     ("path", "value", "words"),
     [
-        (["version"], 2, "version"),
-        (["cameras", 0, "scores", 1], "much", "cameras.0.scores.1"),
-        (["cameras", 0, "scores", 1], float("nan"), "scores"),
+        (["version"], 3, "version"),
+        (["cameras", 0, "center", 1], "much", "cameras.0.center.1"),
+        (["cameras", 0, "center", 1], float("nan"), "center"),
         (["extra"], 1, "extra"),
         (["grid"], [2, 0, 2], "at least 1"),
         (["aabb", "lower"], [1e9, 0, 0], "lower < upper"),
         (["blocks", 0, "cameras"], [], "'blocks'"),
         (["blocks", 1, "gaussians"], 3.5, "integer"),
         (["cameras", 2, "block"], 3, "'cameras'"),
-        (["cameras", 2, "scores"], [1.0], "contradicts"),
+        (["cameras", 2, "assigned"], {}, "'blocks'"),
+        (["cameras", 2, "assigned", 9], "gradient", "contradicts"),
+        (["cameras", 2, "assigned", -1], "both", "contradicts"),
         (["tau_grad"], 2.0, "contradicts"),
         (["blocks"], [], "contradicts"),
     ],
@@ -148,7 +175,7 @@ def test_audit_names_blocks_without_cameras_and_idle_cameras() -> None:
     grid = Grid((1, 1, 3))
     means = np.array([[0.0, 0, 100 * box.upper[2]]])
     made = planned(centers, means, np.zeros((2, 3)), grid)
-    lines = audit(made)
+    lines = audit(made, np.zeros((2, 3)))
     assert "3 blocks (1x1x3)" in lines[0] and "2 cameras, 1 Gaussians" in lines[0]
     assert any("block 0 has no Gaussians and is skipped" in line for line in lines)
     assert any("block 2 has no camera: its 1 Gaussians stay" in line for line in lines)
@@ -160,7 +187,7 @@ def test_blocks_with_few_cameras_keep_what_stage_one_made() -> None:
     made = planned(centers, centers, np.zeros((4, 2)), Grid((2, 1, 1)))
     assert made.trained.tolist() == [False, True]
     assert "block 0 has 1 camera, fewer than partition.min_cameras=3: its 1 Gaussians stay as they were" in (
-        "\n".join(audit(made))
+        "\n".join(audit(made, np.zeros((4, 2))))
     )
     empty = planned(centers, centers[:1], np.zeros((4, 2)), Grid((2, 1, 1)))
     assert empty.trained.tolist() == [False, False]  # the other has no Gaussians
@@ -171,10 +198,11 @@ def test_blocks_with_few_cameras_keep_what_stage_one_made() -> None:
 
 
 def test_audit_reports_uneven_blocks() -> None:
-    made = plan(scores=np.ones((6, 4)))
+    scores = np.ones((6, 4))
+    made = plan(scores)
     uneven = replace(made, gaussians=np.array([1000, 10, 10, 10]))
-    assert any("10 to 1,000 Gaussians" in line for line in audit(uneven))
-    assert not any("uneven" in line for line in audit(made) if "cameras" in line)
+    assert any("10 to 1,000 Gaussians" in line for line in audit(uneven, scores))
+    assert not any("uneven" in line for line in audit(made, scores) if "cameras" in line)
 
 
 def sharing(others: list[float], tau_grad: float = 0.8) -> list[str]:
@@ -184,7 +212,7 @@ def sharing(others: list[float], tau_grad: float = 0.8) -> list[str]:
     here = grid.block_of(contract(centers, aabb(centers, 5.0)))
     scores = np.where(here[:, None] == np.arange(2), 1.0, np.array(others)[:, None])
     made = planned(centers, centers, scores, grid, tau_grad=tau_grad)
-    return [line for line in audit(made) if line.startswith("gradients add")]
+    return [line for line in audit(made, scores) if line.startswith("gradients add")]
 
 
 def test_audit_names_the_threshold_at_which_blocks_overlap() -> None:

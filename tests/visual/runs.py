@@ -197,9 +197,9 @@ def _partition(run: Written) -> list[TaskId]:
         run.add(_started(shard))
         path = run.folder.relative(run.folder.shard(shard))
         run.add(Progressed(shard, 32, 32, 1.4), ScoresSaved(shard, path, 32), after=24)
-    plan = town.plan(json.loads(run.folder.info.read_bytes())["config"]["blocks"], _CAMERAS)
-    write_plan(run.folder, plan)
-    *notices, saved = plan_records(run.folder, plan)
+    plan, scores = town.plan(json.loads(run.folder.info.read_bytes())["config"]["blocks"], _CAMERAS)
+    write_plan(run.folder, plan, scores)
+    *notices, saved = plan_records(run.folder, plan, scores)
     assert isinstance(saved, PlanSaved)
     run.add(*notices, saved, after=3)
     return [TaskId.block(block.block) for block in saved.blocks if block.train]

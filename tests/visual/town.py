@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from panolog.partition.cells import Grid
 from panolog.partition.contraction import contract
@@ -72,13 +73,13 @@ def write_model(path: Path) -> None:
     write_ply(path, Gaussians(means, quats, scales, torch.zeros(n), *colours, sky=0))
 
 
-def plan(grid: str, count: int) -> Plan:
-    """A partition of the town for that many training cameras: scores fall with the distance to a block."""
+def plan(grid: str, count: int) -> tuple[Plan, csr_array]:
+    """A partition of the town for that many cameras, and its scores, which fall with the distance."""
     cells, centers, where = Grid.parse(grid), cameras(count), points()
     config = PartitionConfig(aspect=0.5)
     block = cells.block_of(contract(where, config.box(centers)))
     distance = np.linalg.norm(centers[:, None] - where[::10], axis=2)  # (K, P / 10)
     seen = np.exp(-distance / 50) @ np.eye(cells.count)[block[::10]]
-    scores = seen / seen.max() * np.random.default_rng(3).uniform(0.7, 1, seen.shape)
+    scores = csr_array(seen / seen.max() * np.random.default_rng(3).uniform(0.7, 1, seen.shape))
     names = [f"street_{row:03d}.jpg" for row in range(count)]
-    return make_plan(centers, where, scores, cells, config, rows=range(count), names=names)
+    return make_plan(centers, where, scores, cells, config, rows=range(count), names=names), scores

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from benchmarks.paper import goals, pages
 from benchmarks.paper.crops import Comparison, Crop
@@ -142,9 +143,8 @@ def test_a_study_is_written_as_text_sheet_and_page(tmp_path: Path) -> None:
 
 
 def test_overlap_counts_what_gradients_add() -> None:
-    geometric = np.array([[True, False], [False, True], [True, True], [False, False]])
-    gradient = np.array([[True, True], [False, False], [True, False], [True, False]])
-    assert overlap_of(Assignment(geometric, gradient)) == (6 / 4, 2 / 6)
+    gradient = csr_array([[True, True], [False, False], [True, False], [False, True]])
+    assert overlap_of(Assignment(np.array([0, 1, 1, 1]), gradient)) == (6 / 4, 2 / 6)
     (cells,) = overlap_table([Overlap("street", "paper", tau, 1.5, 0.25) for tau in TAUS]).rows
     assert cells[:2] == ("street, paper", "1.50 (25 %)")
 

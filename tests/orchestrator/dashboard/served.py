@@ -12,10 +12,11 @@ from typing import Any
 import cv2
 import httpx
 import numpy as np
+from scipy.sparse import csr_array
 
 from panolog.orchestrator.dashboard import server
 from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
@@ -30,13 +31,14 @@ from panolog.orchestrator.run.records import (
     ViewEvaluated,
 )
 from panolog.orchestrator.run.store import Database
-from panolog.orchestrator.stages.partitioning import plan_records
+from panolog.orchestrator.stages.partitioning import plan_records, write_plan
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 
 PATIENCE_S = 120.0  # for what a machine under load does at last
 POST = {"X-PanoLOG": "1", "Content-Type": "application/json"}
+SCORES = csr_array([[1.0, 0], [1, 0.9], [0.1, 1], [0, 1]])  # of the cameras and blocks of `plan`
 EVIL = '<script>alert("x")</script>&\'"'
 
 
@@ -68,17 +70,15 @@ def progressed(task: TaskId, iteration: int, gaussians: int = 500) -> Progressed
 def plan() -> Plan:
     """Four cameras in two blocks."""
     centers = np.array([[-3.0, 0, 0], [-1, 0.5, 0], [1, 0, 0.2], [3, 0.4, 0]])
-    scores = np.array([[1.0, 0], [1, 0.9], [0.1, 1], [0, 1]])
     means = np.random.default_rng(0).uniform(-4, 4, (50, 3))
     names = [f"{number}.jpg" for number in range(4)]
-    return make_plan(centers, means, scores, Grid((2, 1, 1)), PartitionConfig(), rows=range(4), names=names)
+    return make_plan(centers, means, SCORES, Grid((2, 1, 1)), PartitionConfig(), rows=range(4), names=names)
 
 
 def write_whole_run(root: Path, scene: str = "/scenes/town") -> RunFolder:
     """A run in the middle of Stage II, with all that a page shows."""
     folder = write_run(root, scene=scene)
-    write_json(folder.plan, plan().to_json())
-    np.savez(folder.scores, cameras=np.arange(4), scores=plan().scores)
+    write_plan(folder, plan(), SCORES)
     for path in (folder.root / "coarse" / "previews" / "000050.jpg", folder.images / "a" / "0.jpg"):
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), np.zeros((8, 16, 3), np.uint8))
@@ -92,7 +92,7 @@ def write_whole_run(root: Path, scene: str = "/scenes/town") -> RunFolder:
         PreviewSaved(COARSE, 50, "1.jpg", "coarse/previews/000050.jpg"),
         Noticed(COARSE, "an image is strange"),
         ModelSaved(COARSE, "coarse/model.ply", 500, 9_000, 100, 12.0),
-        *plan_records(folder, plan()),
+        *plan_records(folder, plan(), SCORES),
         started(TaskId.block(0)),
         *(progressed(TaskId.block(0), iteration) for iteration in range(1, 41)),
         CheckpointSaved(TaskId.block(0), 40, "blocks/000/checkpoint.safetensors", 10),

@@ -143,7 +143,8 @@ def test_links_out_of_a_run_are_not_followed(tmp_path: Path) -> None:
     np.savez(program.scores, cameras=np.array([print], dtype=object), scores=np.zeros((4, 2)))
     with serving(tmp_path / "folder") as served:
         for run in served.get("/api/runs")["runs"]:
-            target = "map" if run["name"].startswith("partition") else run["name"]
+            scores = run["name"].endswith(("scores.npz", "program"))
+            target = "camera/0" if scores else "map" if run["name"].startswith("partition") else run["name"]
             assert served.errors(f"/api/runs/{run['id']}/{target}", 404)
 
 

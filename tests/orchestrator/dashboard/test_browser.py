@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
+from scipy.sparse import csr_array
 
-from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.records import Noticed, PreviewSaved, RunBegan, TaskFailed
-from panolog.orchestrator.stages.partitioning import plan_records
+from panolog.orchestrator.stages.partitioning import plan_records, write_plan
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.workers.tasks import COARSE, TaskId
@@ -270,13 +270,12 @@ def test_what_a_scene_says_stays_text(browser: Browser, shown: Served) -> None:
 def test_a_thousand_blocks_cost_no_more_rows_than_are_seen(browser: Browser, tmp_path: Path) -> None:
     random, count = np.random.default_rng(0), 1000
     centers, means = random.normal(size=(400, 3)) * [50, 40, 1], random.normal(size=(5000, 3)) * 50
-    scores, names = random.random((400, count)) ** 40, [f"{k}.jpg" for k in range(400)]
+    scores, names = csr_array(random.random((400, count)) ** 40), [f"{k}.jpg" for k in range(400)]
     grid = Grid((40, 25, 1))
     plan = make_plan(centers, means, scores, grid, PartitionConfig(), rows=range(400), names=names)
     folder = write_run(tmp_path / "city")
-    write_json(folder.plan, plan.to_json())
-    np.savez(folder.scores, cameras=np.arange(400), scores=scores)
-    append(folder, RunBegan(socket.gethostname(), 1, resumed=False), *plan_records(folder, plan))
+    write_plan(folder, plan, scores)
+    append(folder, RunBegan(socket.gethostname(), 1, resumed=False), *plan_records(folder, plan, scores))
     with serving(tmp_path) as server, opened(browser, f"{server.url}/runs/{server.id('city')}") as page:
         expect(page.locator("#tally")).to_contain_text("waiting")
         assert page.locator("#block-table tbody tr").count() < 60

@@ -16,7 +16,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.control import Action, ControlRequest
-from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import (
     Delivered,
     EvaluationSaved,
@@ -33,11 +33,11 @@ from panolog.orchestrator.run.records import (
     UnpauseRequested,
     ViewEvaluated,
 )
-from panolog.orchestrator.stages.partitioning import plan_records
+from panolog.orchestrator.stages.partitioning import plan_records, write_plan
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.orchestrator.dashboard.browser import AWAY, opened
-from tests.orchestrator.dashboard.served import append, plan, progressed, serving, started, write_run
+from tests.orchestrator.dashboard.served import SCORES, append, plan, progressed, serving, started, write_run
 from tests.orchestrator.dashboard.test_browser import fills_its_card
 from tests.orchestrator.views.models import some
 
@@ -93,9 +93,8 @@ def stage_one_moves(page: Page, folder: RunFolder) -> None:
 def blocks_fill(page: Page, folder: RunFolder) -> None:
     append(folder, ModelSaved(COARSE, "coarse/model.ply", 500, 9_000, 100, 12.0))
     append(folder, started(SHARD), ScoresSaved(SHARD, "scores/000.npz", 4))
-    write_json(folder.plan, plan().to_json())
-    np.savez(folder.scores, cameras=np.arange(4), scores=plan().scores)
-    *_, saved = plan_records(folder, plan())
+    write_plan(folder, plan(), SCORES)
+    *_, saved = plan_records(folder, plan(), SCORES)
     assert isinstance(saved, PlanSaved)
     blocks = tuple(replace(block, train=True) for block in saved.blocks)
     append(folder, replace(saved, blocks=blocks), started(FIRST), started(SECOND), progressed(FIRST, 30))

@@ -20,7 +20,7 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.dashboard.browser import opened
-from tests.orchestrator.dashboard.served import POST, Served, plan, raw, serving, write_run
+from tests.orchestrator.dashboard.served import POST, SCORES, Served, plan, raw, serving, write_run
 from tests.orchestrator.views.models import some
 from tests.orchestrator.views.pictures import layers, psnr, ready, rendered, shown, until
 from tests.orchestrator.views.sites import SIZE, viewpoints_of
@@ -68,7 +68,7 @@ def save_model(folder: RunFolder, model: Gaussians) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """A run whose model is of opaque balls in front of one of its cameras."""
     folder = write_run(tmp_path_factory.mktemp("folder") / "run")
-    write_plan(folder, plan())
+    write_plan(folder, plan(), SCORES)
     save_model(folder, layers(viewpoints_of(folder, "1.jpg")))
     return folder
 
@@ -165,7 +165,7 @@ def test_what_a_run_has_written_is_shown_with_the_scenes_photographs(
     blue = bytes(cv2.imencode(".jpg", np.full((512, 1024, 3), (250, 20, 10), np.uint8))[1])
     (tmp_path / "scene" / "images" / "2.jpg").write_bytes(blue)
     folder = write_run(tmp_path / "run", scene=str(tmp_path / "scene"))
-    write_plan(folder, plan())
+    write_plan(folder, plan(), SCORES)
     save_model(folder, some(400, sky=100))
     write_folder(site_of_run(folder, Wanted()), folder.web)
     (folder.web / "secret.txt").symlink_to(tmp_path / "scene" / "images" / "2.jpg")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import ModelSaved, Noticed, PlanSaved
@@ -79,8 +80,9 @@ def test_a_block_of_one_camera_is_not_trained_and_a_notice_says_so(tmp_path: Pat
     for least, train in ((3, [False, True]), (1, [True, True])):
         config = PartitionConfig(min_cameras=least)
         grid = Grid((2, 1, 1))
-        plan = make_plan(centers, centers, np.zeros((4, 2)), grid, config, rows=range(4), names=names)
-        *notices, saved = plan_records(RunFolder(tmp_path), plan)
+        scores = csr_array((4, 2))
+        plan = make_plan(centers, centers, scores, grid, config, rows=range(4), names=names)
+        *notices, saved = plan_records(RunFolder(tmp_path), plan, scores)
         assert isinstance(saved, PlanSaved)
         assert [block.train for block in saved.blocks] == train
         lines = [record.message for record in notices if isinstance(record, Noticed)]
