@@ -10,6 +10,7 @@ import typer
 
 from panolog.orchestrator.cli.console import command, print_json, progress_bar, say
 from panolog.orchestrator.cli.options import (
+    AtEndOption,
     DeadlineOption,
     JsonOption,
     LogOption,
@@ -79,6 +80,7 @@ def submit(
     prices: PricesOption = None,
     max_cost: MaxCostOption = None,
     deadline: DeadlineOption = None,
+    at_end: AtEndOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Start a run on the cluster, with the options of `panolog run`; F.yaml and prices are read here.
@@ -100,6 +102,7 @@ def submit(
     budget = wanted(prices, max_cost, deadline).options()
     words = ["run", source, "-o", run, *as_settings(config), *as_arguments(options), *budget]
     words += words_elsewhere(notify or (), log or ())
+    words += ["--at-end", at_end] if at_end else []
     _start(address, run, words, as_json=as_json)
 
 
@@ -112,6 +115,7 @@ def resume(
     prices: PricesOption = None,
     max_cost: MaxCostOption = None,
     deadline: DeadlineOption = None,
+    at_end: AtEndOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Resume a run on the cluster from its last checkpoints."""
@@ -121,6 +125,7 @@ def resume(
     run = on_head(run, "RUN")
     words = ["resume", run, *wanted(prices, max_cost, deadline).options()]
     words += words_elsewhere(notify or (), log or ())
+    words += ["--at-end", at_end] if at_end else []
     _start(address, run, words, as_json=as_json)
 
 

@@ -121,6 +121,16 @@ DeadlineOption = Annotated[
         rich_help_panel=BUDGET,
     ),
 ]
+AtEndOption = Annotated[
+    str | None,
+    typer.Option(
+        "--at-end",
+        metavar="COMMAND",
+        help="Carried out when the run has ended for good, however, but not if it is stopped: ends a machine"
+        " that is paid (docs/money.md).",
+        rich_help_panel=BUDGET,
+    ),
+]
 DeviceOption = Annotated[
     str | None,
     typer.Option(metavar="auto|cpu|cuda", help="Device to compute on. Default: as in the settings, or auto."),

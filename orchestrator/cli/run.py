@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from panolog.orchestrator.cli.at_end import when_ended
 from panolog.orchestrator.cli.console import (
     command,
     err,
@@ -22,6 +23,7 @@ from panolog.orchestrator.cli.console import (
 from panolog.orchestrator.cli.options import (
     AddressOption,
     AnyRunArg,
+    AtEndOption,
     DashboardOption,
     DeadlineOption,
     JsonOption,
@@ -67,6 +69,7 @@ def run(
     prices: PricesOption = None,
     max_cost: MaxCostOption = None,
     deadline: DeadlineOption = None,
+    at_end: AtEndOption = None,
 ) -> None:
     """Reconstruct a scene, a folder of panoramas or a 360° video: one model of the place."""
     from panolog.orchestrator.preparation.settings import as_arguments
@@ -74,17 +77,19 @@ def run(
 
     driver, budget = _driver_options(address, nice, dashboard=dashboard), wanted(prices, max_cost, deadline)
     code, state = 0, None
-    with mirrored(output, local) as root, _followed(root, notify, log):
-        if _supervised(max_resumes, supervise=supervise):
-            first = ["run", source, "-o", str(root), *as_settings(config), *as_arguments(options)]
-            code = _supervise(root, first, driver, budget.options(), address, max_resumes)
-        else:
-            with progress_bar("starting"):
-                from panolog.orchestrator.commands import session
+    with when_ended(at_end) as begun:
+        with mirrored(output, local) as root, _followed(root, notify, log):
+            begun(root)
+            if _supervised(max_resumes, supervise=supervise):
+                first = ["run", source, "-o", str(root), *as_settings(config), *as_arguments(options)]
+                code = _supervise(root, first, driver, budget.options(), address, max_resumes)
+            else:
+                with progress_bar("starting"):
+                    from panolog.orchestrator.commands import session
 
-            with _display(root, output, dashboard=dashboard) as show:
-                state = session.start(source, root, config, address, show, None, nice, options, budget)
-    _end(root, code, state)
+                with _display(root, output, dashboard=dashboard) as show:
+                    state = session.start(source, root, config, address, show, None, nice, options, budget)
+        _end(root, code, state)
 
 
 def resume(
@@ -103,6 +108,7 @@ def resume(
     prices: PricesOption = None,
     max_cost: MaxCostOption = None,
     deadline: DeadlineOption = None,
+    at_end: AtEndOption = None,
     after: Annotated[str, typer.Option("--resumed-after", hidden=True)] = "",
     has_mirror: Annotated[bool, typer.Option("--has-mirror", hidden=True)] = False,
 ) -> None:
@@ -112,19 +118,21 @@ def resume(
 
     options, budget = _driver_options(address, nice, dashboard=dashboard), wanted(prices, max_cost, deadline)
     code, state = 0, None
-    with mirrored(run, local, resumes=True, force=force, mirror=not has_mirror) as root:
-        read_info(RunFolder(root))  # fails before torch is imported
-        with _followed(root, notify, log):
-            if _supervised(max_resumes, supervise=supervise):
-                first = ["resume", str(root), "--has-mirror"]
-                code = _supervise(root, first, options, budget.options(), address, max_resumes)
-            else:
-                with progress_bar("starting"):
-                    from panolog.orchestrator.commands import session
+    with when_ended(at_end) as begun:
+        with mirrored(run, local, resumes=True, force=force, mirror=not has_mirror) as root:
+            begun(root)
+            read_info(RunFolder(root))  # fails before torch is imported
+            with _followed(root, notify, log):
+                if _supervised(max_resumes, supervise=supervise):
+                    first = ["resume", str(root), "--has-mirror"]
+                    code = _supervise(root, first, options, budget.options(), address, max_resumes)
+                else:
+                    with progress_bar("starting"):
+                        from panolog.orchestrator.commands import session
 
-                with _display(root, run, dashboard=dashboard) as show:
-                    state = session.resume(root, address, show, None, nice, after, budget)
-    _end(root, code, state)
+                    with _display(root, run, dashboard=dashboard) as show:
+                        state = session.resume(root, address, show, None, nice, after, budget)
+        _end(root, code, state)
 
 
 def demo(

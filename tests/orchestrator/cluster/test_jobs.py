@@ -175,6 +175,7 @@ def test_notifications_sinks_and_settings_are_words_of_the_job(
     given = ["--notify", "slack:@/etc/panolog/slack.url", "--notify", "env:TARGETS", "--notify", "@~/more"]
     given += ["--notify", "webhook:https://h.example/hook", "--notify", "mail:smtp://h.example/a@b.c"]
     given += ["--log", "mlflow", "--log", "tensorboard:/curves", "--log", "wandb:place"]
+    given += ["--at-end", "ray down -y /etc/cluster.yaml"]
     submit = ("submit", "/data/town", "-o", "/runs/a", "--config", settings)
     for command in (submit, ("resume", "/runs/a")):
         assert invoke(*command, *given).exit_code == 0
