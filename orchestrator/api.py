@@ -144,13 +144,19 @@ def run(
 
 
 def resume(
-    run: StrPath, *, address: str | None = None, pool: Pool | None = None, on_change: OnChange = ignore
+    run: StrPath,
+    *,
+    address: str | None = None,
+    pool: Pool | None = None,
+    on_change: OnChange = ignore,
+    accept_changes: bool = False,
 ) -> RunState:
     """Resumes the run in a run folder from its last checkpoints, to the end; a done run is left as it is.
 
-    Args, return value and errors are those of `run`; RunLockedError if another driver runs it.
+    Args, return value and errors are those of `run`; RunLockedError if another driver runs it, ConfigError if
+    the settings in run.json were changed since it was begun, unless `accept_changes`.
     """
-    return session.resume(Path(run), address, on_change, pool)
+    return session.resume(Path(run), address, on_change, pool, accept_changes=accept_changes)
 
 
 def _scene(scene: Scene | StrPath) -> Scene:

@@ -10,6 +10,7 @@ from typing import Any
 
 from benchmarks.paper.results import Result
 from panolog.orchestrator.run.config import RunConfig, load_config
+from panolog.orchestrator.run.config import flat as settings_in
 from panolog.workers.training.recipes import RECIPES
 
 Measured = Mapping[str, Result]  # by variant, of one scene and one seed
@@ -93,15 +94,7 @@ class Group:
 
 def flat(config: RunConfig) -> dict[str, Any]:
     """Settings by dotted key."""
-
-    def walk(tree: Mapping[str, Any], prefix: str) -> Iterable[tuple[str, Any]]:
-        for key, value in tree.items():
-            if isinstance(value, dict):
-                yield from walk(value, f"{prefix}{key}.")
-            else:
-                yield prefix + key, value
-
-    return dict(walk(config.model_dump(mode="json"), ""))
+    return dict(settings_in(config.model_dump(mode="json")))
 
 
 def differing(a: Mapping[str, Any], b: Mapping[str, Any], without: Sequence[str] = ()) -> dict[str, Any]:

@@ -36,8 +36,8 @@ def measure(folder: Path, panoramas: int, blocks: int, seen: int) -> PlanSize:
     root = RunFolder(folder / f"{panoramas}-{blocks}")
     write, made = in_fresh_process(_write, root, panoramas, blocks, seen)
     read, used = in_fresh_process(_read, root)
-    sizes = (path.stat().st_size / 1e6 for path in (root.plan, root.scores))
-    return PlanSize(panoramas, blocks, seen, *sizes, write, read, max(made, used) / 1e6)
+    plan, scores = (path.stat().st_size / 1e6 for path in (root.plan, root.scores))
+    return PlanSize(panoramas, blocks, seen, plan, scores, write, read, max(made, used) / 1e6)
 
 
 def _write(folder: RunFolder, panoramas: int, blocks: int, seen: int) -> tuple[float, int]:

@@ -10,6 +10,7 @@ import typer
 
 from panolog.orchestrator.cli.console import command, print_json, progress_bar, say
 from panolog.orchestrator.cli.options import (
+    AcceptOption,
     AtEndOption,
     DeadlineOption,
     JsonOption,
@@ -110,6 +111,7 @@ def submit(
 def resume(
     run: HeadRunArg,
     address: ServerOption = _LOCAL,
+    accept_changes: AcceptOption = False,
     notify: NotifyOption = None,
     log: LogOption = None,
     prices: PricesOption = None,
@@ -124,6 +126,7 @@ def resume(
 
     run = on_head(run, "RUN")
     words = ["resume", run, *wanted(prices, max_cost, deadline).options()]
+    words += ["--accept-changes"] * accept_changes
     words += words_elsewhere(notify or (), log or ())
     words += ["--at-end", at_end] if at_end else []
     _start(address, run, words, as_json=as_json)

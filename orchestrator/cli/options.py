@@ -121,6 +121,13 @@ DeadlineOption = Annotated[
         rich_help_panel=BUDGET,
     ),
 ]
+AcceptOption = Annotated[
+    bool,
+    typer.Option(
+        "--accept-changes",
+        help="Go on with other settings in run.json than those that the run was begun with.",
+    ),
+]
 AtEndOption = Annotated[
     str | None,
     typer.Option(

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from panolog.orchestrator.cli.at_end import when_ended
 from panolog.orchestrator.cli.console import (
     command,
     err,
@@ -21,6 +20,7 @@ from panolog.orchestrator.cli.console import (
     say_results,
 )
 from panolog.orchestrator.cli.options import (
+    AcceptOption,
     AddressOption,
     AnyRunArg,
     AtEndOption,
@@ -72,12 +72,13 @@ def run(
     at_end: AtEndOption = None,
 ) -> None:
     """Reconstruct a scene, a folder of panoramas or a 360° video: one model of the place."""
+    from panolog.orchestrator.commands.at_end import when_ended
     from panolog.orchestrator.preparation.settings import as_arguments
     from panolog.orchestrator.run.config import as_settings
 
     driver, budget = _driver_options(address, nice, dashboard=dashboard), wanted(prices, max_cost, deadline)
     code, state = 0, None
-    with when_ended(at_end) as begun:
+    with when_ended(at_end, _complain) as begun:
         with mirrored(output, local) as root, _followed(root, notify, log):
             begun(root)
             if _supervised(max_resumes, supervise=supervise):
@@ -105,6 +106,7 @@ def resume(
     force: Annotated[
         bool, typer.Option("--force", help="Take a run with a URL from a driver that may still be at work.")
     ] = False,
+    accept_changes: AcceptOption = False,
     prices: PricesOption = None,
     max_cost: MaxCostOption = None,
     deadline: DeadlineOption = None,
@@ -113,25 +115,28 @@ def resume(
     has_mirror: Annotated[bool, typer.Option("--has-mirror", hidden=True)] = False,
 ) -> None:
     """Resume a run from its last checkpoints."""
+    from panolog.orchestrator.commands.at_end import when_ended
     from panolog.orchestrator.run.folder import RunFolder
     from panolog.orchestrator.run.info import read_info
 
     options, budget = _driver_options(address, nice, dashboard=dashboard), wanted(prices, max_cost, deadline)
     code, state = 0, None
-    with when_ended(at_end) as begun:
+    with when_ended(at_end, _complain) as begun:
         with mirrored(run, local, resumes=True, force=force, mirror=not has_mirror) as root:
             begun(root)
             read_info(RunFolder(root))  # fails before torch is imported
             with _followed(root, notify, log):
                 if _supervised(max_resumes, supervise=supervise):
                     first = ["resume", str(root), "--has-mirror"]
-                    code = _supervise(root, first, options, budget.options(), address, max_resumes)
+                    once = budget.options() + ["--accept-changes"] * accept_changes
+                    code = _supervise(root, first, options, once, address, max_resumes)
                 else:
                     with progress_bar("starting"):
                         from panolog.orchestrator.commands import session
 
                     with _display(root, run, dashboard=dashboard) as show:
-                        state = session.resume(root, address, show, None, nice, after, budget)
+                        given = (root, address, show, None, nice, after, budget)
+                        state = session.resume(*given, accept_changes=accept_changes)
         _end(root, code, state)
 
 
@@ -309,12 +314,14 @@ def _supervise(
     """Runs drivers as children of this process. Returns the exit code of the last one."""
     from panolog.orchestrator.commands.supervise import Supervised, supervise
 
-    def show(line: str) -> None:
-        err().show_cursor()  # a driver that was killed in its display has hidden it
-        say(f"panolog: {line}", style="red")
-
     first, options = [*first, *options, *limits], [*options, "--has-mirror"]
-    return supervise(Supervised(root, first, options, limits, address, limit or _RESUMES, show))
+    return supervise(Supervised(root, first, options, limits, address, limit or _RESUMES, _complain))
+
+
+def _complain(line: str) -> None:
+    """Says something about a run that is not at work now."""
+    err().show_cursor()  # a driver that was killed in its display has hidden it
+    say(f"panolog: {line}", style="red")
 
 
 @contextmanager

@@ -119,12 +119,15 @@ def resume(
     nice: int | None = None,
     after: str = "",
     wanted: Wanted | None = None,
+    *,
+    accept_changes: bool = False,
 ) -> RunState:
     """Resumes a run, to the end; does nothing if it is done, or at a limit that stays as it is.
 
-    Args: as `start`; after, why the supervisor resumes it, which becomes a notice.
-    Raises InputError if `root` is no run, its scene has changed or is gone, its device is missing or another
-    driver is at work on it; RunError if the run failed.
+    Args: as `start`; after, why the supervisor resumes it, which becomes a notice; accept_changes, go on with
+    other settings in run.json than those that the run was begun with.
+    Raises InputError if `root` is no run, its scene or its settings have changed, its device is missing or
+    another driver is at work on it; RunError if the run failed.
     """
     folder = RunFolder(root)
     info = run_info.read_info(folder)
@@ -134,13 +137,15 @@ def resume(
         if _is_over(journal.state, budget):
             done = journal.state.outcome == Outcome.DONE
             return _retained(folder, journal, info.config) if done else journal.state
+        changes: Sequence[str] = ()
+        if prepared := journal.state.prepared:
+            changes = run_info.changes(folder, info.config, database.milestones(), accept=accept_changes)
         settings = read_settings(folder) if info.scene.fingerprint == run_info.PENDING else None
         scene = None if settings else scene_of(info, folder)
         remove_partial(root)
-        prepared = journal.state.prepared
         begin = _Beginning(folder, journal, address, pool, nice, scene)
         with end_recorded(journal):
-            begin.take_over(info.config, budget, resumed=True)
+            begin.take_over(info.config, budget, resumed=True, changes=changes)
             if after:
                 journal.record([Noticed(None, f"resumed by the supervisor after: {after}")])
             info = begin.prepare(info, settings)
@@ -206,13 +211,28 @@ class _Beginning:
         self.journal.until_done(lambda: run_info.write_info(self.folder, info))
         return info
 
-    def take_over(self, config: RunConfig, budget: BudgetSet | None, *, resumed: bool = False) -> None:
-        """Makes this the run's driver, which takes requests and from now on waits for a full disk."""
-        presence = Presence(self.folder.presence)
+    def take_over(
+        self,
+        config: RunConfig,
+        budget: BudgetSet | None,
+        *,
+        resumed: bool = False,
+        changes: Sequence[str] = (),
+    ) -> None:
+        """Makes this the run's driver, which takes requests and from now on waits for a full disk.
+
+        Args: changes of settings that were accepted.
+        """
+        presence, state = Presence(self.folder.presence), self.journal.state
         self.journal.patience = Patience(self.folder.root, config.disk.retry, presence)
-        began = RunBegan(socket.gethostname(), os.getpid(), resumed, self.journal.state.latest)
-        lost = lost_with_driver(self.journal.state)
-        self.journal.record([*lost, began, *([budget] if budget else []), *control.begin(self.folder)])
+        settings = config.model_dump(mode="json") if state.prepared else {}
+        code, before = run_info.own_code(), state.driver.code if state.driver else ""
+        began = RunBegan(socket.gethostname(), os.getpid(), resumed, state.latest, code, settings)
+        notices = [f"resumed with other settings: {'; '.join(changes)}"] if changes else []
+        if before and before != code:
+            notices.append(f"resumed with other sources ({before} → {code}): what is trained now may differ")
+        said: list[Record] = [*([budget] if budget else []), *(Noticed(None, line) for line in notices)]
+        self.journal.record([*lost_with_driver(state), began, *said, *control.begin(self.folder)])
 
     @contextmanager
     def workers(self) -> Iterator[Pool]:
@@ -236,7 +256,8 @@ class _Beginning:
         self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
         self.journal.until_done(lambda: run_info.write_info(folder, info))
         seconds = {str(stage.name): stage.seconds for stage in found.estimate.stages}
-        done = PreflightSaved(folder.relative(folder.preflight), seconds)
+        settings = found.config.model_dump(mode="json")
+        done = PreflightSaved(folder.relative(folder.preflight), seconds, settings)
         if budget := self.journal.state.money.budget:
             require_enough(seconds, budget, workers.nodes())
         self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), done])

@@ -384,12 +384,14 @@ def _given(tree: Mapping[str, Any], key: str) -> bool:
 
 def as_settings(config: RunConfig) -> list[str]:
     """What the user has set, as options `--set KEY=VALUE`; the rest is left to the defaults."""
+    given = flat(config.model_dump(mode="json", exclude_unset=True))
+    return [word for key, value in given for word in ("--set", f"{key}={json.dumps(value)}")]
 
-    def flat(tree: dict[str, Any], prefix: str) -> Iterator[str]:
-        for key, value in tree.items():
-            if isinstance(value, dict):
-                yield from flat(value, f"{prefix}{key}.")
-            else:
-                yield from ("--set", f"{prefix}{key}={json.dumps(value)}")
 
-    return list(flat(config.model_dump(mode="json", exclude_unset=True), ""))
+def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The settings of a nested mapping by dotted key."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value

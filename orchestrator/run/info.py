@@ -1,10 +1,11 @@
 """run.json: what a run is of, with which settings, made by what; and which folder may become a run."""
 
+import json
 import os
 import platform
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cache
 from hashlib import sha256
@@ -14,11 +15,12 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from panolog.orchestrator.run.config import RESOLVED, RunConfig
+from panolog.orchestrator.run.config import RESOLVED, RunConfig, flat
 from panolog.orchestrator.run.folder import RunFolder, command_line, read_json, write_json
+from panolog.orchestrator.run.records import PreflightSaved, RunBegan, Stored
 from panolog.orchestrator.run.state import replay
 from panolog.orchestrator.run.store import read_milestones
-from panolog.scene.errors import RunFolderError
+from panolog.scene.errors import ConfigError, RunFolderError
 from panolog.scene.files import SUFFIX
 from panolog.scene.model import NO_OFFSET, Vector
 
@@ -150,6 +152,31 @@ def read_info(folder: RunFolder) -> RunInfo:
         raise RunFolderError(
             f"{folder.info}: is not of this PanoLOG's format: {key}: {first['msg']}"
         ) from error
+
+
+def changes(folder: RunFolder, config: RunConfig, records: Iterable[Stored], *, accept: bool) -> list[str]:
+    """What of the settings is not as drivers have recorded it, such as "iterations = 300, not 200".
+
+    Raises ConfigError if there is something and it is not accepted.
+    """
+    kept = [item.record for item in records if isinstance(item.record, RunBegan | PreflightSaved)]
+    recorded = next((record.settings for record in reversed(kept) if record.settings), None)
+    if recorded is None:  # by a version that recorded none
+        return []
+    with suppress(ValidationError):  # by today's names
+        recorded = RunConfig.model_validate(recorded, context=RESOLVED).model_dump(mode="json")
+    before, now = dict(flat(recorded)), dict(flat(config.model_dump(mode="json")))
+    found = [
+        f"{key} = {json.dumps(now.get(key))}, not {json.dumps(before.get(key))}"
+        for key in before | now
+        if before.get(key) != now.get(key)
+    ]
+    if found and not accept:
+        raise ConfigError(
+            f"{folder.info}: {'; '.join(found)}: not as the run was begun, so that parts of it would differ;"
+            " undo that, or resume with --accept-changes"
+        )
+    return found
 
 
 @cache

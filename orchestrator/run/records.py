@@ -1,7 +1,6 @@
 """What a run has done so far, as typed records: one row of the database each, without tensors.
 
-`workers.events` is what workers yield; a record is what the driver has made of it, once the files that it
-names are in place. Nothing here imports torch or Ray, so that commands that read a run start at once.
+`workers.events` is what workers yield; a record is what the driver has made of it, once its files are there.
 """
 
 from dataclasses import dataclass, field
@@ -54,6 +53,8 @@ class RunBegan:
     pid: int
     resumed: bool
     previous: float | None = None  # seconds since the epoch: the last record of the driver before
+    code: str = ""  # `info.own_code` of its version
+    settings: dict[str, object] = field(default_factory=dict)  # of run.json, if that was resolved by then
     task: None = None
 
 
@@ -71,6 +72,7 @@ class PreflightSaved:
 
     path: str  # relative to the run folder, as all paths here
     seconds: dict[str, float | None]  # expected of each stage; None = not known
+    settings: dict[str, object] = field(default_factory=dict)  # those of run.json from now on
     task: TaskId = CALIBRATE
 
 

@@ -69,7 +69,7 @@ def test_run_and_resume_take_the_words_of_a_queue(
     monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
     for name in ("start", "resume"):
         monkeypatch.setattr(
-            f"panolog.orchestrator.commands.session.{name}", lambda *given_: given.append(given_)
+            f"panolog.orchestrator.commands.session.{name}", lambda *given_, **_: given.append(given_)
         )
     add(here, "run", "--set", "sky.count=9", "--iterations", "70", "--nice", "5", "--address", "auto")
     with opened(here / "queue", make=False) as queue:

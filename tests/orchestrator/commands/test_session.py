@@ -1,10 +1,11 @@
 """A run exists from its first second, and one that is refused leaves nothing."""
 
 import errno
+import json
 import os
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from itertools import chain, repeat
 from pathlib import Path
@@ -17,7 +18,7 @@ from panolog.orchestrator.commands import preparing, session
 from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run.config import RunConfig, load_config
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import read_info
+from panolog.orchestrator.run.info import own_code, read_info
 from panolog.orchestrator.run.records import Noticed, Preparing, RunContinued, RunEnded, RunWaiting
 from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import read_records
@@ -243,3 +244,79 @@ def fails_in_training(spec: TaskSpec) -> Iterator[Event | Calibration]:
     if not isinstance(spec, CalibrateSpec):
         raise CrashError(DIED)
     yield from says(spec)
+
+
+@pytest.fixture
+def failed(scene: Path, tmp_path: Path) -> Path:
+    """A run that has failed in Stage I."""
+    root = tmp_path / "failed run"
+    with pytest.raises(RunError):
+        session.start(scene, root, CONFIG, None, ignore, FakePool(fails_in_training, [MACHINE]))
+    return root
+
+
+def edit(root: Path, **settings: Any) -> None:
+    """What a text editor does with run.json; also removes settings, which are None then."""
+    content = json.loads(RunFolder(root).info.read_bytes())
+    content["config"] = {
+        key: value for key, value in (content["config"] | settings).items() if value is not None
+    }
+    RunFolder(root).info.write_text(json.dumps(content))
+
+
+def notices(root: Path) -> list[str]:
+    return [notice["message"] for notice in status(root)["notices"]]
+
+
+def test_edited_settings_are_refused_with_all_of_them_until_they_are_accepted(failed: Path) -> None:
+    edit(failed, iterations=4, preview={"every": 7})
+    result = call("resume", failed)
+    assert (result.exit_code, result.stdout) == (2, "")
+    changes = "preview.every = 7, not 500; iterations = 4, not 2"
+    assert f"run.json: {changes}: not as the run was begun" in " ".join(result.stderr.split())
+    assert status(failed)["status"] == "failed"  # as before: nothing has taken it over
+    session.resume(failed, None, ignore, calibrating(), accept_changes=True)
+    assert status(failed)["status"] == "done"
+    assert f"resumed with other settings: {changes}" in notices(failed)
+
+
+def test_what_was_accepted_is_what_the_next_driver_compares_with(failed: Path) -> None:
+    edit(failed, iterations=4)
+    failing = FakePool(fails_in_training, [MACHINE])
+    with pytest.raises(RunError):
+        session.resume(failed, None, ignore, failing, accept_changes=True)
+    edit(failed, iterations=2)
+    with pytest.raises(InputError, match=r"run\.json: iterations = 2, not 4: not as the run was begun"):
+        resume(failed)
+    edit(failed, iterations=4)
+    resume(failed)
+
+
+def test_a_setting_that_is_gone_from_run_json_is_a_change_if_that_changes_it(failed: Path) -> None:
+    """What it leaves to the default."""
+    edit(failed, iterations=None)
+    with pytest.raises(InputError, match=r"iterations = 30000, not 2: not as"):
+        resume(failed)
+    edit(failed, iterations=2, seed=None)  # which is the default
+    resume(failed)
+
+
+def test_a_run_of_a_version_that_recorded_no_settings_resumes(
+    failed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(sqlite3.connect(RunFolder(failed).database)) as connection, connection:
+        for kind in ("RunBegan", "PreflightSaved"):
+            connection.execute(
+                "UPDATE events SET payload = json_remove(payload, '$.settings', '$.code') WHERE type = ?",
+                (kind,),
+            )
+    edit(failed, iterations=4)
+    resume(failed)
+
+
+def test_other_sources_are_a_notice(failed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = own_code()
+    monkeypatch.setattr("panolog.orchestrator.run.info.own_code", lambda: "0123456789ab")
+    resume(failed)
+    line = f"resumed with other sources ({own} → 0123456789ab): what is trained now may differ"
+    assert notices(failed).count(line) == 1

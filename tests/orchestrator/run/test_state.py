@@ -19,6 +19,7 @@ from panolog.orchestrator.run.records import (
     PreflightSaved,
     Progressed,
     Record,
+    RunBegan,
     RunEnded,
     Stored,
     TaskFailed,
@@ -40,6 +41,8 @@ NAMES: dict[
     BudgetReached: {"measures": FEW},
     NodeQuarantined: {"tasks": st.just(("block/000",))},
     BudgetSet: {"prices": st.just({"currency": "USD"})},
+    RunBegan: {"settings": st.just({"iterations": 2, "partition": {"cuts": [["x", 0.5, 2]]}})},
+    PreflightSaved: {"settings": st.just({"width": None})},
 }
 
 

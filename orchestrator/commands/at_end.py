@@ -10,58 +10,56 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from subprocess import DEVNULL, Popen, TimeoutExpired
 
-import typer
-
-from panolog.orchestrator.cli.console import say
+from panolog.orchestrator.run import control
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import Outcome
+from panolog.orchestrator.run.state import RunState, replay
+from panolog.orchestrator.run.store import read_milestones
+from panolog.orchestrator.storage.state import read_state
 from panolog.scene.errors import InputError, RunFolderError, in_one_line
 
 _LONGEST_S = 600.0  # for the command; then it goes on by itself
 _REFUSED, _INTERRUPTED = 2, 130  # exit codes of panolog
+Say = Callable[[str], None]
 
 
 @contextmanager
-def when_ended(wanted: str | None) -> Iterator[Callable[[Path], None]]:
+def when_ended(wanted: str | None, say: Say) -> Iterator[Callable[[Path], None]]:
     """Carries out a command of the shell when the context has ended a run for good, however.
 
     Not if the user has stopped it, another driver is at work on the run, or its store lacks some of it.
 
-    Args: wanted, the command; None for none. Yields what to call with the folder of the run once it is this
-    process's.
+    Args: wanted, the command; None for none; say, called with lines. Yields what to call with the folder of
+    the run once it is this process's.
     """
     roots: list[Path] = []
     code, why = 0, ""
     try:
         yield roots.append
+    except KeyboardInterrupt:
+        code = _INTERRUPTED
+        raise
     except BaseException as error:
-        code = _REFUSED if isinstance(error, InputError) else 1
-        if isinstance(error, typer.Exit):
-            code = error.exit_code
-        elif isinstance(error, KeyboardInterrupt):
-            code = _INTERRUPTED
-        else:
-            why = in_one_line(error)
+        code = getattr(error, "exit_code", _REFUSED if isinstance(error, InputError) else 1)
+        why = "" if hasattr(error, "exit_code") else in_one_line(error)
         raise
     finally:
         if wanted and roots and code != _INTERRUPTED:
-            _end(wanted, roots[-1], code, why)
+            _end(wanted, RunFolder(roots[-1]), code, why, say)
 
 
-def _end(wanted: str, root: Path, code: int, why: str) -> None:
+def _end(wanted: str, folder: RunFolder, code: int, why: str, say: Say) -> None:
     """Carries the command out, unless something would be lost by it."""
-    from panolog.orchestrator.run import control
-    from panolog.orchestrator.run.folder import RunFolder
-    from panolog.orchestrator.storage.state import read_state
-
-    folder = RunFolder(root)
     if control.at_work(folder):
-        _complain("is not carried out: another driver is at work on the run")
+        say("--at-end is not carried out: another driver is at work on the run")
         return
     mirror = read_state(folder.mirror)
     if mirror is not None and not mirror.complete:
-        _complain(f"is not carried out, for nothing to be lost: {mirror.line}")
+        say(f"--at-end is not carried out, for nothing to be lost: {mirror.line}")
         return
     outcome, reason = _outcome(folder.database, code)
-    said = {"PANOLOG_OUTCOME": outcome, "PANOLOG_REASON": why or reason, "PANOLOG_RUN": str(root.absolute())}
+    run = str(folder.root.absolute())
+    said = {"PANOLOG_OUTCOME": outcome, "PANOLOG_REASON": why or reason, "PANOLOG_RUN": run}
     say(f"carrying out --at-end: {wanted}")
     try:
         process = Popen(
@@ -72,20 +70,16 @@ def _end(wanted: str, root: Path, code: int, why: str) -> None:
         )
         failed = process.wait(_LONGEST_S)
     except OSError as error:
-        _complain(f"cannot be carried out: {error.strerror}")
+        say(f"--at-end cannot be carried out: {error.strerror}")
     except TimeoutExpired:
-        _complain(f"has not ended after {_LONGEST_S:.0f} s; it goes on by itself")
+        say(f"--at-end has not ended after {_LONGEST_S:.0f} s; it goes on by itself")
     else:
         if failed:
-            _complain(f"has failed (code {failed}): what it was to end may still be there, and paid")
+            say(f"--at-end has failed (code {failed}): what it was to end may still be there, and paid")
 
 
 def _outcome(database: Path, code: int) -> tuple[str, str]:
     """How the run has ended, and why: done, limited, failed or refused. Args: code, panolog's exit code."""
-    from panolog.orchestrator.run.records import Outcome
-    from panolog.orchestrator.run.state import RunState, replay
-    from panolog.orchestrator.run.store import read_milestones
-
     state = RunState()
     with suppress(OSError, RunFolderError):
         state = replay(read_milestones(database))
@@ -94,7 +88,3 @@ def _outcome(database: Path, code: int) -> tuple[str, str]:
         return str(state.outcome or Outcome.DONE), reached.reason if reached else state.reason
     refused = code == _REFUSED and state.outcome != Outcome.FAILED
     return "refused" if refused else str(Outcome.FAILED), state.reason or f"exit code {code}"
-
-
-def _complain(what: str) -> None:
-    say(f"panolog: --at-end {what}", style="red")
