@@ -1,14 +1,19 @@
 """Requests to the driver of a live run (stop, pause, unpause, retry, release), and `clean`."""
 
+import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
 from panolog.orchestrator.cli.options import BlockArg, JsonOption, RunArg
-from panolog.scene.errors import RunFolderError
+from panolog.scene.errors import ConfigError, RunFolderError
+from panolog.scene.stores.url import is_url, parse_url
+
+if TYPE_CHECKING:
+    from panolog.orchestrator.retention.clean import Cleaned
 
 _POLL = 0.5  # seconds between two looks at a driver that stops
 
@@ -74,7 +79,10 @@ def _request(run: Path, action: str, block: int | None = None, node: str | None 
 
 def clean(
     folders: Annotated[
-        list[Path], typer.Argument(metavar="RUN|FOLDER", help="Runs, or folders with runs below them.")
+        list[str],
+        typer.Argument(
+            metavar="RUN|FOLDER|URL", help="Runs, folders with runs below them, or runs in stores."
+        ),
     ],
     keep_checkpoints: Annotated[
         int | None,
@@ -96,24 +104,68 @@ def clean(
         str | None,
         typer.Option(metavar="30d", help="Only runs whose last record is older, such as 12h, 30d or 8w."),
     ] = None,
+    keep_manifests: Annotated[
+        int,
+        typer.Option(
+            metavar="K", min=1, help="URL: the last K states of the run that stay whole, some seconds apart."
+        ),
+    ] = 10,
+    yes: Annotated[bool, typer.Option("--yes", help="URL: confirm that what is listed is removed.")] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be removed, with its bytes; remove nothing.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Remove what is superseded: leftovers, checkpoints of tasks that are done, joined shards."""
-    from panolog.orchestrator.dashboard.discovery import discover
+    """Remove what is superseded: leftovers, checkpoints of tasks that are done, joined shards.
+
+    Of a run in a store: versions of files that its last states do not have. What that is is listed first.
+    """
     from panolog.orchestrator.retention.clean import age, clean
     from panolog.orchestrator.retention.survey import Wanted
 
     wanted = Wanted(keep_checkpoints, blocks, None if older_than is None else age(older_than))
+    if any(map(is_url, folders)):
+        if keep_checkpoints is not None or blocks or not all(map(is_url, folders)):
+            raise ConfigError("clean URL: takes no folders, --blocks and --keep-checkpoints; leave them out")
+        _clean_stores(folders, keep_manifests, wanted.older, yes=yes, dry=dry_run, as_json=as_json)
+    else:
+        _say_cleaned(clean(_runs_in(folders), wanted, dry=dry_run), as_json=as_json)
+
+
+def _runs_in(folders: list[str]) -> list[Path]:
+    """The runs that these are, or have below them. Raises RunFolderError if one has none."""
+    from panolog.orchestrator.dashboard.discovery import discover
+
     roots: dict[Path, None] = {}
-    for folder in folders:
+    for folder in map(Path, folders):
         found = discover(folder.resolve())
         if not found:
             raise RunFolderError(f"{folder}: is no run, and there is none below it")
         roots |= dict.fromkeys(folder / entry.path for entry in found.values())
-    cleaned = clean(list(roots), wanted, dry=dry_run)
+    return list(roots)
+
+
+def _clean_stores(
+    urls: list[str], keep: int, older: float | None, *, yes: bool, dry: bool, as_json: bool
+) -> None:
+    """Lists what may be removed of runs in stores, and removes it if that is confirmed."""
+    from panolog.orchestrator.retention.stores import clean_stores, survey_stores
+
+    with progress_bar("reading the stores"):
+        found = survey_stores([parse_url(url) for url in urls], keep, older)
+    if not (dry or yes) and any(run.removals for run in found.runs):
+        for line in found.lines():
+            say(line)
+        if not sys.stdin.isatty():
+            raise ConfigError("clean URL: nothing is removed without --yes where it cannot be confirmed")
+        yes = typer.confirm("remove it?", err=True)
+    if yes and not dry:
+        with progress_bar("removing"):
+            found = clean_stores(found, keep)
+    _say_cleaned(found, as_json=as_json)
+
+
+def _say_cleaned(cleaned: "Cleaned", *, as_json: bool) -> None:
     print_result(cleaned.as_json(), cleaned.lines(), as_json=as_json)
     if cleaned.failed:
         raise typer.Exit(2)

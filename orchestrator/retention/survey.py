@@ -11,7 +11,7 @@ import shutil
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder, read_json
@@ -19,6 +19,7 @@ from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.run.state import RunState, Status, TaskState, replay
 from panolog.orchestrator.run.store import read_milestones
 from panolog.scene.files import SUFFIX
+from panolog.scene.stores.url import StoreUrl
 from panolog.workers.tasks import Stage, StrEnum, TaskId
 
 _WRITING_S = 3_600.0  # without a write after which a writer, such as an export into the folder, is dead
@@ -31,6 +32,7 @@ class Kind(StrEnum):
     LEFTOVERS = "leftovers"  # of writers that were killed
     CHECKPOINTS = "checkpoints"  # of tasks that are done, or earlier ones
     SHARDS = "shards"  # of scores and of the evaluation, once they are joined
+    VERSIONS = "versions"  # of files in a store, which none of its last manifests names
     MODELS = "models"  # of blocks, districts, rounds, repairs and unions, once they are merged
 
 
@@ -48,7 +50,7 @@ class Removal:
     """A file or a folder that may be removed."""
 
     kind: Kind
-    path: Path
+    path: Path | PurePosixPath  # the latter in a store, below the URL
     size: int  # bytes
     task: TaskId | None = None  # whose model it is
 
@@ -57,7 +59,7 @@ class Removal:
 class Survey:
     """What may be removed of one run."""
 
-    root: Path
+    root: Path | StoreUrl
     removals: tuple[Removal, ...] = ()
     skipped: str = ""  # why the run is left as it is
     failed: bool = False  # because of an error
@@ -169,6 +171,7 @@ def _file(folder: RunFolder, kind: Kind, path: Path, task: TaskId | None = None)
 
 def remove(removal: Removal) -> None:
     """Removes it, if it is still there. Raises OSError if that is impossible."""
+    assert isinstance(removal.path, Path)  # `stores` removes what is in a store
     if removal.path.is_dir() and not removal.path.is_symlink():
         shutil.rmtree(removal.path)
     else:

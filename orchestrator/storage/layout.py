@@ -4,15 +4,18 @@
     URL/.panolog/manifests/…              which object is which file, with sizes and digests; compressed JSON
     URL/.panolog/pointers/NUMBER.json     names a manifest; put last, by the driver whose lease has its number
     URL/.panolog/leases/NUMBER.json       who writes the run, and until when
-    URL/NAME                              results of a run that is done, under their own names
+    URL/NAME                              copies of the results of a run that is done, under their own names
 
-Only the pointer is ever replaced, and that of the highest number counts: what it leads to is whole at any
-moment, and a driver that has been replaced without knowing it replaces nothing.
+Drivers only add to it: nothing is removed but by `panolog clean URL`, and by the driver of a run that is
+refused before it has made anything. Only the pointer, the lease and the copies of results are replaced. The
+pointer of the highest number counts: what it leads to is whole at any moment, and a driver that has been
+replaced without knowing it replaces nothing.
 """
 
 import json
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
@@ -52,6 +55,14 @@ class Manifest:
 
     name: str  # of the manifest's own object
     files: Mapping[str, Entry]  # by their names in the run folder
+
+    @property
+    def time(self) -> float:
+        """When it was made, in seconds since the epoch; 0 if its name does not say."""
+        moment = PurePosixPath(self.name).name.partition("-")[0]
+        with suppress(ValueError):
+            return int(moment, 16) / 1e9
+        return 0.0
 
     def pack(self) -> bytes:
         """The content of its object."""
@@ -119,6 +130,14 @@ def current(store: Store) -> Manifest | None:
     raise StoreError(
         f"{store.url}/{POINTERS}: names a manifest that is missing or damaged; resume an older copy"
     )
+
+
+def read_manifest(store: Store, name: str) -> Manifest:
+    """A manifest, the current one or one before. Raises as `Store`; StoreError if it is gone or damaged."""
+    packed = store.read(name)
+    if packed is None:
+        raise StoreError(f"{store.url}/{name}: is gone")
+    return _unpacked(store, name, packed)
 
 
 def digest_of(path: Path) -> str:

@@ -121,8 +121,6 @@ def take(store: Store, root: Path, *, force: bool, again: bool = False) -> Lease
         name = numbered(LEASES, number)
         # A request that was repeated may have been served the first time.
         if store.write(name, owner.content(), new=True) or _read(store, name).get("owner") == owner.token:
-            if found:
-                store.remove(found)
             return Lease(store, number, owner)
 
 

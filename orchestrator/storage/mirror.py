@@ -3,7 +3,7 @@
 A round first stores the files that have changed, then takes a snapshot of run.db, stores the files that have
 changed meanwhile, and the snapshot; then the manifest, and at last the pointer. The driver writes a file
 before the record that names it, so whatever the snapshot names is in the store before the snapshot counts.
-What the round has replaced is removed one round later.
+Nothing that a round replaces is removed: `panolog clean URL` does that.
 """
 
 import os
@@ -35,7 +35,6 @@ from panolog.orchestrator.storage.layout import (
     is_result,
     is_work,
     mirrored,
-    number_of,
     numbered,
     put_pointer,
 )
@@ -46,6 +45,7 @@ from panolog.scene.stores.store import Store
 
 _THREADS = 4  # files stored at a time
 _SHARE = 10  # a pause is at least so many times as long as writing run.db and the manifest took
+_RATE = 500_000.0  # bytes a second that copies of run.db may take in the store on average, as they all stay
 _LONGEST_S = 120.0  # between two tries while a store fails
 _PASSING = (StoreError, StoreLostError, RunFolderError, sqlite3.OperationalError, OSError)
 Stamp = tuple[int, int, int]  # size, time of change in ns, inode
@@ -58,11 +58,9 @@ class Mirror:
         self._folder, self._store, self._lease = folder, store, lease
         self._files: dict[str, Entry] = dict(known.files) if known else {}  # that the pointer names
         self._stored: dict[str, tuple[Stamp, Entry]] = {}  # what is in the store of the files as they are now
-        self._replaced: list[str] = []  # keys that only the manifest before the current one names
         self._state = MirrorState(str(store.url), published=known.name if known else "")
         self._lock = threading.Lock()  # of `_state`
-        self._cost = 0.0  # seconds that the last snapshot and manifest took
-        self._swept = False
+        self._pause = 0.0  # seconds before the next round, at least
         self._begun = known is not None  # whether the store has anything of the run that took time
         self._own: list[str] = []  # keys that this mirror has made until then, in order
         for left in folder.mirror.parent.glob("*.part"):  # of a mirror that was killed
@@ -85,7 +83,7 @@ class Mirror:
             over = ended.is_set() and not lock.held(self._folder.lock)
             before = self._state.pending_files, self._state.published, len(self._stored)
             if self._try(last=over):
-                pause = max(period, _SHARE * self._cost)
+                pause = max(period, self._pause)
                 if over:
                     return
             elif self._lease.lost or stop.is_set():
@@ -139,12 +137,10 @@ class Mirror:
         }
         files |= lost
         self._begun |= state.prepared or any(map(is_work, files))
-        if last and state.outcome in (Outcome.DONE, Outcome.LIMITED):
-            if any(known.key == name for name, known in self._files.items()):  # of an end before
-                self._publish(files | {DATABASE: entry}, moment)  # what is in force must not change
-            files = self._publish_results(files)
         self._publish(files | {DATABASE: entry}, moment)
-        self._cost = time.monotonic() - began
+        self._pause = max(_SHARE * (time.monotonic() - began), entry.size / _RATE)
+        if last and state.outcome in (Outcome.DONE, Outcome.LIMITED):
+            self._copy_results(files)
         gone = f"no longer in {self._folder.root}, but kept in the store: {', '.join(sorted(lost))}"
         self._say(problem=gone if lost else "", pending_files=0, pending_bytes=0, since=moment, complete=last)
 
@@ -184,7 +180,7 @@ class Mirror:
         if failed is not None:
             raise failed
         for gone in self._stored.keys() - present.keys():
-            self._forget(gone)
+            del self._stored[gone]
         return {name: self._stored[name][1] for name in present if name in self._stored}
 
     def _send_one(self, name: str, stamp: Stamp) -> None:
@@ -194,10 +190,7 @@ class Mirror:
             if not self._hold(self._folder.root / name, held):
                 return  # it is gone: the next look does not find it either
             known = self._stored[name][1] if name in self._stored else self._files.get(name)
-            entry = self._put(held, name, known)
-            if entry != known:
-                self._forget(name)
-            self._stored[name] = (stamp, entry)
+            self._stored[name] = (stamp, self._put(held, name, known))
         finally:
             held.unlink(missing_ok=True)
 
@@ -227,12 +220,6 @@ class Mirror:
         self._store.put(path, key)
         return entry
 
-    def _forget(self, name: str) -> None:
-        """Removes an object that no manifest has named yet."""
-        _, entry = self._stored.pop(name, (None, None))
-        if entry is not None and entry not in self._files.values():
-            self._store.remove(entry.key)
-
     def _snapshot(self) -> Path:
         """A copy of run.db as it is after some commit."""
         copy = self._folder.mirror.with_name(f"{secrets.token_hex(4)}.db.part")
@@ -253,41 +240,14 @@ class Mirror:
         self._store.write(manifest.name, packed)
         self._say(announced=manifest.name)
         put_pointer(self._store, self._lease.number, manifest, packed)
-        kept = {entry.key for entry in files.values()}
-        for key in self._replaced:
-            if key not in kept:  # a result by its name
-                self._store.remove(key)
-        self._replaced = [it.key for it in self._files.values() if it.key not in kept]
-        self._replaced += [self._state.published] if self._state.published else []
         self._files = files
         self._say(published=manifest.name, since=moment)
-        if not self._swept:
-            self._sweep(manifest)
 
-    def _sweep(self, manifest: Manifest) -> None:
-        """Removes what earlier drivers have left: pointers, and objects that were never named."""
-        kept = {manifest.name, *(entry.key for entry in manifest.files.values()), *self._replaced}
-        for folder in (OBJECTS, MANIFESTS):
-            for name in self._store.list(folder).keys() - kept:
-                self._store.remove(name)
-        for name in self._store.list(POINTERS):
-            if number_of(name) < self._lease.number:
-                self._store.remove(name)
-        self._swept = True
-
-    def _publish_results(self, files: dict[str, Entry]) -> dict[str, Entry]:
-        """Gives the results of a run that has a model their own names in the store."""
-        named = dict(files)
+    def _copy_results(self, files: dict[str, Entry]) -> None:
+        """Copies the results of a run that has a model to their own names in the store, for people."""
         for name, entry in files.items():
-            if is_result(name) and entry.key != name:
+            if is_result(name) and entry.key != name:  # as an earlier version has stored it
                 self._store.copy(entry.key, name)
-                named[name] = replace(entry, key=name)
-        for name, entry in named.items():
-            self._stored[name] = (self._stored[name][0], entry)
-        # What has been copied only from objects that no manifest names yet goes with the next round.
-        unnamed = {it.key for it in files.values()} - {it.key for it in self._files.values()}
-        self._replaced += sorted(unnamed - {it.key for it in named.values()})
-        return named
 
     def _withdraw(self) -> None:
         """Removes what this mirror has stored of a run that was refused before anything was made."""
