@@ -9,6 +9,7 @@ import sqlite3
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from socket import gethostname
 
 from panolog.orchestrator.driver.attempts import Attempt, WorkerSpec
 from panolog.orchestrator.driver.deadlines import Deadlines
@@ -28,6 +29,7 @@ from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
 from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run.folder import command_line
+from panolog.orchestrator.run.machines.nodes import leaves_for_sure
 from panolog.orchestrator.run.money.records import BudgetReached
 from panolog.orchestrator.run.presence import Presence
 from panolog.orchestrator.run.records import (
@@ -69,21 +71,13 @@ _LOOK_S = 10.0  # the same while machines are on their way
 _ENDS = (Trained, Scored, Ended, Failed)  # after these messages another task may start
 
 
-def _nothing(_: Job) -> list[Record]:
-    return [Delivered("", 0, 0.0)]
-
-
-def _unchanged(spec: WorkerSpec) -> TaskSpec:
-    return spec
-
-
 @dataclass(frozen=True)
 class Hooks:
     """What a driver calls as a run proceeds."""
 
     on_plan: OnPlan = ignore  # (N, 3) means of Stage I; before plan.json
-    deliver: Deliver = _nothing  # makes the files for viewers
-    on_start: Callable[[WorkerSpec], TaskSpec] = _unchanged  # returns the spec to start; for tests
+    deliver: Deliver = lambda _: [Delivered("", 0, 0.0)]  # makes the files for viewers
+    on_start: Callable[[WorkerSpec], TaskSpec] = lambda spec: spec  # returns the spec to start; for tests
 
 
 _LOG = logging.getLogger(__name__)
@@ -198,8 +192,9 @@ class Driver:
     def _take_requests(self) -> None:
         """Carries out what users have requested through the run folder."""
         self._news = self._requests.carry_out() or self._news
+        ends = self._own_machine_leaves
         for task, attempt in list(self._attempts.items()):
-            leaves = bool(self._machines.leaves(attempt.placement.node))
+            leaves = ends or bool(self._machines.leaves(attempt.placement.node))
             if leaves and not attempt.ready:  # it has not begun: nothing is lost
                 self._pool.cancel(task)
                 self._forget(task)
@@ -207,6 +202,10 @@ class Driver:
             held = self._state.task(task).held or (leaves and task.stage.trains)
             if held and attempt.ready and not attempt.stopping:
                 self._stop_task(task)
+
+    @property
+    def _own_machine_leaves(self) -> bool:  # and with it the run, wherever its tasks are
+        return leaves_for_sure(self._state.leaving(), gethostname())
 
     def _stop_task(self, task: TaskId) -> None:
         """Requests a last checkpoint and the end of a task."""
@@ -227,6 +226,8 @@ class Driver:
             if not self._attempts and (why := quarantine.hopeless(self._state, ready, nodes)):
                 return Outcome.FAILED, why
             self._start_ready(ready)
+            if not self._attempts and (why := self._purse.gives_up(job.config.scaling.patience)):
+                return Outcome.LIMITED, why
         return None
 
     def _start_ready(self, ready: Sequence[TaskId]) -> None:
@@ -244,7 +245,7 @@ class Driver:
         """Starts those of the tasks for which there is room, as far as messages need not wait for long."""
         demands = Demands(self._sizes, self._state)
         running = demands.running({t: it.placement for t, it in self._attempts.items()}, self._clock.time())
-        nodes = quarantine.usable(self._state, self._nodes)
+        nodes = quarantine.usable(self._state, () if self._own_machine_leaves else self._nodes)
         waiting = demands.of(tasks)
         turn = self._clock.monotonic() + _STARTS_S
         for task, where in self._machines.place(waiting, lambda: demands.work(tasks), running, nodes):

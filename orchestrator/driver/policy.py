@@ -31,7 +31,8 @@ def ready(
     blocks longest first, their union and what trains once more in it, the merge, the evaluation, perhaps in
     shards and then as one, and the delivery: each waits for all before it. A block that has failed for good
     holds no stage up, one that is paused does. Without `refine` the merge follows Stage I. Where a limit has
-    ended the training, the merge follows at once, if there is anything to merge.
+    ended the training, the merge follows at once, if there is anything to merge, and the evaluation comes
+    last: it alone needs a machine, and there may be none.
     """
     stages: list[tuple[TaskId, ...]] = []
     if state.money.reached is not None:
@@ -39,7 +40,8 @@ def ready(
             return ()
     else:
         stages = list(_training(state, shards=shards, refine=refine, districts=districts))
-    stages += [(MERGE,), state.measures, (EVAL,), *([(DELIVER,)] if deliver else [])]
+    delivery, measured = [(DELIVER,)] if deliver else [], [state.measures, (EVAL,)]
+    stages += [(MERGE,), *delivery, *measured] if state.money.reached else [(MERGE,), *measured, *delivery]
     for tasks in stages:
         waiting = tuple(task for task in tasks if state.status(task) == Status.WAITING)
         unfinished = any(not _over(state, task) for task in tasks)

@@ -25,11 +25,11 @@ from panolog.orchestrator.run.money.records import (
     NodeReturned,
     OfMoney,
 )
-from panolog.orchestrator.run.records import Record, TaskFailed
+from panolog.orchestrator.run.records import Noticed, Record, TaskFailed
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.units import duration
 from panolog.scene.errors import ConfigError, RunError
-from panolog.workers.tasks import MERGE, Stage
+from panolog.workers.tasks import EVAL, MERGE, Stage
 
 _AFTER = (Stage.MERGE, Stage.MEASURE, Stage.EVAL, Stage.DELIVER)  # the stages after the training
 _UNSURE = 1.2  # times what is estimated of these: estimates of them were up to a fifth too low
@@ -130,6 +130,7 @@ class Purse:
         self._journal = journal
         self._clock = clock
         self._seen: tuple[Node, ...] = ()
+        self._stranded: float | None = None  # Clock.monotonic(): no machine since then, after a limit
         budget = journal.state.money.budget
         self._prices = prices.of_record(budget.prices) if budget else None
 
@@ -151,6 +152,22 @@ class Purse:
             self._journal.record([found])
             return None
         return found
+
+    def gives_up(self, patience: float) -> str:
+        """The limit, if after it there has been no machine for so many seconds; else "".
+
+        Called while nothing runs. Args: patience, for which the evaluation waits for a machine.
+        """
+        state, now = self._journal.state, self._clock.monotonic()
+        if state.money.reached is None or not state.waiting:
+            self._stranded = None
+            return ""
+        self._stranded = now if self._stranded is None else self._stranded
+        if now - self._stranded < patience:
+            return ""
+        line = f"not evaluated: no machine for {duration(patience)} after the limit; `panolog eval` does that"
+        self._journal.record([Noticed(EVAL, line)])
+        return state.money.reached.reason
 
     def require(self, idle: float | None = None) -> None:
         """Raises RunError at a limit while the disk takes nothing: the run ends. Args: as `verdict`."""

@@ -81,6 +81,12 @@ def by_host(nodes: Iterable[NodeState]) -> tuple[NodeState, ...]:
     return tuple(sorted(nodes, key=lambda node: (node.host, node.id)))
 
 
+def leaves_for_sure(nodes: Iterable[NodeState], host: str) -> bool:
+    """Whether a machine is among those that leave, and not only probably."""
+    leaves = (node.leave for node in nodes if node.host == host)
+    return any(leave is not None and leave.kind != Leaving.REBALANCE for leave in leaves)
+
+
 _WHY = {
     Leaving.PREEMPTION: "its provider takes it away",
     Leaving.TERMINATION: "its owner has it deleted",

@@ -25,17 +25,27 @@ from panolog.orchestrator.run.money.records import (
     WorkLost,
 )
 from panolog.orchestrator.run.records import Outcome, PreflightSaved, Record, RunBegan, Stored
-from panolog.orchestrator.run.state import Status, replay
+from panolog.orchestrator.run.state import RunState, Status, replay
 from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import ConfigError, RunError
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
 from panolog.workers.events import Checkpoint, Event, Preview, Progress
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, EVAL, MERGE, TaskId
+from panolog.workers.tasks import COARSE, DELIVER, EVAL, MERGE, TaskId
 from panolog.workers.training.optimizer import ModelState
 from panolog.workers.training.trainer import TrainSpec
-from tests.orchestrator.fakes import DIED, MACHINE, CrashError, Harness, SetClock, begins, trained, well
+from tests.orchestrator.fakes import (
+    DIED,
+    MACHINE,
+    CrashError,
+    FakePool,
+    Harness,
+    SetClock,
+    begins,
+    trained,
+    well,
+)
 
 PRICES = {"currency": "USD", "machine": [{"name": "any", "price": 3600.0, "host": "*"}]}  # 1 USD per second
 AFTER = {"merge": 1.0, "eval": 5.0, "deliver": 4.0}  # seconds: 12 with what is unsure of them
@@ -281,3 +291,33 @@ def test_where_idle_machines_go_less_is_reserved_in_cost_and_more_in_time() -> N
     assert isinstance(found(100, None, deadline=at + 100 + needed - 1), BudgetReached)
     assert not isinstance(found(100, None, deadline=at + 100 + needed + 1), BudgetReached)
     assert isinstance(found(100, 60, deadline=at + 100 + needed + STARTUP_S - 1), BudgetReached)
+
+
+@pytest.mark.parametrize("comes_back", [False, True])
+def test_after_a_limit_the_evaluation_waits_for_a_machine_for_so_long_and_not_for_ever(
+    tmp_path: Path, comes_back: bool
+) -> None:
+    """The head of a cluster whose machines had gone stayed paid, whatever the limit."""
+    harness = Limited(tmp_path, BudgetSet(max_cost=100.0, prices=PRICES), deliver=True)
+    pool, began = FakePool(slow(harness, {COARSE: 20, BLOCK: 500}), [MACHINE]), harness.clock.time()
+
+    def watch(state: RunState, _: object) -> None:
+        if state.money.reached is not None and not state.tasks.keys() & {EVAL, MERGE}:
+            pool.lose(MACHINE.id)
+
+    def wait() -> None:
+        harness.passes(20)
+        if comes_back and harness.clock.time() > began + 400:
+            pool.join(MACHINE)
+
+    pool.when_waiting(wait)
+    state = harness.drive(pool=pool, on_change=watch)
+    assert state.outcome == Outcome.LIMITED and state.merged is not None
+    assert state.status(DELIVER) == Status.DONE  # which needs no machine
+    said = [notice.message for notice in state.notices if notice.task == EVAL]
+    if comes_back:
+        assert state.metrics == {"psnr": 24.0, "lpips": None} and said == []
+    else:
+        assert state.metrics is None
+        assert said == ["not evaluated: no machine for 10:00 after the limit; `panolog eval` does that"]
+        assert 600 <= harness.clock.time() - began <= 800

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Set
 from contextlib import nullcontext
 from pathlib import Path
+from socket import gethostname
 
 import pytest
 import torch
@@ -163,3 +164,45 @@ def test_a_node_whose_notice_is_withdrawn_is_used_again(tmp_path: Path) -> None:
     assert len(run.records(NodeStaying)) == 1
     waits = [notice.message for notice in run.records(Noticed)]
     assert any(message.startswith("every machine leaves") for message in waits)
+
+
+def test_when_the_machine_of_the_driver_leaves_all_tasks_save_and_nothing_begins(tmp_path: Path) -> None:
+    """They end with it, wherever they are: those on other machines trained on, and that was lost."""
+    head = Node("head", gethostname(), 0, 2**40)
+    run, blocks = Harness(tmp_path, (head, A, B), retries=0), {TaskId.block(0), TaskId.block(1)}
+    begun: list[int] = []
+
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        if spec.task not in blocks or len(run.attempts(spec.task)) > 1:
+            yield from well(spec)
+            return
+        yield Progress(spec.task, 1, 9, 1.0)
+        if blocks <= set(run.pool.running):
+            run.pool.leaving["head"] = SOON
+        for iteration in range(2, 99):
+            yield Progress(spec.task, iteration, 99, 1.0)
+            if spec.task in run.pool.stopped:
+                yield Checkpoint(spec.task, iteration, {"iteration": torch.tensor(iteration)})
+                return
+        raise AssertionError("it is not requested to stop")
+
+    def wait() -> None:  # nothing runs: the machine is still there
+        begun.append(len(run.tasks))
+        if len(begun) == 5:
+            run.pool.leaving.clear()
+
+    pool = FakePool(script, run.nodes)
+    pool.when_waiting(wait)
+    assert run.drive(pool=pool).outcome == Outcome.DONE
+    assert {record.task for record in run.records(TaskYielded)} == blocks
+    assert len(begun) >= 5 and len(set(begun[:5])) == 1  # nothing has begun meanwhile
+    assert not run.records(TaskFailed)
+
+
+def test_a_rebalance_of_the_driver_s_machine_may_never_come_and_changes_nothing(tmp_path: Path) -> None:
+    head = Node("head", gethostname(), 0, 2**40)
+    run = Harness(tmp_path, (head, A))
+    pool = FakePool(well, run.nodes)
+    pool.leaving["head"] = LeaveNotice(Leaving.REBALANCE)
+    assert run.drive(pool=pool).outcome == Outcome.DONE
+    assert not run.records(TaskYielded)
