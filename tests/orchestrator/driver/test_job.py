@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.sparse import csc_array
 
 from panolog.orchestrator.driver.job import Job, Specs
 from panolog.orchestrator.run.config import RunConfig
@@ -23,6 +24,7 @@ from tests.workers.small import WIDTH, small_scene
 
 BLOCK = (1, 3)  # the cameras of block 0
 OTHERS = (2, 0)  # those that see it besides
+SCORES = [0.5, 1.0, 0.0, 2.0]  # of block 0
 CELL = Cell(aabb(np.eye(3), 2.0), Grid((1, 1, 1)), 0)
 FACES = (Plane(0, 1, 0, 0.5, (0.5, 0.0, 0.0), (0.5, 1.0, 1.0)),)
 
@@ -38,9 +40,12 @@ class Offer(Noting):
         self.coarse = self.job.folder.model(COARSE)
         self.specs = Specs(self.job, self)
         plan = SimpleNamespace(
-            cameras=lambda _: BLOCK, cell=lambda _: CELL, compared=lambda _, n: (*BLOCK[:n], *OTHERS[:n])
+            rows=range(4),
+            cameras=lambda _: BLOCK,
+            cell=lambda _: CELL,
+            compared=lambda _, scores, n: (*BLOCK[:n], *OTHERS[:n]) if scores.tolist() == SCORES else (),
         )
-        vars(self.specs).update(plan=plan, faces=(), _labels=())
+        vars(self.specs).update(plan=plan, faces=(), _labels=(), _scores=csc_array([[it] for it in SCORES]))
 
     def images(self, rows: Iterable[int]) -> set[Path]:
         return {file for row in rows for file in self.job.scene.panoramas[row].files}
