@@ -322,8 +322,7 @@ class Driver:
                 continue
             self._pool.cancel(task)
             self._news = True
-            evaluation = self._evaluations.get(task)
-            evaluated = evaluation is not None and evaluation.complete
+            evaluated = task in self._evaluations and self._evaluations[task].complete
             if evaluated or attempt.stopping or self._state.status(task) == Status.DONE:
                 records += self._ended(task)
             else:

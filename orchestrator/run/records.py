@@ -1,7 +1,4 @@
-"""What a run has done so far, as typed records: one row of the database each, without tensors.
-
-`workers.events` is what workers yield; a record is what the driver has made of it, once its files are there.
-"""
+"""What a run has done so far: what the driver has made of `workers.events`, each once its files are there."""
 
 from dataclasses import dataclass, field
 
