@@ -272,7 +272,7 @@ def report(
     if is_url(runs[0]) and output is None:
         raise InputError("a report of a run in a store: give -o FILE.html")
     with opened(runs[0], "report") as (root, _), progress_bar("writing the report"):
-        from panolog.orchestrator.views.report import write_report
+        from panolog.orchestrator.views.pages.report import write_report
 
         page = write_report(RunFolder(root), output)
     print(page)
@@ -304,9 +304,9 @@ def _write_comparison(runs: list[Path], output: Path, *, quiet: bool = False) ->
     if not output.parent.is_dir():
         raise InputError(f"{output.parent}: there is no such folder for the page")
     with progress_bar("writing the page"):
-        from panolog.orchestrator.views.comparison.page import write_page
+        from panolog.orchestrator.views.comparison.page import write_comparison
 
-        write_page(runs, output)
+        write_comparison(runs, output)
     if quiet:
         say(str(output))
     else:

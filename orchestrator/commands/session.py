@@ -50,8 +50,8 @@ from panolog.orchestrator.run.state import OnChange, RunState, ignore
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.stages.measuring import Measuring
 from panolog.orchestrator.stages.scenes import measured_scene, save_measured, scene_of
+from panolog.orchestrator.views.pages.report import report_or_notice
 from panolog.orchestrator.views.plan_picture import write_plan_picture
-from panolog.orchestrator.views.report import report_or_notice
 from panolog.partition.plan import Plan
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import ClusterError, RunFolderError, RunLockedError

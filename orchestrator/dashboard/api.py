@@ -24,6 +24,8 @@ GET /api/runs/{id}/views              HeldOutViews
 GET /api/runs/{id}/views/{number}     JPEG, the render above the photograph
 GET /api/runs/{id}/preparation/{name} PNG or JPEG, what a step of the preparation has made: `PictureView.name`
 GET /api/runs/{id}/exposure           ExposureCurve
+GET /api/runs/{id}/findings           Findings: metrics of held-out panoramas, seams, refined poses, movers
+GET /api/runs/{id}/findings/{name}    PNG or JPEG, one of `Findings.pictures`
 GET /api/runs/{id}/point_cloud.ply    the model, to save
 GET /api/runs/{id}/report.html[?save=1]the report, to read in a sandbox of its own, or to save
 GET /api/compare?run=ID&run=ID…       Comparison of two to eight runs; of one that cannot be read the error
@@ -72,7 +74,7 @@ from panolog.orchestrator.dashboard.discovery import RunEntry, read_below
 from panolog.orchestrator.dashboard.messages import CameraView
 from panolog.orchestrator.dashboard.model_pages import ModelPages, page_policy
 from panolog.orchestrator.dashboard.queues.panel import QueueAction
-from panolog.orchestrator.dashboard.responses import encode, json_response, model_download, report_download
+from panolog.orchestrator.dashboard.responses import json_response, model_download, report_download
 from panolog.orchestrator.dashboard.watch import Watch, error_line
 from panolog.orchestrator.views import queries
 from panolog.orchestrator.views.comparison.compare import compare
@@ -80,6 +82,7 @@ from panolog.orchestrator.views.comparison.curves import curves_of
 from panolog.orchestrator.views.comparison.reading import ReadRun, UnreadRun
 from panolog.orchestrator.views.comparison.schema import Comparison
 from panolog.orchestrator.views.exposures import MOST_BYTES, ExposureCurve, exposure_curve
+from panolog.orchestrator.views.pages.encoding import encode
 from panolog.scene.errors import InputError
 from panolog.scene.stores.outline import local_folder, made_here
 from panolog.scene.stores.url import is_url
@@ -255,6 +258,18 @@ async def get_preparation_picture(request: Request, run: Run, name: str) -> Resp
 async def get_exposure(request: Request, run: Run) -> Response:
     """How bright each training panorama is."""
     return await respond_json(request, _exposure_curve, run.entry, status=404)
+
+
+@router.get("/api/runs/{id}/findings")
+async def get_findings(request: Request, run: Run) -> Response:
+    """What was measured."""
+    return await respond_json(request, pictures.findings, run.entry, status=404)
+
+
+@router.get("/api/runs/{id}/findings/{name}")
+async def get_finding_picture(request: Request, run: Run, name: str) -> Response:
+    """One of its pictures."""
+    return await respond(request, 404, pictures.of_findings, run.entry, name)
 
 
 @router.get("/api/runs/{id}/point_cloud.ply")

@@ -10,11 +10,12 @@ from pydantic import BaseModel, Field, ValidationError
 
 from panolog.orchestrator.dashboard.discovery import read_below
 from panolog.orchestrator.dashboard.registry import RunRegistry, Topic
-from panolog.orchestrator.dashboard.responses import encode, json_response
+from panolog.orchestrator.dashboard.responses import json_response
 from panolog.orchestrator.dashboard.watch import UNREADABLE, Watch, error_line
 from panolog.orchestrator.views.comparison.measured import MOST_BYTES, parse_measured
 from panolog.orchestrator.views.comparison.reading import ReadRun, UnreadRun
 from panolog.orchestrator.views.comparison.schema import MOST
+from panolog.orchestrator.views.pages.encoding import encode
 
 _BODY = 4_096  # bytes of a POST at most
 _BODY_TIMEOUT_S = 10.0

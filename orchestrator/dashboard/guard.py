@@ -8,6 +8,8 @@ page of a model has an origin of its own, from which browsers send no cookie: th
 only clients with the token learn, is as secret as the token and grants these files alone.
 """
 
+import base64
+import hashlib
 import ipaddress
 import os
 import secrets
@@ -21,16 +23,19 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import HTMLResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from panolog.orchestrator.dashboard.responses import encode
+from panolog.orchestrator.views.pages.encoding import encode
+from panolog.orchestrator.views.pages.shell import LIVE_IMPORTS
 from panolog.scene.errors import InputError
 from panolog.scene.files import user_folder
 
 _LOCAL = {"localhost", "127.0.0.1", "[::1]"}
 _SAFE = {"GET", "HEAD"}
 _OWN_HEADER = "x-panolog"  # a header that no other site can send without being allowed to
-# plotly writes its own style elements and attributes; scripts are files of ours only.
+_IMPORTS = base64.b64encode(hashlib.sha256(LIVE_IMPORTS.encode()).digest()).decode()
+# plotly writes its own style elements and attributes; scripts are files of ours only, and where they are.
 CSP = (
-    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:;"
+    f"default-src 'none'; script-src 'self' 'sha256-{_IMPORTS}';"
+    " style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:;"
     " font-src 'self'; connect-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none';"
     " frame-ancestors 'none'"
 )

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.dashboard.discovery import RunEntry, by_handle, opened, read_below
 from panolog.orchestrator.dashboard.messages import BlockCamera, BlockCameras
-from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.views.figures import Figure, map_figure
+from panolog.orchestrator.views.pages.encoding import encode
 from panolog.orchestrator.views.plan_map import read_points
 from panolog.partition.plan import Plan
 from panolog.partition.plan_json import PlanCamera

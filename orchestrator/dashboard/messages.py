@@ -9,6 +9,7 @@ from pydantic import ConfigDict
 from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.views.comparison.schema import Comparison, CurvesOfRuns
 from panolog.orchestrator.views.exposures import ExposureCurve
+from panolog.orchestrator.views.pages.findings import Findings
 from panolog.orchestrator.views.run_view import LiveView, RunView
 from panolog.orchestrator.views.summary import STAGES, SummaryHead, TaskView, Text, ViewModel
 from panolog.partition.plan_json import Reason
@@ -24,11 +25,15 @@ class Actions(ViewModel):
 
 
 class Results(ViewModel):
-    """Which results of a run can be downloaded; `exposure` changes with the exposures, if there are any."""
+    """Which results of a run can be downloaded.
+
+    `exposure` changes with the exposures, if there are any, `findings` with what was measured.
+    """
 
     model: bool
     report: bool
     exposure: str | None = None
+    findings: str = ""
 
 
 class RunPage(RunView):
@@ -243,6 +248,7 @@ MESSAGES = (
     HeldOutViews,
     Series,
     ExposureCurve,
+    Findings,
     CameraView,
     BlockCameras,
     Comparison,

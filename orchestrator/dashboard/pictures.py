@@ -19,6 +19,7 @@ from fastapi.responses import Response
 from panolog.orchestrator.dashboard.discovery import RunEntry, open_below, read_below
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.views import queries
+from panolog.orchestrator.views.pages.findings import Findings, finding_pictures, read_findings
 from panolog.orchestrator.views.preparation import picture_path
 from panolog.orchestrator.views.site.photographs import STORE_S, require_size, small_copy
 from panolog.scene.errors import InputError, StoreLostError
@@ -27,6 +28,7 @@ from panolog.scene.read import check_names, image_folder, model_folder
 from panolog.scene.stores.outline import made_here, whole
 
 _SIZE = 50_000_000  # bytes of a JPEG at most
+_MEASURED = 200_000_000  # bytes of a file of what was measured at most
 _REDUCED = 1024  # pixels of the width of a panorama's copy
 _CACHED = 64  # copies, of some hundred kilobytes each
 _PREVIEW_PATH = re.compile(r"(coarse|(district|blocks|round|repair)/\d{3,9})/previews/\d{6,12}\.jpg")
@@ -82,7 +84,21 @@ def view(entry: RunEntry, number: int) -> Response:
 
 def of_preparation(entry: RunEntry, name: str) -> Response:
     """A picture that a step of the preparation has made. Raises InputError as `preview`."""
-    path = picture_path(entry.folder, name)
+    return _own(entry, picture_path(entry.folder, name))
+
+
+def findings(entry: RunEntry) -> Findings:
+    """What was measured of a run. Raises InputError if a file is damaged or not below the run."""
+    folder = entry.folder
+    return read_findings(folder, lambda path: read_below(path, folder.root, _MEASURED))
+
+
+def of_findings(entry: RunEntry, name: str) -> Response:
+    """A picture of the findings. Raises InputError as `preview` and `findings`."""
+    return _own(entry, finding_pictures(entry.folder, findings(entry)).get(name))
+
+
+def _own(entry: RunEntry, path: Path | None) -> Response:
     if path is None:
         raise HTTPException(404, "there is no such picture")
     data = read_below(path, entry.folder.root, _SIZE)

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 from panolog.orchestrator.dashboard.discovery import discover
 from panolog.orchestrator.dashboard.messages import RunRow
 from panolog.orchestrator.dashboard.queues.panel import QueuePanel
-from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.dashboard.watch import Watch
+from panolog.orchestrator.views.pages.encoding import encode
 
 _THREADS = 16
 _RUN_S = 0.25  # between two refreshes of a run whose page is open

@@ -1,15 +1,11 @@
 """Answers: JSON as browsers take it, and files of a run as downloads."""
 
 import gzip
-import json
-import math
 import os
 import re
-from typing import Any
 
 from fastapi import Request
 from fastapi.responses import FileResponse, Response
-from pydantic import BaseModel
 from starlette.types import Receive, Scope, Send
 
 from panolog.orchestrator.dashboard.discovery import RunEntry, by_handle, open_below
@@ -17,36 +13,9 @@ from panolog.orchestrator.dashboard.discovery import RunEntry, by_handle, open_b
 _UNCOMPRESSED = 1_000  # bytes up to which compression is not worth its time
 # A report may come from another person's run: its scripts must not reach the dashboard.
 _SANDBOX = (
-    "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval';"
+    "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline' data:;"
     " style-src 'unsafe-inline'; img-src data: blob:; font-src data:; frame-ancestors 'none'"
 )
-
-
-def encode(content: Any) -> bytes:
-    """ASCII JSON in one line. Not a number and infinity, which only a damaged run can hold, become null."""
-    try:
-        text = json.dumps(content, default=_plain, allow_nan=False, separators=(",", ":"))
-    except ValueError:
-        text = json.dumps(_finite(content), allow_nan=False, separators=(",", ":"))
-    return text.encode()
-
-
-def _plain(value: Any) -> Any:
-    return value.model_dump(mode="python") if isinstance(value, BaseModel) else vars(value)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, str | int | None):  # enums, too
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if hasattr(value, "__dict__"):
-        value = _plain(value)
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return value
 
 
 def json_response(request: Request, data: bytes, status: int = 200) -> Response:

@@ -2,7 +2,6 @@
 
 import asyncio
 import gzip
-import importlib.resources
 import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -15,7 +14,7 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, HTMLResponse, Response
+from fastapi.responses import HTMLResponse, Response
 from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -26,15 +25,13 @@ from panolog.orchestrator.dashboard.maps import MapCache
 from panolog.orchestrator.dashboard.model_pages import ModelPages
 from panolog.orchestrator.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.dashboard.registry import RunRegistry
-from panolog.orchestrator.dashboard.responses import encode
-from panolog.orchestrator.views.comparison.page import CONTENT
+from panolog.orchestrator.views.pages.encoding import encode
+from panolog.orchestrator.views.pages.shell import COMPARISON, RUN, RUNS, STATIC, Page, live_page, plotly
 from panolog.scene.errors import InputError
 
-STATIC = Path(__file__).with_name("static")
 _SEND_TIMEOUT_MS = 60_000  # after which a client that reads nothing is disconnected
 _REQUEST_TIMEOUT_S = 15.0  # in which a connection must have sent a request
 _MAX_CONNECTIONS = 1_000
-_CONTENT = "<!-- content -->"  # what stands for it in compare.html
 _SHUTDOWN_S = 4  # for open answers and the last messages of streams when the server ends
 
 
@@ -66,22 +63,23 @@ def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
     return app
 
 
-def _index() -> FileResponse:
-    return FileResponse(STATIC / "runs" / "runs.html", headers={"Cache-Control": "no-cache"})
+def _page(page: Page) -> HTMLResponse:
+    return HTMLResponse(live_page(page), headers={"Cache-Control": "no-cache"})
 
 
-async def _run(request: Request, id: str) -> FileResponse:
+def _index() -> HTMLResponse:
+    return _page(RUNS)
+
+
+async def _run(request: Request, id: str) -> HTMLResponse:
     registry: RunRegistry = request.app.state.registry
     if found := await registry.run(id):
         found[1].start_refresh()  # the page requests the run as soon as its scripts are loaded
-    return FileResponse(STATIC / "run" / "run.html", headers={"Cache-Control": "no-cache"})
+    return _page(RUN)
 
 
-def _compare() -> Response:
-    """The page that compares runs; a report of several runs has the same content."""
-    content = CONTENT.read_text(encoding="utf-8")
-    page = (STATIC / "compare" / "compare.html").read_text(encoding="utf-8").replace(_CONTENT, content)
-    return HTMLResponse(page, headers={"Cache-Control": "no-cache"})
+def _compare() -> HTMLResponse:
+    return _page(COMPARISON)
 
 
 def _plotly(request: Request) -> Response:
@@ -91,15 +89,13 @@ def _plotly(request: Request) -> Response:
     if request.headers.get("if-none-match") == tag:
         return Response(status_code=304, headers=headers)
     if "gzip" not in request.headers.get("accept-encoding", ""):
-        path = importlib.resources.files("plotly") / "package_data" / "plotly.min.js"
-        return Response(path.read_bytes(), 200, headers, "text/javascript")
+        return Response(plotly(), 200, headers, "text/javascript")
     return Response(_plotly_gzip(), 200, headers | {"Content-Encoding": "gzip"}, "text/javascript")
 
 
 @cache
 def _plotly_gzip() -> bytes:
-    path = importlib.resources.files("plotly") / "package_data" / "plotly.min.js"
-    return gzip.compress(path.read_bytes(), 6)
+    return gzip.compress(plotly(), 6)
 
 
 def _error(_: Request, error: Exception) -> Response:

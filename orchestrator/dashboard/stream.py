@@ -9,8 +9,8 @@ from collections.abc import AsyncIterator
 from contextlib import suppress
 
 from panolog.orchestrator.dashboard.registry import RunRegistry, Topic
-from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.dashboard.watch import Snapshot, Watch
+from panolog.orchestrator.views.pages.encoding import encode
 
 _PING_S = 10.0  # between two messages at most
 _PAUSE_S = 0.5  # between two messages at least

@@ -12,7 +12,6 @@ from typing import Any
 from panolog.orchestrator.dashboard import actions
 from panolog.orchestrator.dashboard.discovery import RunEntry, read_below, require_plain
 from panolog.orchestrator.dashboard.messages import Actions, Results, RunChanges, RunPage, RunRow
-from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.preparation.settings import MOST_BYTES
 from panolog.orchestrator.run import lock, presence, reading
 from panolog.orchestrator.run.records import Progressed, RunBegan, RunEnded, Stored
@@ -20,6 +19,8 @@ from panolog.orchestrator.run.store import as_event, read_milestones, read_news
 from panolog.orchestrator.storage.state import read_state
 from panolog.orchestrator.views import queries
 from panolog.orchestrator.views.history import History
+from panolog.orchestrator.views.pages.encoding import encode
+from panolog.orchestrator.views.pages.findings import findings_version
 from panolog.orchestrator.views.preparation import stamp_of, version_of, view_preparation, with_step
 from panolog.orchestrator.views.queries import LOCK_TIMEOUT_S
 from panolog.orchestrator.views.run_view import view_run
@@ -186,6 +187,7 @@ class Watch:
             model=folder.point_cloud.is_file(),
             report=folder.report.is_file(),
             exposure=version_of(folder.exposure),
+            findings=findings_version(folder),
         )
         waiting = presence.waiting(folder.presence) if running else ""
         mirror = read_state(folder.mirror, running=running)

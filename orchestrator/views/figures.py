@@ -1,81 +1,59 @@
-"""The map of dashboard and report as a plotly figure: plain dicts, ready for JSON."""
+"""The map of a run as a plotly figure: plain dicts, ready for JSON. The page paints the cells."""
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from panolog.orchestrator.views.palette import SEAM_GRADES, block_color, seam_grade
-from panolog.orchestrator.views.plan_map import BLOCK_STATUSES, BlockStatus, MapWindow, filled, window_on
+from panolog.orchestrator.views.plan_map import LABELS, RINGS, MapWindow, served, window_on
 from panolog.partition.faces import planes_between
 from panolog.partition.plan import Plan
 
 Figure = dict[str, Any]  # {"data": traces, "layout": layout}
 
-# The tints of a cell for each status: its open and its filled part. Translucent, for light and dark themes.
-TINTS = {
-    "waiting": ("rgba(125,135,150,0.10)", "rgba(125,135,150,0.34)"),
-    "running": ("rgba(52,120,225,0.12)", "rgba(52,120,225,0.46)"),
-    "paused": ("rgba(205,140,15,0.14)", "rgba(205,140,15,0.50)"),
-    "done": ("rgba(38,150,85,0.14)", "rgba(38,150,85,0.42)"),
-    "failed": ("rgba(214,60,60,0.16)", "rgba(214,60,60,0.50)"),
-    "kept": ("rgba(125,135,150,0.10)", "rgba(125,135,150,0.26)"),
-}
 _INK, _GREY, _GRID = "#22272e", "#7b8696", "rgba(125,135,150,0.25)"
 _FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', sans-serif"
-_LABELS = 80  # blocks in the window up to which each has a number
 _RINGED = 1_500  # cameras up to which rings are drawn: each is a shape of its own
-_RINGS = (9, 14, 18)  # pixels: a camera, and the rings around it for the second and the third block it serves
 
 
 def map_figure(
-    plan: Plan,
-    points: NDArray[np.floating],
-    statuses: Mapping[int, BlockStatus] | None = None,
-    seams: Mapping[tuple[int, int], float] | None = None,
+    plan: Plan, points: NDArray[np.floating], seams: Mapping[tuple[int, int], float] | None = None
 ) -> Figure:
     """A plan from above in world space: cells, faces, AABB, points and cameras.
 
-    The figure has one more key, "blocks": `count` and `colors` of all blocks, `names` of the cameras, and for
-    blocks on top of each other `layers`, the `layer` shown and the `stride` of ids between layers. The trace
-    "blocks" has ids as `customdata`, and the codes of `plan_map.filled` as `z`.
+    The figure has one more key, "blocks": `count` and `colors` of all blocks, `names` of the cameras,
+    `grades` for the legend of seams, and for blocks on top of each other `layers`, the `layer` shown and the
+    `stride` of ids between layers. The trace "blocks" has the ids of the lowest layer as `z`.
 
-    Args: points (P, 3) of the scene, such as those of `plan_map.read_points`; the status of each block; the
-    seams of faces by their blocks.
+    Args: points (P, 3) of the scene, such as those of `plan_map.read_points`; seams of faces by their blocks.
     """
     view = window_on(plan, points)
-    layer = _layer_of_cameras(view)
-    colors = [block_color(b) for b in range(plan.grid.count)]
-    blocks = view.cells + layer * view.stride
     return {
         "data": [
-            _cells(view, blocks, filled(blocks, statuses or {})),
+            _cells(view),
             _density(view, points),
             _line("faces", view.faces(), _GREY, "solid"),
             *_seams(view, seams or {}),
-            _line("box", _outline(view), _GREY, "dash"),
-            *_cameras(view, colors),
-            _labels(view, layer, colors),
+            _line("box", view.outline(), _GREY, "dash"),
+            *_cameras(view),
+            _labels(view),
         ],
         "layout": _map_layout(view),
         "blocks": {
             "count": plan.grid.count,
-            "colors": colors,
+            "colors": view.colors,
             "names": list(plan.names),
+            "grades": _grades((seams or {}).values()),
             "layers": view.layers,
-            "layer": layer,
+            "layer": view.layer,
             "stride": view.stride,
         },
     }
-
-
-def _layer_of_cameras(view: MapWindow) -> int:
-    """The layer in which most cameras are."""
-    layers = view.plan.camera_blocks // view.stride % view.layers
-    return int(np.bincount(layers, minlength=view.layers).argmax())
 
 
 def _packed(values: NDArray[Any]) -> dict[str, str]:
@@ -92,21 +70,31 @@ def _steps(view: MapWindow, shape: tuple[int, ...]) -> dict[str, float]:
     return {"x0": float(x0), "dx": float(step[0]), "y0": float(y0), "dy": float(step[1])}
 
 
-def _cells(view: MapWindow, blocks: NDArray[np.int64], codes: NDArray[np.uint8]) -> dict[str, Any]:
-    tints = [tint for status in BLOCK_STATUSES for tint in TINTS[status]]
-    scale = [[(i + side) / len(tints), tint] for i, tint in enumerate(tints) for side in (0, 1)]
+def _cells(view: MapWindow) -> dict[str, Any]:
+    """The blocks of the lowest layer as a transparent raster, for the pointer and for who paints them."""
+    clear = "rgba(0,0,0,0)"
     return {
         "type": "heatmap",
         "name": "blocks",
-        "z": _packed(codes),
-        "customdata": _packed(blocks.astype("<i2")),
-        **_steps(view, blocks.shape),
-        "zmin": -0.5,
-        "zmax": len(tints) - 0.5,
-        "colorscale": scale,
+        "z": _packed(view.cells.astype("<i2" if view.plan.grid.count < 2**15 else "<i4")),
+        **_steps(view, view.cells.shape),
+        "colorscale": [[0, clear], [1, clear]],
         "showscale": False,
-        "hovertemplate": "block %{customdata}<extra></extra>",
+        "hoverinfo": "none",
     }
+
+
+def _grades(seams: Iterable[float]) -> list[list[str]]:
+    """Text and colour of each grade of seams that there is."""
+    present, limits = {seam_grade(seam) for seam in seams}, [least for least, _ in SEAM_GRADES.values()]
+    spans = [f"{low:g} to {high:g}" if low else f"below {high:g}" for low, high in pairwise(limits)]
+    return [
+        [f"seam {span}", color]
+        for (name, (_, color)), span in zip(
+            SEAM_GRADES.items(), [*spans, f"{limits[-1]:g} and more"], strict=True
+        )
+        if name in present
+    ]
 
 
 def _density(view: MapWindow, points: NDArray[np.floating]) -> dict[str, Any]:
@@ -153,21 +141,14 @@ def _seams(view: MapWindow, seams: Mapping[tuple[int, int], float]) -> list[dict
     return traces
 
 
-def _outline(view: MapWindow) -> NDArray[np.float64]:
-    """(5, 2) the AABB."""
-    pair = list(view.axes[:2])
-    (left, bottom), (right, top) = view.plan.aabb.lower[pair], view.plan.aabb.upper[pair]
-    return np.array([[left, bottom], [right, bottom], [right, top], [left, top], [left, bottom]])
-
-
-def _cameras(view: MapWindow, colors: Sequence[str]) -> list[dict[str, Any]]:
+def _cameras(view: MapWindow) -> list[dict[str, Any]]:
     """A disc for each camera in the colour of its own block, and rings for other blocks that it trains."""
     plan = view.plan
-    served = [_served(plan, k) for k in range(len(plan.rows))]
-    size = float(np.clip(60 / max(len(served), 1) ** 0.5, 0.45, 1.0))
+    blocks = [served(plan, k) for k in range(len(plan.rows))]
+    size = float(np.clip(60 / max(len(blocks), 1) ** 0.5, 0.45, 1.0))
     traces = []
-    for ring in reversed(range(len(_RINGS) if len(served) <= _RINGED else 1)):
-        here = [k for k, blocks in enumerate(served) if len(blocks) > ring]
+    for ring in reversed(range(len(RINGS) if len(blocks) <= _RINGED else 1)):
+        here = [k for k, its in enumerate(blocks) if len(its) > ring]
         places = plan.centers[here][:, list(view.axes[:2])]
         traces.append(
             {
@@ -177,10 +158,10 @@ def _cameras(view: MapWindow, colors: Sequence[str]) -> list[dict[str, Any]]:
                 "x": places[:, 0].tolist(),
                 "y": places[:, 1].tolist(),
                 "customdata": [plan.rows[k] for k in here],
-                "text": [f"{escape(plan.names[k])}<br>trains {_listed(served[k])}" for k in here],
+                "text": [f"{escape(plan.names[k])}<br>trains {_listed(blocks[k])}" for k in here],
                 "marker": {
-                    "size": _RINGS[ring] * size,
-                    "color": [colors[served[k][ring]] for k in here],
+                    "size": RINGS[ring] * size,
+                    "color": [block_color(blocks[k][ring]) for k in here],
                     "opacity": 1,
                     "line": {"color": "#ffffff", "width": 1.2 * size},
                 },
@@ -190,21 +171,16 @@ def _cameras(view: MapWindow, colors: Sequence[str]) -> list[dict[str, Any]]:
     return traces
 
 
-def _served(plan: Plan, k: int) -> list[int]:
-    """The blocks that a camera trains, its own first."""
-    return sorted(plan.assignment.blocks_of(k).tolist(), key=lambda b: b != plan.camera_blocks[k])
-
-
 def _listed(blocks: Sequence[int]) -> str:
     head = ", ".join(map(str, sorted(blocks)[:8]))
     return f"block{'s' * (len(blocks) > 1)} {head}{', …' * (len(blocks) > 8)}"
 
 
-def _labels(view: MapWindow, layer: int, colors: Sequence[str]) -> dict[str, Any]:
+def _labels(view: MapWindow) -> dict[str, Any]:
     """The number of each cell on a disc, if there are not too many."""
-    few = len(np.unique(view.cells)) <= _LABELS
+    few = len(np.unique(view.cells)) <= LABELS
     ids, places = view.labels() if few else (np.empty(0, np.int64), np.empty((0, 2)))
-    shown = ids + layer * view.stride
+    shown = ids + view.layer * view.stride
     return {
         "type": "scatter",
         "mode": "markers+text",
@@ -218,7 +194,7 @@ def _labels(view: MapWindow, layer: int, colors: Sequence[str]) -> dict[str, Any
             "size": 26,
             "color": "#ffffff",
             "opacity": 1,
-            "line": {"color": [colors[b] for b in shown], "width": 2},
+            "line": {"color": [block_color(b) for b in shown.tolist()], "width": 2},
         },
         "hovertemplate": "block %{customdata}<extra></extra>",
     }

@@ -1,10 +1,8 @@
 """A plan from above as rasters: which block each pixel belongs to, how far it is, and where points are.
 
-A thousand cells cost as much to draw as two: they are one raster, and when a block progresses, only its
-values change.
+A thousand cells cost as much to draw as two: they are one raster.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,25 +10,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.views.summary import Summary
+from panolog.orchestrator.views.palette import block_color
 from panolog.partition.cells import Face, Grid
 from panolog.partition.contraction import contract, expand
 from panolog.partition.faces import Plane
 from panolog.partition.plan import Plan
 from panolog.scene.ply_table import read_table, sky_of
-from panolog.workers.tasks import TaskId
 
-# The statuses of a block; "kept" is not trained, as Stage I made it. A raster holds twice the index in
-# this list, plus one where the block is filled.
-BLOCK_STATUSES = ("waiting", "running", "paused", "done", "failed", "kept")
 _CELLS = 360  # samples of the cells along the longer side
 _POINTS = 640  # the same of the points
 _REACH = (1.15, 1.6)  # half extents of the AABB that are shown at least and at most
 _SHAPE = (1.4, 1.7)  # width by height of a window: outer cells have no end, so any window can be filled
+LABELS = 80  # blocks in the window up to which each has a number
+RINGS = (9, 14, 18)  # pixels: a camera, and the rings around it for the second and the third block it trains
 _LABEL_GRID = 24  # rows and columns of candidates for the position of a label
 _ALONG = 120  # samples of a face between cells
-
-BlockStatus = tuple[str, float]  # one of BLOCK_STATUSES, and how much of the block is done, 0 to 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,24 +48,28 @@ class MapWindow:
         return int(np.prod(grid.shape[: self.axes[2]])) if isinstance(grid, Grid) else 1
 
     @cached_property
+    def layer(self) -> int:
+        """The layer in which most cameras are, the lowest is 0."""
+        layers = self.plan.camera_blocks // self.stride % self.layers
+        return int(np.bincount(layers, minlength=self.layers).argmax())
+
+    @property
+    def colors(self) -> list[str]:
+        """The colours of all blocks."""
+        return [block_color(block) for block in range(self.plan.grid.count)]
+
+    @cached_property
     def cells(self) -> NDArray[np.int64]:
         """(rows, columns) the block of the lowest layer at each sample, lowest row first.
 
         Faces are drawn as they run through the middle of the AABB, in every layer alike.
         """
-        middle = self.blocks(_CELLS)
-        return middle - middle // self.stride % self.layers * self.stride
-
-    def blocks(self, longer: int) -> NDArray[np.int64]:
-        """(rows, columns) the block at each sample of the plane through the AABB's middle, lowest row first.
-
-        Args: longer, samples along the longer side.
-        """
-        x, y = self.samples(longer)
+        x, y = self.samples(_CELLS)
         world = np.tile(self.plan.aabb.center, (len(y), len(x), 1))
         world[..., self.axes[0]], world[..., self.axes[1]] = np.meshgrid(x, y)
         contracted = contract(world.reshape(-1, 3), self.plan.aabb)
-        return self.plan.grid.block_of(contracted).reshape(len(y), len(x))
+        middle = self.plan.grid.block_of(contracted).reshape(len(y), len(x))
+        return middle - middle // self.stride % self.layers * self.stride
 
     def samples(self, longer: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """World coordinates of the columns and rows of a picture with `longer` pixels on its longer side."""
@@ -97,6 +95,12 @@ class MapWindow:
         lines = [self.line(face) for face in self.plan.grid.faces if face.axis != self.axes[2]]
         gap = np.full((1, 2), np.nan)
         return np.concatenate([np.empty((0, 2)), *(part for line in lines for part in (line, gap))])
+
+    def outline(self) -> NDArray[np.float64]:
+        """(5, 2) the AABB."""
+        pair = list(self.axes[:2])
+        (left, bottom), (right, top) = self.plan.aabb.lower[pair], self.plan.aabb.upper[pair]
+        return np.array([[left, bottom], [right, bottom], [right, top], [left, top], [left, bottom]])
 
     def line(self, face: Face | Plane) -> NDArray[np.float64]:
         """(F, 2) points of a face that is not seen from its front."""
@@ -129,59 +133,25 @@ class MapWindow:
         return ids, best
 
 
-def window_on(
-    plan: Plan,
-    points: NDArray[np.floating],
-    reach: tuple[float, float] = _REACH,
-    shape: tuple[float, float] | None = _SHAPE,
-) -> MapWindow:
-    """The window that shows the AABB and most of the points (P, 3), but not much more than the AABB.
+def served(plan: Plan, k: int) -> list[int]:
+    """The blocks that the k-th camera trains, its own first."""
+    return sorted(plan.assignment.blocks_of(k).tolist(), key=lambda b: b != plan.camera_blocks[k])
 
-    Args: reach, half extents of the AABB that it shows at least and at most; shape, its least and largest
-    width by height, to which it is enlarged, None for any.
-    """
+
+def window_on(plan: Plan, points: NDArray[np.floating]) -> MapWindow:
+    """The window that shows the AABB and most of the points (P, 3), but not much more than the AABB."""
     depth = int(np.argmin(np.ptp(plan.centers, axis=0)))
     across, up = (axis for axis in range(3) if axis != depth)
     pair = [across, up]
     center, half = plan.aabb.center[pair], plan.aabb.half[pair]
-    extents = np.full(2, reach[0])
+    extents = np.full(2, _REACH[0])
     if len(points):
         offsets = np.abs(points[:, pair] - center) / half
-        extents = np.clip(np.percentile(offsets, 98, axis=0), *reach)
+        extents = np.clip(np.percentile(offsets, 98, axis=0), *_REACH)
     size = extents * half
-    if shape is not None:
-        size[0] = max(size[0], shape[0] * size[1])
-        size[1] = max(size[1], size[0] / shape[1])
+    size[0] = max(size[0], _SHAPE[0] * size[1])
+    size[1] = max(size[1], size[0] / _SHAPE[1])
     return MapWindow(plan, (across, up, depth), center - size, center + size)
-
-
-def levels(blocks: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(rows, columns) the share of its block's pixels that lie in the rows below each pixel."""
-    count = int(blocks.max()) + 1
-    each = np.stack([np.bincount(row, minlength=count) for row in blocks])  # (rows, blocks)
-    below = np.cumsum(each, axis=0) - each
-    shares: NDArray[np.float64] = np.take_along_axis(below, blocks, axis=1) / each.sum(axis=0)[blocks]
-    return shares
-
-
-def filled(blocks: NDArray[np.int64], statuses: Mapping[int, BlockStatus]) -> NDArray[np.uint8]:
-    """(rows, columns) codes, see BLOCK_STATUSES. Blocks fill from below, and wait by default."""
-    count = int(blocks.max()) + 1
-    names, shares = zip(*(statuses.get(b, ("waiting", 0.0)) for b in range(count)), strict=True)
-    kinds = np.array([BLOCK_STATUSES.index(name) for name in names], np.uint8)
-    full: NDArray[np.bool_] = levels(blocks) < np.array(shares)[blocks]
-    return 2 * kinds[blocks] + full.astype(np.uint8)
-
-
-def block_statuses(summary: Summary) -> dict[int, BlockStatus]:
-    """The status of each block."""
-    tasks = {task.name: (task.status, task.share) for task in summary.tasks}
-    return {
-        plan.block: tasks.get(str(TaskId.block(plan.block)), ("waiting", 0.0))
-        if plan.train
-        else ("kept", 1.0)
-        for plan in summary.blocks
-    }
 
 
 def read_points(ply: Path, most: int = 200_000) -> NDArray[np.float32]:

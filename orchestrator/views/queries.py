@@ -8,13 +8,14 @@ import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from panolog.orchestrator.run.reading import has_table, query
 from panolog.orchestrator.run.store import PICTURES
 
 LOCK_TIMEOUT_S = 5.0  # to wait for the driver, which locks the database for milliseconds
 SEARCHED = 50_000  # records that one search for a text reads
+_Item = TypeVar("_Item")
 _PREVIEWS = 200  # of a task, at most
 _EVENT = "SELECT id, time, type, payload FROM events"
 _KINDS = (  # the parts of the table that have an index by task, or are small
@@ -56,6 +57,13 @@ class Filter:
     without: frozenset[str] = frozenset()
     task: str | None = None
     text: str = ""  # somewhere in the record, in either case
+
+
+def spread(items: Sequence[_Item], most: int) -> list[_Item]:
+    """At most `most` of the items, two or more, evenly spaced, both ends included."""
+    if len(items) <= most:
+        return list(items)
+    return [items[round(i * (len(items) - 1) / (most - 1))] for i in range(most)]
 
 
 def series(

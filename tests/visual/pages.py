@@ -8,8 +8,8 @@ from pathlib import Path
 from playwright.sync_api import Page, expect
 
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.views.comparison.page import write_page
-from panolog.orchestrator.views.report import write_report
+from panolog.orchestrator.views.comparison.page import write_comparison
+from panolog.orchestrator.views.pages.report import write_report
 from tests.orchestrator.dashboard.browser import DESK, PHONE
 from tests.orchestrator.dashboard.served import Served, serving
 from tests.visual.fixed import fixed_machine
@@ -82,7 +82,7 @@ def site(root: Path) -> Iterator[Site]:
     ):
         reports = {state: write_report(runs[state], root / f"{state}.html") for state in ("finished", "live")}
         comparison = root / "comparison.html"
-        write_page([runs[state].root for state in _COMPARED], comparison)
+        write_comparison([runs[state].root for state in _COMPARED], comparison)
         yield Site(root, served, runs, reports, comparison)
 
 

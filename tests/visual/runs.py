@@ -53,7 +53,7 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.stages.partitioning import plan_records, write_plan
-from panolog.orchestrator.views.report import write_report
+from panolog.orchestrator.views.pages.report import write_report
 from panolog.workers.tasks import COARSE, EVAL, PREPARE, TaskId
 from tests.visual import town
 from tests.visual.fixed import HOST, Clock

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.views.comparison.reading import DAMAGED, ReadRun, UnreadRun
 from panolog.orchestrator.views.comparison.schema import Curve, CurvesOfRuns, Line, RunCurves, StageCurves
-from panolog.orchestrator.views.queries import series
-from panolog.orchestrator.views.report import spread
+from panolog.orchestrator.views.queries import series, spread
 from panolog.orchestrator.views.summary import STAGES, TaskView
 from panolog.scene.errors import InputError
 from panolog.workers.tasks import Stage, TaskId

@@ -1,33 +1,18 @@
-"""A report of several runs: one self-contained page that compares them, to read or to send.
+"""A report of several runs: the page that compares them with a snapshot, as one self-contained file."""
 
-The page of the dashboard has the same content and scripts. Nothing of a run becomes markup: the scripts show
-names and settings as text.
-"""
-
-import time
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
-import jinja2
-from markupsafe import Markup
 from PIL import Image
 
 from panolog.orchestrator.views.comparison.compare import compare
 from panolog.orchestrator.views.comparison.curves import curves_of
 from panolog.orchestrator.views.comparison.reading import ReadRun, picture_of, read_runs
-from panolog.orchestrator.views.report import STATIC, data_url, joined, plotly, scripts, spread
-from panolog.scene.files import natural_key, write_bytes
+from panolog.orchestrator.views.pages.shell import COMPARISON, data_url, write_snapshot
+from panolog.orchestrator.views.queries import spread
+from panolog.scene.files import natural_key
 
-_HERE = Path(__file__).parent
-_COMPARE = STATIC / "compare"
-CONTENT = _COMPARE / "content.html"  # of this page and of the dashboard's
-_STYLES = (STATIC / "shared/base.css", STATIC / "shared/compare.css", _COMPARE / "comparison.css")
-_SCRIPTS = (  # each after those that it imports
-    *(STATIC / "shared/dom.js", STATIC / "shared/format.js", STATIC / "shared/charts.js"),
-    *(STATIC / "run/plot.js", STATIC / "run/panorama.js", STATIC / "shared/compare.js"),
-    *(_COMPARE / "tables.js", _COMPARE / "compared_curves.js", _COMPARE / "held_out.js", _HERE / "page.js"),
-)
 _PICTURES = 60  # of all runs and the ground truth
 _PANORAMAS = 12  # that are shown at most
 _WIDTH, _QUALITY = 1024, 82  # pixels and JPEG quality of a picture
@@ -36,32 +21,15 @@ _FILE, _PIXELS = 50_000_000, 2**28  # bytes and pixels of a run's picture at mos
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 
 
-def write_page(roots: Sequence[Path], output: Path) -> None:
+def write_comparison(roots: Sequence[Path], output: Path) -> None:
     """Writes the comparison of runs in their present state, atomically.
 
     Raises InputError as `read_runs`, or if a run's files are damaged; OSError if the page cannot be written.
     """
     runs = read_runs(roots)
     pictures = _Pictures(runs)
-    comparison = compare(runs, pictures.render, pictures.truth)
-    data = {
-        "comparison": comparison.model_dump(mode="json"),
-        "curves": curves_of(runs).model_dump(mode="json"),
-    }
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    template = environment.from_string((_HERE / "page.html.j2").read_text(encoding="utf-8"))
-    page = template.render(
-        title=" | ".join(run.name for run in runs),
-        count=len(runs),
-        made=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
-        running=any(run.status == "running" for run in comparison.runs),
-        content=Markup(CONTENT.read_text(encoding="utf-8")),
-        data=data,
-        plotly=Markup(plotly()),
-        style=Markup(joined(_STYLES)),
-        script=Markup(scripts(_SCRIPTS)),
-    )
-    write_bytes(output, page.encode(errors="replace"))
+    answers = {"compare?": compare(runs, pictures.render, pictures.truth), "compare/curves?": curves_of(runs)}
+    write_snapshot(output, COMPARISON, answers, {"runs": {"runs": []}})
 
 
 class _Pictures:
@@ -85,7 +53,7 @@ class _Pictures:
     def _part(self, run: ReadRun, view: str, *, truth: bool) -> str | None:
         path = picture_of(run, view)
         jpeg = _cut(Path(path), truth=truth) if path is not None else None
-        return None if jpeg is None else data_url("jpeg", jpeg)
+        return None if jpeg is None else data_url("image/jpeg", jpeg)
 
 
 def _chosen(runs: Sequence[ReadRun]) -> list[str]:

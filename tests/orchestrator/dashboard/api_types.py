@@ -6,7 +6,7 @@ from typing import Any
 from pydantic.json_schema import models_json_schema
 
 from panolog.orchestrator.dashboard.messages import MESSAGES
-from panolog.orchestrator.dashboard.server import STATIC
+from panolog.orchestrator.views.pages.shell import STATIC
 
 FILE = STATIC / "shared" / "messages.d.ts"
 

@@ -1,12 +1,18 @@
 """The JSON of a run for the pages."""
 
+import base64
 import gzip
+import hashlib
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
+from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.records import Noticed, Outcome, RunBegan, RunEnded
 from panolog.orchestrator.views import queries
 from panolog.workers.tasks import COARSE
@@ -43,6 +49,7 @@ def test_the_list_has_a_row_for_each_run(tmp_path: Path) -> None:
 
 def test_the_page_of_a_run_has_its_results_and_settings(served: Served) -> None:
     run = served.get(f"/api/runs/{served.id('run')}")
+    assert run["result"].pop("findings") == "- - - -"
     assert run["result"] == {"model": True, "report": True, "exposure": None}
     settings = {setting["key"]: setting for setting in run["config"]}
     assert settings["iterations"]["changed"]
@@ -170,7 +177,9 @@ def test_pages_and_scripts(served: Served) -> None:
     for path in ("/", f"/runs/{served.id('run')}", "/runs/nonsense"):
         answer = served.client.get(path)
         assert answer.headers["content-type"] == "text/html; charset=utf-8"
-        assert "script-src 'self';" in answer.headers["content-security-policy"]
+        inline = re.findall(r"<script(?![^>]* src=)[^>]*>(.*?)</script>", answer.text, re.DOTALL)
+        (digest,) = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in inline)
+        assert f"script-src 'self' 'sha256-{digest}';" in answer.headers["content-security-policy"]
     charts = served.client.get("/static/plotly.min.js")
     assert b"plotly.js" in charts.content[:1000]
     again = served.client.get("/static/plotly.min.js", headers={"If-None-Match": charts.headers["etag"]})
@@ -183,3 +192,34 @@ def test_large_answers_are_packed(served: Served) -> None:
     url = f"/api/runs/{served.id('run')}"
     with served.client.stream("GET", url, headers={"Accept-Encoding": "gzip"}) as answer:
         assert gzip.decompress(b"".join(answer.iter_raw())) == served.client.get(url).content
+
+
+def test_what_was_measured_and_its_pictures_are_of_the_run_alone(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    with serving(tmp_path) as server:
+        path = f"/api/runs/{server.id('run')}/findings"
+        empty: dict[str, Any] = {
+            "metrics": None,
+            "seams": [],
+            "colors": [],
+            "moves": [],
+            "movers": [],
+            "pictures": [],
+        }
+        assert server.get(path) == empty
+        write_json(
+            folder.metrics, {"mean": {"psnr": 20.0}, "views": {"a.jpg": {"psnr": 20.0, "lpips": None}}}
+        )
+        write_json(folder.mover_shares, {"panoramas": [{"name": f"{i}.jpg", "share": 0.1} for i in range(2)]})
+        folder.mover_picture("0.jpg").parent.mkdir(parents=True)
+        cv2.imwrite(str(folder.mover_picture("0.jpg")), np.zeros((8, 16, 3), np.uint8))
+        (tmp_path / "secret.jpg").write_bytes(folder.mover_picture("0.jpg").read_bytes())
+        folder.mover_picture("1.jpg").symlink_to(tmp_path / "secret.jpg")
+        found = server.get(path)
+        assert found["metrics"]["views"] == {"a.jpg": {"psnr": 20.0, "lpips": None}}
+        assert found["pictures"] == ["mover-0.jpg"]
+        assert server.client.get(f"{path}/mover-0.jpg").headers["content-type"] == "image/jpeg"
+        for name in ("mover-1.jpg", "mover-7.jpg", "..%2Frun.json"):
+            assert server.client.get(f"{path}/{name}").status_code == 404
+        folder.metrics.write_bytes(b'{"mean": 3}')
+        assert "metrics.json: is damaged" in server.errors(path, 404)

@@ -8,16 +8,12 @@ import plotly.graph_objects as go  # type: ignore[import-untyped]
 import pytest
 from numpy.typing import NDArray
 
-from panolog.orchestrator.run.records import BlockPlan, Progressed
-from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.orchestrator.views import figures, plan_map
 from panolog.orchestrator.views.palette import SEAM_GRADES
-from panolog.orchestrator.views.summary import summarize
 from panolog.partition.cells import Grid
 from panolog.partition.contraction import contract
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.scene.ply import write_ply
-from panolog.workers.tasks import TaskId
 from tests.scene.test_ply import gaussians
 
 GRID = Grid((3, 2, 2))
@@ -46,7 +42,7 @@ def trace(figure: figures.Figure, name: str) -> dict[str, Any]:
 
 
 def test_plotly_takes_the_figure_and_json_too(plan: Plan) -> None:
-    figure = figures.map_figure(plan, POINTS, {0: ("running", 0.5)})
+    figure = figures.map_figure(plan, POINTS)
     go.Figure({"data": figure["data"], "layout": figure["layout"]})  # checks every name and value
     json.dumps(figure, allow_nan=False)
 
@@ -54,7 +50,7 @@ def test_plotly_takes_the_figure_and_json_too(plan: Plan) -> None:
 def test_each_pixel_has_the_block_of_its_place(plan: Plan) -> None:
     figure = figures.map_figure(plan, POINTS)
     cells, blocks = trace(figure, "blocks"), figure["blocks"]
-    ids = unpacked(cells["customdata"])
+    ids = unpacked(cells["z"]) + blocks["layer"] * blocks["stride"]
     assert (blocks["layers"], blocks["stride"], blocks["count"]) == (2, 6, 12)
     rows, columns = np.random.default_rng(2).integers(0, ids.shape, (200, 2)).T
     height = plan.aabb.center[2] + (0.1 if blocks["layer"] else -0.1) * plan.aabb.half[2]
@@ -65,43 +61,12 @@ def test_each_pixel_has_the_block_of_its_place(plan: Plan) -> None:
     assert (ids[rows, columns] == expected).mean() > 0.98  # but for pixels that a face crosses
 
 
-def test_a_block_is_filled_from_below_as_far_as_it_is_done(plan: Plan) -> None:
-    blocks = plan_map.window_on(plan, POINTS).cells
-    statuses = {0: ("running", 0.25), 1: ("done", 1.0), 2: ("failed", 0.0)}
-    codes = plan_map.filled(blocks, statuses)
-    for block, (name, share) in statuses.items():
-        mine = codes[blocks == block]
-        assert set(mine // 2) == {plan_map.BLOCK_STATUSES.index(name)}
-        assert (mine % 2).mean() == pytest.approx(share, abs=0.01)
-    height = [rows.mean() for rows in (np.nonzero((blocks == 0) & (codes % 2 == full))[0] for full in (1, 0))]
-    assert height[0] < height[1]
-    assert set(codes[blocks == 5]) == {0}  # nothing is known of it
-
-
 def test_cameras_have_a_ring_for_each_further_block_and_names_that_stay_text(plan: Plan) -> None:
     figure = figures.map_figure(plan, POINTS)
     served = plan.assignment.assigned.sum(axis=1)
     for ring in (1, 2):
         assert len(trace(figure, f"cameras, ring {ring}")["x"]) == (served > ring).sum()
     assert trace(figure, "cameras")["text"][0].startswith("&lt;b&gt;0&lt;/b&gt;.jpg<br>trains block")
-
-
-def test_statuses_are_those_of_the_summary() -> None:
-    def task(block: int, status: Status, iteration: int | None = None) -> TaskState:
-        name = TaskId.block(block)
-        progress = None if iteration is None else Progressed(name, iteration, 10, 1.0)
-        return TaskState(name, status, progress=progress)
-
-    plan = tuple(BlockPlan(b, 1, 1, train=b != 3) for b in range(5))
-    tasks = [task(0, Status.DONE, 10), task(1, Status.PAUSED, 5), task(2, Status.RUNNING)]
-    state = RunState({task.id: task for task in tasks}, plan)
-    assert plan_map.block_statuses(summarize(state, running=True)) == {
-        0: ("done", 1.0),
-        1: ("paused", 0.5),
-        2: ("running", 0.0),
-        3: ("kept", 1.0),
-        4: ("waiting", 0.0),
-    }
 
 
 def test_points_of_a_model_are_thinned_and_without_sky(tmp_path: Path) -> None:
@@ -122,6 +87,10 @@ def test_faces_have_the_colour_of_their_seam_the_worst_above(plan: Plan) -> None
         SEAM_GRADES["clear"][1],
     ]
     assert "blocks 0 and 1: 9.00" in lines[-1]["text"]
+    assert figure["blocks"]["grades"] == [
+        ["seam below 1.5", SEAM_GRADES["hardly"][1]],
+        ["seam 3 and more", SEAM_GRADES["clear"][1]],
+    ]
     go.Figure({"data": figure["data"], "layout": figure["layout"]})
     x, y = (np.array(lines[-1][axis]) for axis in "xy")
     inside = np.abs(y - plan.aabb.center[1]) < 0.9 * plan.aabb.half[1]

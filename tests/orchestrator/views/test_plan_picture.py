@@ -6,7 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from matplotlib.text import Annotation
 
 from panolog.orchestrator.views.plan_picture import plan_figure, write_plan_picture
 from panolog.partition.cells import Grid
@@ -54,8 +53,7 @@ def test_the_picture_is_full_and_nothing_lies_over_anything_else(tmp_path: Path,
     assert legend.get_window_extent().x0 >= 0
     assert legend.get_window_extent().x1 <= figure.bbox.width
     assert whole.y1 < figure.texts[0].get_window_extent().y0  # the title
-    labels = [child for child in axes.get_children() if isinstance(child, Annotation)]
-    boxes = [patch.get_window_extent() for label in labels if (patch := label.get_bbox_patch())]
+    boxes = [patch.get_window_extent() for label in axes.texts if (patch := label.get_bbox_patch())]
     assert len(boxes) >= min(4, plan.grid.count)
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
     pair = [k for k in range(3) if k != int(np.argmin(np.ptp(plan.centers, axis=0)))]

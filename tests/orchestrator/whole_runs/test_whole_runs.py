@@ -31,6 +31,7 @@ from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from tests.examples.test_examples import example
 from tests.orchestrator.cli.program import call, shown
+from tests.orchestrator.views.pages.snapshots import snapshot_of
 
 pytestmark = pytest.mark.system
 
@@ -195,7 +196,8 @@ def test_a_limit_delivers_what_there_is_and_without_it_the_bytes_are_the_same(
         assert (limited.outcome, limited.status(TaskId.block(1))) == ("limited", "waiting")
         assert limited.merged is not None
         assert (limited.metrics or {})["psnr"] is not None
-        assert "<h2>Cost</h2>" in RunFolder(root).report.read_text()
+        reported = snapshot_of(RunFolder(root).report.read_text())["stream"]["run"]["summary"]
+        assert reported["money"]["used"]["cost"] == limited.money.used.cost
         resumed(root)
         assert state_of(root) == limited
         resumed(root, "none")

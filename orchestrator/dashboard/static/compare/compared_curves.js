@@ -1,10 +1,10 @@
-// The curves of all runs of a comparison on one axis. Also part of a report of several runs.
+// The curves of all runs of a comparison on one axis.
 
 /** @import { ComparedRun, CurvesOfRuns, StageCurves } from "../shared/messages.js" */
-import { CHARTS, chartLayout, chartTitle } from "../shared/charts.js";
-import { byId, el, replaceIfChanged, setMessage } from "../shared/dom.js";
-import { draw, themed } from "../run/plot.js";
-import { runMark } from "./tables.js";
+import { CHARTS, chartLayout, chartTitle } from "panolog/shared/charts.js";
+import { byId, el, replaceIfChanged, setMessage } from "panolog/shared/dom.js";
+import { draw, themed } from "panolog/shared/plot.js";
+import { runMark } from "panolog/compare/tables.js";
 
 const COMPARED = CHARTS.filter(({ key }) => ["loss", "psnr", "gaussians"].includes(key));
 /** The title of each axis. @type {{iterations: string, minutes: string}} */

@@ -1,12 +1,12 @@
 // The held-out panoramas of a comparison: a slider between any two of the runs and the ground truth, and the metrics of
-// each panorama. Also part of a report of several runs.
+// each panorama.
 
 /** @import { ComparedView, Comparison } from "../shared/messages.js" */
 /** @import { Side } from "../shared/compare.js" */
-import { comparison, projections } from "../shared/compare.js";
-import { byId, el, replaceIfChanged, setText } from "../shared/dom.js";
-import { count, fixed } from "../shared/format.js";
-import { METRICS, differenceMark, runMark } from "./tables.js";
+import { comparison, projections } from "panolog/shared/compare.js";
+import { byId, el, replaceIfChanged, setText } from "panolog/shared/dom.js";
+import { METRICS, count, fixed } from "panolog/shared/format.js";
+import { differenceMark, runMark } from "panolog/compare/tables.js";
 
 const TRUTH = "truth";
 

@@ -1,11 +1,11 @@
 // The page that compares runs: which ones the address says, and it follows them while they train.
 
 /** @import { ComparedRun, Comparison, RunList } from "../shared/messages.js" */
-import { connectionLine, get, messageOf, statusOf, stream } from "../shared/api.js";
-import { byId, el, replaceIfChanged, setMessage, throttled } from "../shared/dom.js";
-import { comparedCurves } from "./compared_curves.js";
-import { heldOut } from "./held_out.js";
-import { runMark, showFacts, showMetrics, showSettings, showWarnings } from "./tables.js";
+import { connectionLine, get, messageOf, snapshot, statusOf, stream } from "panolog/shared/api.js";
+import { byId, el, replaceIfChanged, setMessage, throttled } from "panolog/shared/dom.js";
+import { comparedCurves } from "panolog/compare/compared_curves.js";
+import { heldOut } from "panolog/compare/held_out.js";
+import { runMark, showFacts, showMetrics, showSettings, showWarnings } from "panolog/compare/tables.js";
 
 const POLL = 2000; // milliseconds between two readings of runs that train
 const CURVES = 5000; // the same of their curves
@@ -37,7 +37,7 @@ function show() {
   byId("content").hidden = false;
   byId("missing").hidden = true;
   document.title = `${runs.map(({ name }) => name).join(" | ")} · PanoLOG`;
-  replaceIfChanged(byId("chosen"), runs.map(({ id, name, error, color }) => [id, name, error, color]), () => runs.map(chosenItem));
+  if (!snapshot) replaceIfChanged(byId("chosen"), runs.map(({ id, name, error, color }) => [id, name, error, color]), () => runs.map(chosenItem));
   showWarnings(known);
   showFacts(known, lost !== null);
   showMetrics(known);

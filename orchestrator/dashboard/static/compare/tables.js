@@ -1,18 +1,9 @@
-// The tables of a comparison: what the runs are, their metrics, and the settings that differ. Also part of a report of
-// several runs.
+// The tables of a comparison: what the runs are, their metrics, and the settings that differ.
 
 /** @import { ComparedRun, Comparison, DifferentSetting, MetricView, Trained } from "../shared/messages.js" */
-import { bar, byId, el, pill, replaceIfChanged, setPill } from "../shared/dom.js";
-import { bytes, count, duration, fixed, percent } from "../shared/format.js";
+import { bar, byId, el, pill, replaceIfChanged, setPill } from "panolog/shared/dom.js";
+import { METRICS, bytes, count, duration, fixed, percent } from "panolog/shared/format.js";
 
-/** The metrics in their order, with how they are shown. @type {{key: string, label: string, unit: string, digits: number, lower: boolean}[]} */
-export const METRICS = [
-  { key: "ws_psnr", label: "WS-PSNR", unit: "dB", digits: 2, lower: false },
-  { key: "psnr", label: "PSNR", unit: "dB", digits: 2, lower: false },
-  { key: "ssim", label: "SSIM", unit: "", digits: 4, lower: false },
-  { key: "ws_ssim", label: "WS-SSIM", unit: "", digits: 4, lower: false },
-  { key: "lpips", label: "LPIPS", unit: "less is better", digits: 4, lower: true },
-];
 const MISSING = "–";
 
 /** The colour of a run's curves, as a mark. @param {ComparedRun} run */

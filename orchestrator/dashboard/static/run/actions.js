@@ -2,10 +2,10 @@
 
 /** @import { Actions, NodeView, RunPage } from "../shared/messages.js" */
 /** @import { Row } from "./rows.js" */
-import { messageOf, post } from "../shared/api.js";
-import { confirm } from "../shared/confirm.js";
-import { byId, el, replaceIfChanged, setMessage } from "../shared/dom.js";
-import { taskLabel } from "../shared/format.js";
+import { messageOf, post } from "panolog/shared/api.js";
+import { confirm } from "panolog/shared/confirm.js";
+import { byId, el, replaceIfChanged, setMessage } from "panolog/shared/dom.js";
+import { taskLabel } from "panolog/shared/format.js";
 
 /** @typedef {"stop" | "resume" | "pause" | "unpause" | "retry" | "release"} Action */
 

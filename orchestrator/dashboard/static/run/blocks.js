@@ -2,9 +2,9 @@
 
 /** @import { Choose } from "./run.js" */
 /** @import { Row } from "./rows.js" */
-import { addHeadings, bar, byId, childrenOf, compare, el, first, markSorted, matches, pill, setBar, setPill, setText } from "../shared/dom.js";
-import { bytes, count, duration, fixed, short, significant, taskLabel } from "../shared/format.js";
-import { lastError } from "./rows.js";
+import { addHeadings, bar, byId, childrenOf, compare, el, first, markSorted, matches, pill, setBar, setPill, setText } from "panolog/shared/dom.js";
+import { bytes, count, duration, fixed, short, significant, taskLabel } from "panolog/shared/format.js";
+import { STATES, lastError } from "panolog/run/rows.js";
 
 const ROW = 44; // pixels, as in run.css
 const MARGIN = 8; // rows beyond each edge
@@ -23,6 +23,8 @@ const COLUMNS = [
   { key: "iteration", label: "Iteration", value: (row) => row.share, number: true },
   { key: "rate", label: "it/s", value: rate, text: (row) => fixed(rate(row), 1), number: true },
   { key: "eta", label: "ETA", value: (row) => row.eta, text: (row) => duration(row.eta), number: true },
+  { key: "seconds", label: "Time", value: (row) => row.seconds, text: (row) => duration(row.seconds), number: true },
+  { key: "cameras", label: "Cameras", value: (row) => row.plan?.cameras, text: (row) => count(row.plan?.cameras), number: true },
   { key: "loss", label: "Loss", value: (row) => row.loss, text: (row) => significant(row.loss), number: true },
   { key: "psnr", label: "PSNR", value: (row) => row.psnr, text: (row) => fixed(row.psnr), number: true },
   { key: "gaussians", label: "Gaussians", value: gaussians, text: (row) => short(gaussians(row)), number: true },
@@ -83,7 +85,7 @@ export function blockTable(choose) {
     const [chip, name] = childrenOf(cells[0]);
     chip.style.background = view.color(row.block);
     setText(name, taskLabel(row.name));
-    setPill(childrenOf(cells[1])[0], row.status);
+    setPill(childrenOf(cells[1])[0], row.status, STATES[row.status]);
     const [iterations, progress] = childrenOf(cells[2]);
     setText(iterations, row.iterations ? `${count(row.iteration ?? 0)} / ${count(row.iterations)}` : "–");
     setBar(progress, row.kept ? 0 : row.share, `progress of ${taskLabel(row.name)}`);
@@ -112,9 +114,10 @@ export function blockTable(choose) {
   search.addEventListener("input", () => { scroll.scrollTop = 0; arrange(); });
 
   return {
-    /** @param {Row[]} rows */
-    update(rows) {
+    /** @param {Row[]} rows @param {boolean} running whether the run is */
+    update(rows, running) {
       view.rows = rows;
+      byId("block-table").classList.toggle("ended", !running);
       const groups = Object.groupBy(rows.filter((row) => row.block >= 0), (row) => row.status);
       setText(byId("tally"), Object.entries(groups).map(([status, some]) => `${some?.length} ${status}`).join(" · "));
       arrange();

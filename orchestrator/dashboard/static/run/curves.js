@@ -4,13 +4,13 @@
 /** @import { RunEvent } from "../shared/messages.js" */
 /** @import { BlockTable } from "./blocks.js" */
 /** @import { Row } from "./rows.js" */
-import { get, statusOf } from "../shared/api.js";
-import { CHARTS, chartLayout, chartTitle, chartTraces, narrow } from "../shared/charts.js";
-import { byId, el, replaceIfChanged, throttled, token } from "../shared/dom.js";
-import { taskLabel } from "../shared/format.js";
-import { draw, themed } from "./plot.js";
+import { get, statusOf } from "panolog/shared/api.js";
+import { CHARTS, chartLayout, chartTitle, chartTraces, narrow } from "panolog/shared/charts.js";
+import { byId, el, replaceIfChanged, throttled, token } from "panolog/shared/dom.js";
+import { taskLabel } from "panolog/shared/format.js";
+import { draw, themed } from "panolog/shared/plot.js";
 
-const POINTS = 600;
+const POINTS = 600; // of a curve, as the server sends it
 const FIRST = 4; // curves that are shown by default
 const MOST = 8;
 
@@ -35,7 +35,7 @@ export function curves(path, table) {
   /** @param {string} task */
   async function load(task) {
     try {
-      data.set(task, await get(`${path}/series?task=${encodeURIComponent(task)}&points=${POINTS}`));
+      data.set(task, await get(`${path}/series?task=${encodeURIComponent(task)}`));
       soon();
     } catch (error) {
       if (statusOf(error) !== 404) throw error; // nothing to show yet

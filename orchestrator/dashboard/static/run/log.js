@@ -1,9 +1,9 @@
 // The events of a run, newest first, with filters. Progress is left out by default: there is too much of it.
 
 /** @import { EventList, RunEvent, RunPage } from "../shared/messages.js" */
-import { get, messageOf } from "../shared/api.js";
-import { byId, el, replaceIfChanged, setText, throttled } from "../shared/dom.js";
-import { bytes, clock, count, decibel, duration, fixed, significant, taskLabel } from "../shared/format.js";
+import { get, messageOf, snapshot } from "panolog/shared/api.js";
+import { byId, el, replaceIfChanged, setText, throttled } from "panolog/shared/dom.js";
+import { bytes, clock, count, decibel, duration, fixed, significant, taskLabel } from "panolog/shared/format.js";
 
 const PAGE = 100;
 const KEPT = 2000; // events in the page at most
@@ -22,6 +22,8 @@ const TYPES = {
   TaskFailed: ["Failed", (e) => `attempt ${e.attempt}: ${e.reason}; ${e.then || (e.final ? "given up" : "trying again")}`],
   Merged: ["Merged", (e) => `${count(e.gaussians)} Gaussians, ${count(e.sky)} of them sky, ${bytes(e.size)}`],
   ViewEvaluated: ["View", (e) => `${e.view}: PSNR ${decibel(e.metrics.psnr)}, SSIM ${fixed(e.metrics.ssim, 4)}`],
+  SeamEvaluated: ["Seam", (e) => `blocks ${e.face}: ${fixed(e.seam)}`],
+  Delivered: ["Delivered", (e) => (e.path ? `${e.path}, ${bytes(e.size)}, after ${duration(e.seconds)}` : "")],
   MeasuresSaved: ["Measures", (e) => `${count(e.views)} panoramas, ${count(e.faces)} seams`],
   EvaluationSaved: ["Metrics", (e) => `PSNR ${decibel(e.metrics.psnr)}, SSIM ${fixed(e.metrics.ssim, 4)}`],
   Transferred: ["Moved", (e) => `${bytes(e.received)} received, ${bytes(e.sent)} sent`],
@@ -84,10 +86,10 @@ export function log(path) {
     const request = ++requests;
     try {
       /** @type {EventList} */
-      const answer = await get(query(before));
+      const answer = await get(snapshot ? `${path}/events` : query(before));
       if (request !== requests) return;
       if (!before) list.replaceChildren();
-      list.append(...answer.events.map(line));
+      list.append(...answer.events.filter(passes).map(line));
       oldest = answer.next ?? answer.events.at(-1)?.id ?? oldest;
       older.hidden = !answer.more;
       setText(empty, list.children.length || answer.more ? "" : "No events.");

@@ -3,12 +3,12 @@
 /** @import { Chart, MapFigure, Trace } from "../shared/plotly.js" */
 /** @import { RunPage } from "../shared/messages.js" */
 /** @import { Choose } from "./run.js" */
-import { get, messageOf } from "../shared/api.js";
-import { narrow } from "../shared/charts.js";
-import { byId, el, setText, throttled, token } from "../shared/dom.js";
-import { percent } from "../shared/format.js";
-import { draw, plotly, themed, unpack } from "./plot.js";
-import { BLOCK_STATUSES } from "./rows.js";
+import { get, messageOf } from "panolog/shared/api.js";
+import { narrow } from "panolog/shared/charts.js";
+import { byId, el, setText, throttled, token } from "panolog/shared/dom.js";
+import { percent } from "panolog/shared/format.js";
+import { draw, plotly, themed, unpack } from "panolog/shared/plot.js";
+import { BLOCK_STATUSES, STATES } from "panolog/run/rows.js";
 
 const STEP = 1.6; // of one zoom
 const PAUSE = 900; // milliseconds between two drawings
@@ -85,7 +85,7 @@ export function planMap(path, choose) {
     }
     const { layers, layer, colors } = figure.blocks;
     for (const item of cameras()) item.meta = item.marker.size;
-    base = { cells: unpack(trace("blocks").customdata), labels: trace("labels").customdata };
+    base = { cells: unpack(trace("blocks").z), labels: trace("labels").customdata };
     levels = levelsOf(base.cells);
     byId("layer-label").hidden = layers < 2;
     layerSelect.replaceChildren(...Array.from({ length: layers }, (_, i) => el("option", { value: i }, `${i + 1} of ${layers}`)));
@@ -93,6 +93,10 @@ export function planMap(path, choose) {
     shift(figure);
     byId("map-empty").hidden = true;
     byId("legend").hidden = false;
+    byId("legend").replaceChildren(
+      ...BLOCK_STATUSES.map((status) => el("li", { "data-block-status": status }, `${MARKS[status] ?? ""} ${STATES[status] ?? status}`)),
+      ...figure.blocks.grades.map(([text, color]) => el("li", { class: "grade", style: `--tone: ${color}` }, text)),
+    );
     const [across, up] = [figure.layout.xaxis, figure.layout.yaxis].map(({ range: [low, high] }) => high - low);
     plot.style.setProperty("--shape", String(across / up));
     plot.hidden = false; // before it is drawn: plotly measures it
@@ -161,11 +165,7 @@ export function planMap(path, choose) {
 
   /** Applies the theme, the width of the page and what is selected. */
   function style() {
-    const blocks = trace("blocks"); // invisible, for the pointer
-    blocks.colorscale = [[0, "rgba(0,0,0,0)"], [1, "rgba(0,0,0,0)"]];
-    blocks.customdata = cells;
-    blocks.hoverinfo = "none";
-    delete blocks.hovertemplate;
+    trace("blocks").customdata = cells; // invisible, for the pointer
     const [ink, surface, text, line] = ["--points", "--surface", "--ink", "--line-strong"].map(token);
     trace("points").colorscale = [[0, withAlpha(ink, 0)], [0.02, withAlpha(ink, 0.3)], [1, withAlpha(ink, 0.95)]];
     for (const name of ["faces", "box"]) trace(name).line.color = line;
@@ -236,7 +236,6 @@ export function planMap(path, choose) {
   narrow.addEventListener("change", render);
   // Also when the window stays as it is: a scroll bar that appears makes the card narrower.
   new ResizeObserver(async () => { if (plot.layout && plot.offsetWidth) (await plotly()).Plots.resize(plot); }).observe(plot);
-  byId("legend").append(...BLOCK_STATUSES.filter((status) => status !== "kept").map((status) => el("li", { "data-block-status": status }, `${MARKS[status] ?? ""} ${status}`)));
 
   return {
     /** @param {RunPage} run @param {Map<number, [string, number]>} current */

@@ -2,8 +2,9 @@
 
 /** @import { ActionButtons } from "./actions.js" */
 /** @import { NodeView, RunPage, SettingView, StageView, SummaryHead, UsageView } from "../shared/messages.js" */
-import { bar, byId, childrenOf, el, first, pill, reconcile, replaceIfChanged, setBar, setMessage, setPill, setText } from "../shared/dom.js";
-import { ago, bytes, clock, decibel, duration, fixed, percent, shellWord, short, taskLabel } from "../shared/format.js";
+import { snapshot } from "panolog/shared/api.js";
+import { bar, byId, childrenOf, el, first, pill, reconcile, replaceIfChanged, setBar, setMessage, setPill, setText, table } from "panolog/shared/dom.js";
+import { ago, bytes, clock, count, decibel, duration, fixed, percent, shellWord, short, significant, taskLabel } from "panolog/shared/format.js";
 
 const REFRESH = 5000; // milliseconds between two updates of times without a message
 const FULL = 0.9; // share of what a machine has from which on little is left
@@ -42,10 +43,28 @@ function costs(money) {
   ];
 }
 
+/** What the machines of each kind have cost. @param {SummaryHead["money"]} money */
+function showCost(money) {
+  byId("cost").hidden = byId("to-cost").hidden = !money || money.used.cost === null;
+  if (!money) return;
+  replaceIfChanged(byId("cost-table"), money, () => [table(money.kinds, [
+    ["Machine", ({ kind }) => kind],
+    ["Machines", (kind) => count(kind.count), "number"],
+    [`${money.currency} per hour`, ({ price }) => significant(price), "number"],
+    ["Hours", ({ used }) => fixed(used.seconds / 3600), "number"],
+    ["Cost", ({ used }) => fixed(used.cost), "number"],
+    ["Idle", ({ idle }) => fixed(idle.cost), "number"],
+    ["Lost", ({ lost }) => fixed(lost.cost), "number"],
+  ])]);
+}
+
 /** What to do about a run that ended before it was done. @param {RunPage} run @returns {[string, string] | null} */
-function hint({ summary: { status, stage }, latest, path }) {
+function hint({ summary: { status, stage }, progress, eta, latest, path }) {
   const resume = `panolog resume ${shellWord(path)}`;
   const kept = stage === "prepare" ? "What is done is kept" : "The checkpoints are kept";
+  if (snapshot && status === "running") {
+    return [`The run was still running when this was written: ${percent(progress)} done${eta === null ? "" : `, about ${duration(eta)} left`}. To write it again:`, `panolog report ${shellWord(path)}`];
+  }
   const last = latest ? ` Last update: ${clock(latest)}, ${ago(latest)}.` : "";
   if (status === "stopped") return [`${kept}.${last} To resume the run:`, resume];
   if (status === "limited") return ["A limit has ended the training early; the model is what there was. To complete the run, also with a higher limit:", `${resume} --max-cost none --deadline none`];
@@ -70,7 +89,8 @@ function fillStage(node, stage, now, live) {
   setText(name, stage.label);
   const time = stage.began && (stage.ended || running) ? duration((stage.ended ?? now) - stage.began) : "";
   const tally = stage.tasks > 1 && stage.status !== "done" ? `${stage.done} of ${stage.tasks}` : "";
-  setText(note, [live || !running ? stage.status : "last state: running", tally, time].filter(Boolean).join(" · "));
+  const from = stage.began ? `from ${clock(stage.began)}` : "";
+  setText(note, [live || !running ? stage.status : "last state: running", tally, time, from].filter(Boolean).join(" · "));
   setBar(progress, stage.status === "done" ? 1 : stage.progress, `progress of ${stage.label}`);
 }
 
@@ -100,6 +120,7 @@ export function overview() {
     reconcile(byId("facts"), facts(run, live, running ? since : 0), ([label]) => label, () => el("div", {}, el("dt"), el("dd")), (node, fact) => {
       childrenOf(node).forEach((child, i) => setText(child, fact[i]));
     });
+    showCost(summary.money);
     reconcile(byId("stages"), run.stages, (stage) => stage.name, makeStage, (node, stage) => fillStage(node, stage, running ? run.now + since : run.latest ?? run.now, live));
   }
 
@@ -218,7 +239,8 @@ export function settings() {
     update(run) {
       config = run.config;
       const versions = Object.entries(run.info.versions ?? {}).map(([name, version]) => `${name} ${version}`);
-      setText(byId("versions"), [`created ${run.info.created ?? "?"}`, ...versions].join(" · "));
+      const { created, seed, scene } = run.info;
+      setText(byId("versions"), [`created ${created ?? "?"}`, ...versions, `seed ${seed ?? "?"}`, `scene ${scene?.fingerprint ?? "?"}`].join(" · "));
       show();
     },
   };

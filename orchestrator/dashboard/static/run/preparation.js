@@ -1,8 +1,9 @@
 // How a run makes its scene of panoramas or of a video: its steps, what the reconstruction has kept, and pictures.
 
 /** @import { PictureView, PreparationView, RunPage, StepView } from "../shared/messages.js" */
-import { bar, byId, childrenOf, el, reconcile, replaceIfChanged, setBar, setMessage, setText } from "../shared/dom.js";
-import { count, duration } from "../shared/format.js";
+import { snapshot, urlOf } from "panolog/shared/api.js";
+import { bar, byId, childrenOf, el, reconcile, replaceIfChanged, setBar, setMessage, setText } from "panolog/shared/dom.js";
+import { count, duration } from "panolog/shared/format.js";
 
 /** What is known of the panoramas. @param {PreparationView} view @returns {[string, string][]} */
 function numbers({ video, frames, panoramas, registered, points, weak_links, contradictions }) {
@@ -40,9 +41,9 @@ function fillStep(node, step, live) {
 
 /** @param {string} path of the run below /api @param {PictureView} picture */
 function figure(path, { name, label, version }) {
-  const url = `/api/${path}/preparation/${name}?${version}`;
+  const url = urlOf(`${path}/preparation/${name}?${version}`);
   const image = el("img", { src: url, alt: label, loading: "lazy" });
-  return el("figure", {}, el("a", { href: url, target: "_blank" }, image), el("figcaption", {}, label));
+  return el("figure", {}, snapshot ? image : el("a", { href: url, target: "_blank" }, image), el("figcaption", {}, label));
 }
 
 /** @param {string} path of the run below /api */

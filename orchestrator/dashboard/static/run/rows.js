@@ -1,15 +1,18 @@
 // The rows of the block table: Stage I and all blocks of the plan, and the status of each block on the map.
 
 /** @import { BlockView, RunPage, Status, TaskView } from "../shared/messages.js" */
-import { blockTask } from "../shared/format.js";
+import { blockTask } from "panolog/shared/format.js";
 
 /**
  * A row: a task, which has few fields before it starts. `block` is -1 for all but blocks, `place` that in the order of the stages, `kept` is a block that is not trained.
  * @typedef {Partial<Omit<TaskView, "status">> & {name: string, status: Status | "kept" | "pausing", share: number, block: number, place: number, plan?: BlockView, kept: boolean, device: string}} Row
  */
 
-/** As in orchestrator/views/plan_map.py; "kept" is not trained. */
+/** The statuses of a block; "kept" is not trained. */
 export const BLOCK_STATUSES = ["waiting", "running", "paused", "done", "failed", "kept"];
+
+/** Statuses by which people read them, where that is another word. @type {Record<string, string>} */
+export const STATES = { kept: "as Stage I left it" };
 
 /**
  * The status of each block and its share done, 0 to 1.

@@ -1,22 +1,23 @@
 // The page of one run: passes the server's messages to its parts.
 
 /** @import { EventList, RunChanges, RunPage } from "../shared/messages.js" */
-import { connectionLine, get, messageOf, statusOf, stream } from "../shared/api.js";
-import { byId, setMessage } from "../shared/dom.js";
-import { shellWord } from "../shared/format.js";
-import { actions } from "./actions.js";
-import { blockTable } from "./blocks.js";
-import { curves } from "./curves.js";
-import { exposures } from "./exposures.js";
-import { log } from "./log.js";
-import { planMap } from "./map.js";
-import { machines, overview, settings } from "./overview.js";
-import { preparation } from "./preparation.js";
-import { blockStatuses, trainingRows } from "./rows.js";
-import { selection } from "./selection.js";
-import { views } from "./views.js";
+import { connectionLine, get, messageOf, snapshot, statusOf, stream } from "panolog/shared/api.js";
+import { byId, setMessage } from "panolog/shared/dom.js";
+import { shellWord } from "panolog/shared/format.js";
+import { actions } from "panolog/run/actions.js";
+import { blockTable } from "panolog/run/blocks.js";
+import { curves } from "panolog/run/curves.js";
+import { exposures } from "panolog/run/exposures.js";
+import { findings } from "panolog/run/findings.js";
+import { log } from "panolog/run/log.js";
+import { planMap } from "panolog/run/map.js";
+import { machines, overview, settings } from "panolog/run/overview.js";
+import { preparation } from "panolog/run/preparation.js";
+import { blockStatuses, trainingRows } from "panolog/run/rows.js";
+import { selection } from "panolog/run/selection.js";
+import { views } from "panolog/run/views.js";
 
-const id = encodeURIComponent(location.pathname.split("/").filter(Boolean).pop() ?? "");
+const id = snapshot ? "report" : encodeURIComponent(location.pathname.split("/").filter(Boolean).pop() ?? "");
 const path = `runs/${id}`;
 
 /**
@@ -46,6 +47,11 @@ const choose = {
     pictures.choose(task);
     byId("views").scrollIntoView();
   },
+  /** @param {string} name of a held-out panorama */
+  view(name) {
+    pictures.chooseView(name);
+    byId("views").scrollIntoView();
+  },
   /** The map is there. @param {string[]} colors */
   mapped(colors) {
     charts.colors(colors);
@@ -60,6 +66,7 @@ const map = planMap(path, choose);
 const table = blockTable(choose);
 const charts = curves(path, table);
 const exposed = exposures(path);
+const measured = findings(path, choose);
 const selected = selection(path, choose, acts, map);
 const pictures = views(path);
 const events = log(path);
@@ -68,8 +75,8 @@ const options = settings();
 
 /** The run as the server has sent it last. @type {RunPage | null} */
 let known = null;
-/** When the connection was lost, in seconds since the epoch; null while there is one. @type {number | null} */
-let lost = null;
+/** When the connection was lost, in seconds since the epoch; null while there is one. A report has none. @type {number | null} */
+let lost = snapshot ? 0 : null;
 
 /** A run without what was true only when it was sent: times left and speeds. @param {RunPage} run @returns {RunPage} */
 function lastKnown(run) {
@@ -81,17 +88,18 @@ function lastKnown(run) {
 /** @param {RunPage} sent */
 function show(sent) {
   known = sent;
-  const run = lost === null ? sent : lastKnown(sent);
+  const run = lost === null || snapshot ? sent : lastKnown(sent);
   byId("content").hidden = false;
   byId("missing").hidden = true;
   const rows = trainingRows(run);
   head.update(run, lost);
-  acts.update(run);
+  if (!snapshot) acts.update(run);
   prepared.update(run, lost === null);
   map.update(run, blockStatuses(run));
-  table.update(rows);
+  table.update(rows, run.summary.status === "running");
   charts.update(rows);
   exposed.update(run);
+  measured.update(run);
   selected.update(run, rows);
   pictures.update(run);
   events.update(run);

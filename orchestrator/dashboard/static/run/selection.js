@@ -5,10 +5,10 @@
 /** @import { PlanMap } from "./map.js" */
 /** @import { Row } from "./rows.js" */
 /** @import { Choose } from "./run.js" */
-import { get, messageOf } from "../shared/api.js";
-import { bar, byId, el, pill, replaceIfChanged } from "../shared/dom.js";
-import { bytes, count, duration, fixed, percent, short, significant, taskLabel } from "../shared/format.js";
-import { lastError } from "./rows.js";
+import { get, messageOf, snapshot, urlOf } from "panolog/shared/api.js";
+import { bar, byId, el, pill, replaceIfChanged } from "panolog/shared/dom.js";
+import { bytes, count, duration, fixed, percent, short, significant, taskLabel } from "panolog/shared/format.js";
+import { lastError } from "panolog/run/rows.js";
 
 const SCORES = 24; // bars drawn for one camera; of the rest only the number is shown
 const REASONS = {
@@ -19,6 +19,7 @@ const REASONS = {
 
 /** What chose a camera for a block. @type {Record<string, string>} */
 const CRITERIA = { geometry: "geometry", gradient: "gradient", both: "geometry and gradient" };
+const NOTICES = [6, 2_000]; // the latest that are shown, and those that can be
 const OPEN = 12; // cameras of a block up to which their list is open
 
 /**
@@ -31,12 +32,12 @@ const OPEN = 12; // cameras of a block up to which their list is open
 function cameraPictures(path, camera, previews, choose) {
   const broken = el("figcaption", {}, "Panorama");
   const panorama = el("img", {
-    alt: `the panorama ${camera.name}`, src: camera.no_picture ? null : `/api/${path}/camera/${camera.row}/panorama`,
+    alt: `the panorama ${camera.name}`, src: camera.no_picture ? null : urlOf(`${path}/camera/${camera.row}/panorama`),
     on: { error: () => { panorama.remove(); broken.textContent = "Its picture cannot be decoded."; } },
   });
   const renders = previews.filter(({ view }) => view === camera.name).map(({ event, task, iteration }) => {
     const label = `${taskLabel(task)}, iteration ${count(iteration)}`;
-    const image = el("img", { alt: "", src: `/api/${path}/previews/${event}`, loading: "lazy" });
+    const image = el("img", { alt: "", src: urlOf(`${path}/previews/${event}`), loading: "lazy" });
     return el("figure", {}, el("button", { type: "button", class: "picture", on: { click: () => choose.preview(task) } }, image, el("span", {}, label)));
   });
   return el("div", { class: "pictures" },
@@ -84,6 +85,7 @@ function blockNumbers(row) {
     ["Loss", significant(row.loss)],
     ["PSNR, training", fixed(row.psnr)],
     ["Gaussians", short(row.gaussians ?? row.plan?.gaussians)],
+    ["Of Stage I", row.gaussians && row.plan ? short(row.plan.gaussians) : ""],
     ["Cameras", row.plan ? count(row.plan.cameras) : ""],
     ["Memory", bytes(row.memory)],
     ["Checkpoint", row.checkpoint ? `iteration ${count(row.checkpoint)}` : ""],
@@ -102,10 +104,10 @@ function blockNumbers(row) {
 function blockButtons(row, choose, acts) {
   const shows = [
     el("button", { type: "button", on: { click: () => choose.curve(row.name) } }, "Curves"),
-    el("button", { type: "button", on: { click: () => choose.preview(row.name) } }, "Views"),
-    acts.viewer(row.name),
+    !snapshot && el("button", { type: "button", on: { click: () => choose.preview(row.name) } }, "Views"),
+    !snapshot && acts.viewer(row.name),
   ];
-  const block = row.block >= 0;
+  const block = row.block >= 0 && !snapshot;
   return [el("div", { class: "row" }, shows), block && el("div", { class: "row" }, acts.ofBlock(row)), block && acts.whyNot(row)];
 }
 
@@ -135,7 +137,7 @@ export function selection(path, choose, acts, map) {
     });
     replaceIfChanged(parts[1], [key, row?.status, acts.key()], () => {
       if (row) return blockButtons(row, choose, acts);
-      return camera ? [el("div", { class: "row" }, acts.viewer(null, camera.name))] : [];
+      return camera && !snapshot ? [el("div", { class: "row" }, acts.viewer(null, camera.name))] : [];
     });
     replaceIfChanged(parts[2], [key, cameras], () => (camera ? cameraPanel(camera, choose) : cameras ? [cameraList(cameras, choose)] : []));
     if (parts[0].parentElement !== panel) panel.replaceChildren(...parts);
@@ -188,9 +190,15 @@ export function selection(path, choose, acts, map) {
     update(run, current) {
       rows = current;
       show();
-      const notices = run.summary.notices.slice(-6);
-      const list = () => notices.map(({ task, message }) => el("li", {}, el("b", {}, taskLabel(task)), " ", message));
-      replaceIfChanged(byId("notices"), notices, () => (notices.length ? [el("h3", {}, "Notices"), el("ul", { class: "noticed" }, list())] : []));
+      const { notices } = run.summary;
+      /** @param {typeof notices} some */
+      const list = (some) => el("ul", { class: "noticed" }, some.map(({ task, message }) => el("li", {}, el("b", {}, taskLabel(task)), " ", message)));
+      const earlier = notices.slice(-NOTICES[1], -NOTICES[0]);
+      replaceIfChanged(byId("notices"), notices, () => (notices.length ? [
+        el("h3", {}, "Notices"),
+        list(notices.slice(-NOTICES[0])),
+        earlier.length > 0 && el("details", {}, el("summary", {}, `${count(earlier.length)} earlier`), list(earlier)),
+      ] : []));
     },
   };
 }

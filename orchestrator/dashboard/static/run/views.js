@@ -1,10 +1,10 @@
 // Renders next to the photographs: training views of each task over the iterations, and the held-out views at the end.
 
 /** @import { HeldOutView, HeldOutViews, PreviewList, RunEvent, RunPage } from "../shared/messages.js" */
-import { get } from "../shared/api.js";
-import { comparison, projections } from "../shared/compare.js";
-import { byId, el, replaceIfChanged, setText } from "../shared/dom.js";
-import { count, decibel, fixed, taskLabel } from "../shared/format.js";
+import { get, snapshot, urlOf } from "panolog/shared/api.js";
+import { comparison, projections } from "panolog/shared/compare.js";
+import { byId, el, replaceIfChanged, setText } from "panolog/shared/dom.js";
+import { count, decibel, fixed, taskLabel } from "panolog/shared/format.js";
 
 /** @param {HeldOutView} view */
 const heldOutText = ({ name, metrics }) => `${name}, held out: PSNR ${decibel(metrics?.psnr)}, SSIM ${fixed(metrics?.ssim, 4)}, WS-PSNR ${decibel(metrics?.ws_psnr)}`;
@@ -40,6 +40,7 @@ export function views(path) {
     if (!lists) return;
     state.tasks = lists[0].previews.map((preview) => preview.task).sort(byStage);
     state.heldOut = lists[1].views;
+    byId("views").hidden = byId("to-views").hidden = Boolean(snapshot) && !state.heldOut.length;
     replaceIfChanged(source, [state.tasks, state.heldOut.map((view) => view.name)], options);
     if (source.value) await show(source.value);
   }
@@ -56,12 +57,12 @@ export function views(path) {
     source.value = value;
     const view = state.heldOut.find(({ number }) => `view/${number}` === value);
     if (view) {
-      state.frames = [{ url: `/api/${path}/views/${view.number}`, text: heldOutText(view) }];
+      state.frames = [{ url: urlOf(`${path}/views/${view.number}`) ?? "", text: heldOutText(view) }];
     } else {
       /** @type {PreviewList} */
       const { previews } = await get(`${path}/previews?task=${encodeURIComponent(value)}`).catch(() => ({ previews: [] }));
       state.frames = previews.sort((a, b) => a.event - b.event).map((preview) => ({
-        url: `/api/${path}/previews/${preview.event}`, text: `${preview.view}, iteration ${count(preview.iteration)}`,
+        url: urlOf(`${path}/previews/${preview.event}`) ?? "", text: `${preview.view}, iteration ${count(preview.iteration)}`,
       }));
     }
     const last = state.frames.length - 1;
@@ -101,6 +102,11 @@ export function views(path) {
     /** @param {string} task */
     choose(task) {
       if (state.tasks.includes(task)) choose(task);
+    },
+    /** @param {string} name of a held-out panorama */
+    chooseView(name) {
+      const view = state.heldOut.find((one) => one.name === name);
+      if (view) choose(`view/${view.number}`);
     },
     /** @param {RunEvent[]} events */
     add(events) {

@@ -2,11 +2,11 @@
 // by which those that wait are dragged.
 
 /** @import { QueueList, QueueRow } from "../shared/messages.js" */
-import { messageOf, post } from "../shared/api.js";
-import { confirm } from "../shared/confirm.js";
-import { byId, el, first, pill, reconcile, setMessage, setPill, setText } from "../shared/dom.js";
-import { ago } from "../shared/format.js";
-import { draggable } from "./drag.js";
+import { messageOf, post } from "panolog/shared/api.js";
+import { confirm } from "panolog/shared/confirm.js";
+import { byId, el, first, pill, reconcile, setMessage, setPill, setText } from "panolog/shared/dom.js";
+import { ago } from "panolog/shared/format.js";
+import { draggable } from "panolog/runs/drag.js";
 
 /** @typedef {"up" | "down" | "retry" | "remove"} Button */
 /** What each button shows, and what screen readers say; {} is the run. @type {Record<Button, [string, string]>} */

@@ -1,10 +1,10 @@
 // The page of all runs.
 
 /** @import { RunList, RunRow } from "../shared/messages.js" */
-import { connectionLine, stream } from "../shared/api.js";
-import { addHeadings, bar, byId, compare, el, first, markSorted, matches, pill, reconcile, setBar, setPill, setText } from "../shared/dom.js";
-import { showQueue } from "./queue.js";
-import { ago, bytes, duration, fixed, percent, shellWord, short } from "../shared/format.js";
+import { connectionLine, stream } from "panolog/shared/api.js";
+import { addHeadings, bar, byId, compare, el, first, markSorted, matches, pill, reconcile, setBar, setPill, setText } from "panolog/shared/dom.js";
+import { showQueue } from "panolog/runs/queue.js";
+import { ago, bytes, duration, fixed, percent, shellWord, short } from "panolog/shared/format.js";
 
 /** @param {RunRow} run */
 const title = (run) => (run.name === "." ? "this folder" : run.name);

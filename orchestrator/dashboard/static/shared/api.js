@@ -1,7 +1,16 @@
-// All communication with the server.
+// All communication with the server; in a report, what it holds in place of one.
 
-import { byId, setMessage } from "./dom.js";
-import { clock } from "./format.js";
+import { byId, setMessage } from "panolog/shared/dom.js";
+import { clock } from "panolog/shared/format.js";
+
+/**
+ * What a report holds: answers and URLs of pictures by their paths below /api, and the messages of the stream. Null in the dashboard.
+ * @type {{answers: Record<string, any>, stream: Record<string, any>} | null}
+ */
+export const snapshot = JSON.parse(document.getElementById("snapshot")?.textContent ?? "null");
+
+/** The URL of a picture. @param {string} path below /api @returns {string | null} */
+export const urlOf = (path) => (snapshot ? snapshot.answers[path] ?? null : `/api/${path}`);
 
 /** An answer that is an error, with the server's own line. */
 class ApiError extends Error {
@@ -20,6 +29,10 @@ export const statusOf = (error) => (error instanceof ApiError ? error.status : u
 
 /** JSON from a path below /api. Throws an ApiError. @param {string} path @returns {Promise<any>} */
 export async function get(path) {
+  if (snapshot) {
+    if (!(path in snapshot.answers)) throw new ApiError("This report does not hold it: the dashboard shows it.", 404);
+    return snapshot.answers[path];
+  }
   return answer(await fetch(`/api/${path}`, { headers: { Accept: "application/json" } }));
 }
 
@@ -77,6 +90,11 @@ export function connectionLine(changed, known) {
  * @param {Record<string, (message: any) => void>} handlers by kind of event
  */
 export function stream(query, open, lost, handlers) {
+  if (snapshot) {
+    open();
+    for (const [kind, message] of Object.entries(snapshot.stream)) handlers[kind](message);
+    return;
+  }
   /** @type {EventSource | null} */
   let source = null;
   /** @type {number | undefined} */

@@ -1,4 +1,4 @@
-// The curves of tasks that train: loss, PSNR, Gaussians, speed, memory and learning rates. Also part of report.html.
+// The curves of tasks that train: loss, PSNR, Gaussians, speed, memory and learning rates.
 
 /** @import { Series } from "./messages.js" */
 /** @import { Layout } from "./plotly.js" */

@@ -1,7 +1,7 @@
-// Two pictures of a panorama, such as a render and its ground truth: flat with a slider between the two, or as a 360° view. Also part of report.html.
+// Two pictures of a panorama, such as a render and its ground truth: flat with a slider between the two, or as a 360° view.
 
-import { panorama } from "../run/panorama.js";
-import { el } from "./dom.js";
+import { panorama } from "panolog/shared/panorama.js";
+import { el } from "panolog/shared/dom.js";
 
 /** A part of a picture: the ground truth at its bottom, or the render at its top. @typedef {{url: string, truth: boolean, label: string}} Side */
 

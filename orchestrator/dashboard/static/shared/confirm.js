@@ -1,7 +1,7 @@
 // The dialog in which an action is confirmed, on every page that has actions.
 
-import { messageOf } from "./api.js";
-import { byId, el, setText } from "./dom.js";
+import { messageOf } from "panolog/shared/api.js";
+import { byId, el, setText } from "panolog/shared/dom.js";
 
 /** The dialog, which the first call makes. */
 function made() {

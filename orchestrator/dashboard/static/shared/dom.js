@@ -101,7 +101,21 @@ export function replaceIfChanged(parent, key, content) {
   parent.dataset.key = text;
   const focused = parent.contains(document.activeElement) ? document.activeElement?.textContent : null;
   parent.replaceChildren(...content().filter((child) => child !== null && child !== undefined && child !== false));
-  if (focused) /** @type {HTMLElement[]} */ ([...parent.querySelectorAll("button, a")]).find((node) => node.textContent === focused)?.focus();
+  if (focused) /** @type {HTMLElement[]} */ ([...parent.querySelectorAll("button, a")]).find((node) => node.textContent === focused)?.focus({ preventScroll: true });
+}
+
+const ROWS = 2_000; // of a table at most
+
+/**
+ * A table. A column is its label, the content of its cells, and the class of both, such as "number".
+ * @template T
+ * @param {readonly T[]} items
+ * @param {readonly (readonly [string, (item: T) => Child | Child[], string?])[]} columns
+ */
+export function table(items, columns) {
+  const heads = columns.map(([label, , kind]) => el("th", { scope: "col", class: kind }, label));
+  const rows = items.slice(0, ROWS).map((item) => el("tr", {}, columns.map(([, content, kind]) => el("td", { class: kind }, content(item)))));
+  return el("table", {}, el("thead", {}, el("tr", {}, heads)), el("tbody", {}, rows));
 }
 
 /**

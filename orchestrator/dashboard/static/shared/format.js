@@ -52,6 +52,15 @@ export function clock(time) {
 /** A path or another text as a word of a shell command. @param {string} text */
 export const shellWord = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 
+/** The metrics in their order, with how they are shown. @type {{key: string, label: string, unit: string, digits: number, lower: boolean}[]} */
+export const METRICS = [
+  { key: "ws_psnr", label: "WS-PSNR", unit: "dB", digits: 2, lower: false },
+  { key: "psnr", label: "PSNR", unit: "dB", digits: 2, lower: false },
+  { key: "ssim", label: "SSIM", unit: "", digits: 4, lower: false },
+  { key: "ws_ssim", label: "WS-SSIM", unit: "", digits: 4, lower: false },
+  { key: "lpips", label: "LPIPS", unit: "less is better", digits: 4, lower: true },
+];
+
 /** @type {Record<string, string>} */
 const TASKS = { prepare: "preparation", district: "district", coarse: "Stage I", score: "scoring", plan: "partition", block: "block", union: "union", round: "second round of block", repair: "repair of seam", merge: "merge", measure: "measurement", eval: "evaluation", deliver: "delivery", calibrate: "calibration" };
 

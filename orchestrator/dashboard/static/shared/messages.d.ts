@@ -100,6 +100,14 @@ export interface CurvesOfRuns {
   runs: Array<RunCurves>;
 }
 
+/** How far what the two blocks show differs. */
+export interface Difference {
+  color: number | null;
+  psnr: number | null;
+  depth: number | null;
+  opacity: number | null;
+}
+
 /** A setting that is not the same in all runs; `known` is false where a run's version does not have it. */
 export interface DifferentSetting {
   key: string;
@@ -124,12 +132,30 @@ export interface ExposureCurve {
   blue: Array<number>;
 }
 
+/** GET …/findings: the worst first, `colors` of the seams; `pictures` are names for …/findings/{name}. */
+export interface Findings {
+  metrics: HeldOutMetrics | null;
+  seams: Array<Seam>;
+  colors: Array<string | null>;
+  moves: Array<MovedCamera>;
+  movers: Array<MoverShare>;
+  pictures: Array<string>;
+}
+
 /** What a GPU does; `utilization` 0 to 1. */
 export interface GpuUsageView {
   name: string;
   utilization: number | null;
   memory_used: number | null;
   memory_total: number | null;
+}
+
+/** The metrics of held-out panoramas, and their means; `lpips_reason`, why there is no LPIPS. */
+export interface HeldOutMetrics {
+  mean: Record<string, number | null>;
+  views: Record<string, Record<string, number | null>>;
+  pose_fit: PoseFit | null;
+  lpips_reason: string | null;
 }
 
 /** A held-out panorama with its metrics. */
@@ -212,10 +238,25 @@ export interface MoneyView {
   kinds: Array<MachineKindView>;
 }
 
+/** A refined camera: how far it moved in world units, turned in degrees, and moved what it sees. */
+export interface MovedCamera {
+  name: string;
+  moved: number;
+  turned: number;
+  pixels: number;
+  at_bound: boolean;
+}
+
 /** Bytes between machines. */
 export interface MovedView {
   received: number;
   sent: number;
+}
+
+/** A training panorama, and what part of it is left out of the loss because it moves, 0 to 1. */
+export interface MoverShare {
+  name: string;
+  share: number;
 }
 
 /** A machine that tasks have run on, and what runs there now. */
@@ -242,6 +283,11 @@ export interface PictureView {
   name: string;
   label: string;
   version: string;
+}
+
+/** Metrics of held-out panoramas at the poses that fit the model best, `pixels` away on average. */
+export interface PoseFit {
+  mean: Record<string, number | null>;
 }
 
 /** The preparation of a run; the counts are None before there are poses. */
@@ -294,11 +340,22 @@ export interface QueueRow {
   time: number;
 }
 
-/** Which results of a run can be downloaded; `exposure` changes with the exposures, if there are any. */
+/** Error and step of one model at a face, those within the blocks (floor), and the ratios of both. */
+export interface Ratios {
+  error: number | null;
+  error_floor: number | null;
+  error_ratio: number | null;
+  step: number | null;
+  step_floor: number | null;
+  step_ratio: number | null;
+}
+
+/** Which results of a run can be downloaded. */
 export interface Results {
   model: boolean;
   report: boolean;
   exposure: string | null;
+  findings: string;
 }
 
 /** The stream's "changes": what has changed since the last message; of the tasks those that have. */
@@ -391,6 +448,19 @@ export interface SavedPreview {
   iteration: number;
   view: string;
   time: number;
+}
+
+/** A face between two blocks, see `workers.seams.measurement`. */
+export interface Seam {
+  blocks: [number, number];
+  axis: "x" | "y" | "z";
+  at: number;
+  cameras: Array<string>;
+  virtual: number;
+  seam: number | null;
+  merged: Ratios;
+  coarse: Ratios;
+  difference: Difference;
 }
 
 /** A curve: iterations, epoch seconds, values. GET …/series has one for each name. */

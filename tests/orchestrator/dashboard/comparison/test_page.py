@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.records import Record, RunBegan, ViewEvaluated
-from panolog.orchestrator.views.comparison.page import write_page
+from panolog.orchestrator.views.comparison.page import write_comparison
 from panolog.workers.tasks import COARSE, EVAL
 from tests.orchestrator.dashboard.browser import PHONE, SMALL, opened, unreachable
 from tests.orchestrator.dashboard.served import EVIL, Served, append, serving
@@ -191,7 +191,7 @@ def test_all_can_be_read_and_reached_and_names_stay_text(
         raise AssertionError("a script of a run has run")
 
     report = tmp_path / "report.html"
-    write_page([root / name for name in NAMES], report)
+    write_comparison([root / name for name in NAMES], report)
     for url in (url_of(served, *NAMES), report.as_uri()):
         with opened(browser, url, width=PHONE) as page:
             page.on("dialog", frozen)

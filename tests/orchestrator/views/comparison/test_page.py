@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.views.comparison.page import write_page
+from panolog.orchestrator.views.comparison.page import write_comparison
 from panolog.scene.errors import InputError
 from tests.orchestrator.views.comparison.runs import metrics, write, write_picture
-from tests.orchestrator.views.test_report import data, self_contained
+from tests.orchestrator.views.pages.snapshots import self_contained, snapshot_of
 
 JPEG = "data:image/jpeg;base64,"
 
 
 def page_of(tmp_path: Path, *folders: RunFolder) -> str:
     output = tmp_path / "page.html"
-    write_page([folder.root for folder in folders], output)
+    write_comparison([folder.root for folder in folders], output)
     return output.read_text()
 
 
@@ -39,11 +39,10 @@ def test_it_is_one_page_with_all_of_it(tmp_path: Path) -> None:
     page = page_of(tmp_path, first, second)
     assert self_contained(page)
     assert "default-src 'none'" in page
-    assert "Comparison of 2 runs" in page
-    found = data(page)
-    assert [run["name"] for run in found["comparison"]["runs"]] == ["a", "b"]
-    assert [len(run["stages"]) for run in found["curves"]["runs"]] == [2, 2]
-    (view,) = (view for view in found["comparison"]["views"] if view["truth"])
+    found = snapshot_of(page)["answers"]
+    assert [run["name"] for run in found["compare?"]["runs"]] == ["a", "b"]
+    assert [len(run["stages"]) for run in found["compare/curves?"]["runs"]] == [2, 2]
+    (view,) = (view for view in found["compare?"]["views"] if view["truth"])
     assert view["name"] == "b.jpg"
     assert grey(view["pictures"][0]) == (64, 32, 20)
     assert grey(view["pictures"][1]) == (1024, 512, 100)
@@ -54,7 +53,7 @@ def test_the_same_runs_make_the_same_page(tmp_path: Path) -> None:
     folders = [write(tmp_path / name, measured=metrics()) for name in "ab"]
     for folder in folders:
         write_picture(folder, "a.jpg", 20, 200)
-    pages = [re.sub(r"this page: .* UTC", "", page_of(tmp_path, *folders)) for _ in range(2)]
+    pages = [re.sub(r"written .* UTC", "", page_of(tmp_path, *folders)) for _ in range(2)]
     assert pages[0] == pages[1]
 
 
@@ -66,7 +65,7 @@ def test_pictures_are_few_and_small(tmp_path: Path, count: int, most: int) -> No
         for name in values:
             write_picture(folder, name, 20, 200, width=1024)
     page = page_of(tmp_path, *folders)
-    shown = [view["name"] for view in data(page)["comparison"]["views"] if view["truth"]]
+    shown = [view["name"] for view in snapshot_of(page)["answers"]["compare?"]["views"] if view["truth"]]
     assert (len(shown), shown[0], shown[-1]) == (most, "00.jpg", "19.jpg")
     assert len(page) < 8_000_000
 
@@ -90,7 +89,7 @@ def test_pictures_that_are_none_are_left_out(tmp_path: Path) -> None:
     first.picture("wide.jpg").write_bytes(bytes(cv2.imencode(".jpg", np.zeros((8, 64, 3), np.uint8))[1]))
     first.picture("empty.jpg").touch()
     first.picture("link.jpg").symlink_to(tmp_path / "outside.jpg")
-    found = data(page_of(tmp_path, first, write(tmp_path / "b")))["comparison"]["views"]
+    found = snapshot_of(page_of(tmp_path, first, write(tmp_path / "b")))["answers"]["compare?"]["views"]
     assert {view["name"] for view in found if any(view["pictures"]) or view["truth"]} == {"good.jpg"}
     assert len(found) == len(views)
 

@@ -1,19 +1,14 @@
-// plotly, loaded when it is first needed, in the colours of the page. Also part of report.html, which holds plotly.
+// plotly, loaded when it is first needed, in the colours of the page. A report holds plotly.
 
-/** @import { Axis, Layout, Packed, Plotly } from "../shared/plotly.js" */
-import { token } from "../shared/dom.js";
+/** @import { Axis, Layout, Packed, Plotly } from "./plotly.js" */
+import { token } from "panolog/shared/dom.js";
 
 const CONFIG = { displayModeBar: false, responsive: true, doubleClick: "reset", showTips: false };
-// plotly adds the style of its geographic maps as an inline sheet, which the policy of these pages refuses. It skips
-// a sheet that is already there, by this id; there are no geographic maps here.
-const GEOGRAPHIC = "9f215cf04c5486422605d13261cb87401f4e7763b6296af81e98efbc0130da53";
 /** @type {Promise<Plotly> | null} */
 let loading = null;
 
 export function plotly() {
   loading ??= window.Plotly ? Promise.resolve(window.Plotly) : new Promise((resolve, reject) => {
-    const mark = document.createElement("meta");
-    mark.id = GEOGRAPHIC;
     const script = document.createElement("script");
     script.src = "/static/plotly.min.js";
     script.onload = () => resolve(window.Plotly);
@@ -21,7 +16,7 @@ export function plotly() {
       loading = null;
       reject(new Error("the charts could not be loaded"));
     };
-    document.head.append(mark, script);
+    document.head.append(script);
   });
   return loading;
 }
