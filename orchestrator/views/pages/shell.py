@@ -69,7 +69,9 @@ def write_snapshot(path: Path, page: Page, answers: Mapping[str, Any], stream: M
         imports=Markup(json.dumps({"imports": {f"panolog/{name}": _data_url_of(name) for name in names}})),
         snapshot=Markup(snapshot.replace("<", r"\u003c")),  # no text ends the element that it is in
         plotly=Markup(plotly().decode()),
-        made=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),  # readers may be in another time zone
+        made=time.strftime(
+            "%Y-%m-%d %H:%M UTC", time.gmtime(time.time())
+        ),  # readers may be in another time zone
     )
     write_bytes(path, text.encode())
 

@@ -62,7 +62,7 @@ function seams(path, { seams: faces, colors, pictures }) {
     note("How much more the error of the model steps at a face between two blocks than along planes within them, divided by the same of the Stage I model, which has no blocks: at 1 a face is as invisible as any other place."),
     ...faces.map((face) => faceFigures(path, face, pictures)),
     listed(counted(faces.length, "face"), table(faces, [
-      ["Blocks", name],
+      ["Blocks", name, "name"],
       ["Seam", ({ seam }) => fixed(seam), "number"],
       ["Step", ({ merged }) => fixed(merged.step, 4), "number"],
       ["Step within blocks", ({ merged }) => fixed(merged.step_floor, 4), "number"],
@@ -83,7 +83,7 @@ function poses(moves, metrics) {
   const fit = metrics?.pose_fit?.mean;
   return [
     note(
-      `${counted(moves.length, "camera")} were refined, and moved what they see by ${fixed(pixels)} pixels on average.`,
+      `Refining the poses of ${counted(moves.length, "camera")} moved what they see by ${fixed(pixels)} pixels on average.`,
       bounded.length > 0 && ` ${count(bounded.length)} would have moved farther than their bound: look at ${bounded[0].name}.`,
       fit && ` Stage I does not refine held-out panoramas. At the poses that fit the finished model best, ${fixed(fit.pixels)} pixels away on average, they have ${metricsText(fit)}; as they are ${metricsText({ psnr: metrics.mean.psnr ?? null })}.`,
     ),

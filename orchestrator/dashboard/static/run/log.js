@@ -89,7 +89,7 @@ export function log(path) {
       const answer = await get(snapshot ? `${path}/events` : query(before));
       if (request !== requests) return;
       if (!before) list.replaceChildren();
-      list.append(...answer.events.filter(passes).map(line));
+      list.append(...(snapshot ? answer.events.filter(passes) : answer.events).map(line));
       oldest = answer.next ?? answer.events.at(-1)?.id ?? oldest;
       older.hidden = !answer.more;
       setText(empty, list.children.length || answer.more ? "" : "No events.");

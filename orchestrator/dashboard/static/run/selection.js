@@ -82,6 +82,7 @@ function blockNumbers(row) {
     ["Iteration", row.iterations ? `${count(row.iteration ?? 0)} of ${count(row.iterations)}` : ""],
     ["Speed", busy && row.rate ? `${fixed(row.rate, 1)} it/s` : ""],
     ["ETA", duration(row.eta)],
+    ["Time", duration(row.seconds)],
     ["Loss", significant(row.loss)],
     ["PSNR, training", fixed(row.psnr)],
     ["Gaussians", short(row.gaussians ?? row.plan?.gaussians)],
