@@ -8,7 +8,6 @@ untrusted text, which scripts show as text.
 
 import base64
 import json
-import mimetypes
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from panolog.scene.files import write_bytes
 
 STATIC = Path(__file__).parents[2] / "dashboard" / "static"
 LIVE_IMPORTS = '{"imports": {"panolog/": "/static/"}}'
+_KINDS = {".js": "text/javascript", ".svg": "image/svg+xml"}  # media types of what a file has as URLs
 _SHARED = "shared"  # the folder of what all pages have
 
 
@@ -105,4 +105,4 @@ def _text_of(path: str) -> Markup:
 
 def _data_url_of(path: str) -> str:
     """A file of static/ as a URL."""
-    return data_url(mimetypes.guess_type(path)[0] or "", (STATIC / path).read_bytes())
+    return data_url(_KINDS[Path(path).suffix], (STATIC / path).read_bytes())
