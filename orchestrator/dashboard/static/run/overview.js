@@ -81,15 +81,16 @@ function makeStage() {
  * @param {StageView} stage
  * @param {number} now the time up to which the stage is known, by the server's clock
  * @param {boolean} live
+ * @param {number | null} first when the run began
  */
-function fillStage(node, stage, now, live) {
+function fillStage(node, stage, now, live, first) {
   const running = stage.status === "running";
   node.dataset.status = live || !running ? stage.status : "waiting";
   const [name, note, progress] = childrenOf(node);
   setText(name, stage.label);
   const time = stage.began && (stage.ended || running) ? duration((stage.ended ?? now) - stage.began) : "";
   const tally = stage.tasks > 1 && stage.status !== "done" ? `${stage.done} of ${stage.tasks}` : "";
-  const from = stage.began ? `from ${clock(stage.began)}` : "";
+  const from = stage.began ? `from ${clock(stage.began, first ?? undefined)}` : "";
   setText(note, [live || !running ? stage.status : "last state: running", tally, time, from].filter(Boolean).join(" · "));
   setBar(progress, stage.status === "done" ? 1 : stage.progress, `progress of ${stage.label}`);
 }
@@ -110,7 +111,7 @@ export function overview() {
     const name = run.name === "." ? run.path.split("/").filter(Boolean).pop() ?? "" : run.name;
     document.title = `${live ? `${percent(run.progress)} ` : ""}${name} · PanoLOG`;
     setText(byId("name"), name);
-    setText(byId("scene"), run.info.scene?.path ?? "");
+    setText(byId("scene"), [run.info.scene?.path, run.began && `began ${clock(run.began)}`].filter(Boolean).join(" · "));
     setPill(byId("status"), running && !live ? "unknown" : summary.status, running && !live ? "last state: running" : summary.label);
     setMessage(byId("reason"), summary.waiting || (summary.reason ?? ""));
     const [text, command] = hint(run) ?? ["", ""];
@@ -121,7 +122,7 @@ export function overview() {
       childrenOf(node).forEach((child, i) => setText(child, fact[i]));
     });
     showCost(summary.money);
-    reconcile(byId("stages"), run.stages, (stage) => stage.name, makeStage, (node, stage) => fillStage(node, stage, running ? run.now + since : run.latest ?? run.now, live));
+    reconcile(byId("stages"), run.stages, (stage) => stage.name, makeStage, (node, stage) => fillStage(node, stage, running ? run.now + since : run.latest ?? run.now, live, run.began));
   }
 
   setInterval(show, REFRESH);

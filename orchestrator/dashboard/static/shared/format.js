@@ -42,10 +42,10 @@ export const ago = orDash((time) => {
   return `${Math.floor(s / size)} ${unit} ago`;
 });
 
-/** @param {number} time seconds since the epoch */
-export function clock(time) {
-  const date = new Date(time * 1000);
-  const day = date.toDateString() === new Date().toDateString() ? "" : `${date.toLocaleDateString("en-CA")} `;
+/** A time, with the date if that is another day. @param {number} time seconds since the epoch @param {number} other the same, by default now */
+export function clock(time, other = Date.now() / 1000) {
+  const [date, known] = [time, other].map((seconds) => new Date(seconds * 1000));
+  const day = date.toDateString() === known.toDateString() ? "" : `${date.toLocaleDateString("en-CA")} `;
   return day + date.toLocaleTimeString("en-GB");
 }
 

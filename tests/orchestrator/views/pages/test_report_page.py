@@ -16,7 +16,7 @@ from panolog.orchestrator.views.palette import SEAM_GRADES
 from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.dashboard.browser import DESK, PHONE, SMALL, opened, unreachable
-from tests.orchestrator.dashboard.served import EVIL, append, progressed, started, write_whole_run
+from tests.orchestrator.dashboard.served import EVIL, append, progressed, serving, started, write_whole_run
 from tests.orchestrator.views.models import save_model
 from tests.visual import legible
 from tests.workers.seams.test_schema import seam
@@ -101,6 +101,17 @@ def test_all_is_there_without_network(browser: Browser, report: Path) -> None:
         assert page.evaluate("[...document.images].filter((image) => !image.naturalWidth).length") == 0
         page.locator(".face .mark").check()
         expect(page.locator(".strips .line").first).to_be_visible()
+
+
+def test_the_dashboard_shows_it_in_a_sandbox(browser: Browser, report: Path, tmp_path: Path) -> None:
+    folder = write_whole_run(tmp_path / "run")
+    shutil.copy(report, folder.report)
+    with serving(tmp_path) as served:
+        url = f"{served.url}/api/runs/{served.id('run')}/report.html"
+        with opened(browser, url) as page:
+            expect(page.locator("#map-plot .imagelayer image")).to_have_count(1)
+            expect(page.locator("#quality tbody tr")).to_have_count(2)
+            assert page.evaluate("self.origin") == "null"
 
 
 def test_the_map_is_that_of_the_dashboard(browser: Browser, report: Path) -> None:
