@@ -119,7 +119,7 @@ def _answers(folder: RunFolder, view: RunView, found: Findings) -> Iterator[tupl
 
 def _cameras(folder: RunFolder, plan: Plan) -> Iterator[tuple[str, Any]]:
     """The cameras of a plan, and the blocks with theirs; nothing of a large one."""
-    if len(plan.rows) * plan.grid.count > _SCORES:
+    if len(plan.rows) * plan.grid.count > _SCORES or not folder.scores.exists():
         return
     scores = read_scores(folder.scores, plan.rows, plan.grid.count).toarray().tolist()
     blocks: dict[int, list[dict[str, Any]]] = {block: [] for block in range(plan.grid.count)}
