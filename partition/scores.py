@@ -41,7 +41,7 @@ def read_scores(file: Path | BinaryIO, cameras: Sequence[int], blocks: int) -> c
     try:
         with np.load(file, allow_pickle=False) as arrays:
             if not np.array_equal(arrays["cameras"], np.array(cameras, np.int64)):
-                raise InputError(f"{_name(file)}: is of other cameras than plan.json")
+                raise InputError(f"{_name(file)}: is of other cameras than the run")
             if "scores" in arrays:
                 found = csr_array(arrays["scores"], dtype=np.float64)
             else:
@@ -51,7 +51,7 @@ def read_scores(file: Path | BinaryIO, cameras: Sequence[int], blocks: int) -> c
     except (BadZipFile, EOFError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{_name(file)}: holds no gradient scores: {error}") from error
     if found.shape != (len(cameras), blocks):
-        raise InputError(f"{_name(file)}: is of other blocks than plan.json")
+        raise InputError(f"{_name(file)}: is of other blocks than the run")
     return found
 
 

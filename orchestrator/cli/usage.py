@@ -8,19 +8,8 @@ from panolog.scene.errors import StoreError
 from panolog.scene.stores.url import PROTOCOLS, is_url
 
 # What takes URLs of object stores.
-_RUNS = (
-    "run",
-    "resume",
-    "status",
-    "events",
-    "report",
-    "export",
-    "clean",
-    "doctor",
-    "scene info",
-    "scene check",
-)
-_STORES = (*_RUNS, *(f"cluster {name}" for name in ("submit", "resume", "status", "stop")))
+_RUNS = ("run", "resume", "status", "events", "report", "export", "doctor", "scene info", "scene check")
+_STORES = (*_RUNS, "clean", *(f"cluster {name}" for name in ("submit", "resume", "status", "stop")))
 
 
 class _PlainUsage:

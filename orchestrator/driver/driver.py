@@ -233,7 +233,7 @@ class Driver:
     def _start_ready(self, ready: Sequence[TaskId]) -> None:
         tasks = [task for task in ready if task not in self._attempts and not self._writers.writes(task)]
         if len(tasks) != 1 or (make := self._results.maker(tasks[0], self._state)) is None:
-            self._place(tasks)
+            self._place(() if self._own_machine_leaves else tasks)
             return
         self._place(())  # takes requests for machines back
         with self._stop.at_once():
@@ -245,7 +245,7 @@ class Driver:
         """Starts those of the tasks for which there is room, as far as messages need not wait for long."""
         demands = Demands(self._sizes, self._state)
         running = demands.running({t: it.placement for t, it in self._attempts.items()}, self._clock.time())
-        nodes = quarantine.usable(self._state, () if self._own_machine_leaves else self._nodes)
+        nodes = quarantine.usable(self._state, self._nodes)
         waiting = demands.of(tasks)
         turn = self._clock.monotonic() + _STARTS_S
         for task, where in self._machines.place(waiting, lambda: demands.work(tasks), running, nodes):

@@ -56,8 +56,9 @@ def _surveyed(url: StoreUrl, keep: int, older: float | None) -> Survey:
 def _cleaned(found: Survey, keep: int) -> Survey:
     if found.skipped or not found.removals:
         return found
+    removed: list[Removal] = []
     try:
-        store, removed = open_store(str(found.root), _PATIENCE_S), list[Removal]()
+        store = open_store(str(found.root), _PATIENCE_S)
         own = lease.take(store, _NOBODY, force=False)
         try:
             shown = {removal.path for removal in found.removals}
@@ -71,7 +72,7 @@ def _cleaned(found: Survey, keep: int) -> Survey:
     except RunLockedError as error:
         return Survey(found.root, skipped=in_one_line(error))
     except PanologError as error:
-        return Survey(found.root, skipped=in_one_line(error), failed=True)
+        return Survey(found.root, tuple(removed), in_one_line(error), failed=True)
 
 
 def _current(store: Store) -> Manifest:

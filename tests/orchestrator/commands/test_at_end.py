@@ -73,6 +73,13 @@ def test_a_run_that_fails_or_is_refused_is_told_apart(tmp_path: Path, end: End) 
         assert (found, run) == (outcome, str(folder.root)) and "/gone" in reason
 
 
+def test_a_run_that_is_refused_before_there_is_a_folder(tmp_path: Path, end: End) -> None:
+    root = tmp_path / "new"
+    assert call("run", tmp_path / "nowhere", "-o", root, *end.option).exit_code == 2
+    ((outcome, reason, run),) = end.said
+    assert (outcome, run) == ("refused", str(root)) and "nowhere" in reason and not root.exists()
+
+
 def test_a_supervisor_carries_it_out_once_when_it_gives_up(
     tmp_path: Path, end: End, monkeypatch: pytest.MonkeyPatch
 ) -> None:
