@@ -29,7 +29,8 @@ _MINE = "PANOLOG_TESTS"  # in the environment of all processes that this one has
 _SERVERS = ("multiprocessing.forkserver", "multiprocessing.resource_tracker")
 _POOLS = ("fsspecIO", "asyncio_", "AnyIO worker thread", "ray_", "tqdm")  # threads of libraries
 _OF_A_FILE = ("dashboard_",)  # threads that a server of a whole file starts when it is used
-_CACHES = ("pymp-", "torchinductor_", ".ses")  # files of Python, torch and ONNX Runtime
+# Files of Python, torch and ONNX Runtime, and memory that the browser of the session shares with its pages.
+_CACHES = ("pymp-", "torchinductor_", ".ses", ".org.chromium.")
 
 Found = dict[str, int]  # description -> the process, or 0
 
