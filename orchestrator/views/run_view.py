@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
-from panolog.orchestrator.run.config import RunConfig, keys
+from panolog.orchestrator.run.config import RunConfig, flat, keys
 from panolog.orchestrator.run.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.views.history import History, Span
 from panolog.orchestrator.views.preparation import PreparationView, prepared_share
@@ -274,7 +274,7 @@ def _nodes(
 
 def _settings(info: Mapping[str, Any]) -> tuple[SettingView, ...]:
     """All settings of a run, flat, next to their defaults, those of its recipe where it has one."""
-    given = _flat(info.get("config") or {})
+    given = dict(flat(info.get("config") or {}))
     preset = RECIPES.get(given.get("recipe", "paper"), {})
     fields = {key: (preset.get(key, default), text) for key, (default, text) in map(_field, keys())}
     return tuple(
@@ -300,11 +300,3 @@ def _field(key: str) -> tuple[str, tuple[Any, str]]:
     info = model.model_fields[name]
     default = info.get_default(call_default_factory=True, validated_data={})
     return key, (list(default) if isinstance(default, tuple) else default, info.description or "")
-
-
-def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """A nested mapping by dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in tree.items() if isinstance(tree, dict) else ():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat
