@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import signal
 from collections import Counter, defaultdict
 from pathlib import Path
 
@@ -34,7 +35,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Checks after each test that nothing of it is left."""
+    """Checks after each test that nothing of it is left; Ctrl-C works, also in a shell's background job."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     leaks.configure(config)
 
 

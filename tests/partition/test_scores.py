@@ -30,7 +30,7 @@ def test_zeros_take_no_bytes(tmp_path: Path) -> None:
         ({"indices": np.array([0, 0, 3])}, "no gradient scores"),  # outside: scipy would write there
         ({"indices": np.array([0, -1, 2])}, "no gradient scores"),
         ({"indptr": np.array([0, 1, 99])}, "no gradient scores"),
-        ({"data": np.array([print] * 3, dtype=object)}, "no gradient scores"),
+        ({"data": np.array([Path()] * 3, dtype=object)}, "no gradient scores"),  # which would be unpickled
         ({"data": None}, "no gradient scores"),
         ({"scores": np.ones((2, 4))}, "other blocks"),
     ],
