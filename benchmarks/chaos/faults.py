@@ -14,7 +14,7 @@ import psutil
 from typing_extensions import assert_never
 
 from benchmarks.chaos.cable import Cable
-from benchmarks.chaos.cluster import GROUPS, HEAD, SECOND, LocalCluster
+from benchmarks.chaos.cluster import DRIVER, GROUPS, HEAD, SECOND, LocalCluster
 from benchmarks.chaos.shim import READ, WRITE, Rule
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.workers.tasks import StrEnum
@@ -60,6 +60,8 @@ class Kind(StrEnum):
     TERMINAL = "terminal"  # SIGKILL for what reads the output of supervisor and driver
     DAMAGE = "damage"  # the checkpoint of a busy worker is overwritten in part, and the worker killed
     VANISH = "vanish"  # the run folder is elsewhere for a while, as where a disk is unmounted
+    MIRROR = "mirror"  # SIGKILL for what copies the run into its store
+    STORE = "store"  # each read and write of the store takes longer
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,8 @@ LIMITS = {
     Kind.TERMINAL: Limits(_START_S),
     Kind.DAMAGE: Limits(_START_S + _ANEW_S),
     Kind.VANISH: Limits(RETRY_S + _START_S, (3.0, 6.0)),
+    Kind.MIRROR: Limits(_START_S),
+    Kind.STORE: Limits(_START_S, (4.0, 8.0)),
 }
 
 
@@ -123,6 +127,7 @@ def plans(runs: int, seed: int, seconds: float, kinds: Sequence[Kind]) -> Iterat
 
 _SIGNALS = {
     Kind.DRIVER: ("kill driver", signal.SIGKILL),
+    Kind.MIRROR: ("kill mirror", signal.SIGKILL),
     Kind.WORKER: ("kill worker", signal.SIGKILL),
     Kind.RAYLET: ("kill raylet", signal.SIGKILL),
     Kind.HANG: ("hang worker", signal.SIGSTOP),
@@ -138,7 +143,9 @@ class Victim:
     cluster: LocalCluster
     scene: Path
     root: Path
+    store: Path
     driver: psutil.Process | None  # not its supervisor; None between two
+    mirror: psutil.Process | None
     terminal: subprocess.Popen[bytes]  # reads the output of both
 
 
@@ -146,7 +153,7 @@ def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
     """Makes it happen; returns what it was and what ends it. None if there is nothing to hit now."""
     cluster, choice, lasts = victim.cluster, planned.choice, planned.lasts
     match planned.kind:
-        case Kind.DRIVER | Kind.WORKER | Kind.RAYLET | Kind.HANG | Kind.PAUSE | Kind.GCS:
+        case Kind.DRIVER | Kind.MIRROR | Kind.WORKER | Kind.RAYLET | Kind.HANG | Kind.PAUSE | Kind.GCS:
             return _signal(planned, victim)
         case Kind.BADNODE:
             folder = cluster.copies or victim.scene
@@ -163,6 +170,9 @@ def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
         case Kind.SLOW:
             rules = (Rule(folder, READ | WRITE, delay=_DELAY_S) for folder in (victim.scene, victim.root))
             return f"slow disk {lasts:g} s", _fail(cluster, GROUPS, *rules)
+        case Kind.STORE:
+            rule = Rule(victim.store, READ | WRITE, delay=_DELAY_S)
+            return f"slow store {lasts:g} s", _fail(cluster, (DRIVER,), rule)
         case Kind.LOCKED:
             return _lock(f"lock {lasts:g} s", RunFolder(victim.root).database)
         case Kind.NET:
@@ -179,8 +189,8 @@ def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
 def _signal(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
     """Sends a signal; the end is a SIGCONT."""
     kind, cluster = planned.kind, victim.cluster
-    if kind == Kind.DRIVER:
-        process = victim.driver
+    if kind in (Kind.DRIVER, Kind.MIRROR):
+        process = victim.driver if kind == Kind.DRIVER else victim.mirror
     elif kind == Kind.GCS:  # without a head no run has to begin: that is refused
         process = cluster.gcs() if RunFolder(victim.root).preflight.exists() else None
     elif kind in (Kind.RAYLET, Kind.PAUSE):

@@ -4,6 +4,7 @@ import hashlib
 import subprocess
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shutil import rmtree
@@ -109,9 +110,13 @@ class ChaosRuns:
         """The folder of a run."""
         return self._root / f"run-{number:03d}"
 
+    def _store(self, folder: Path) -> Path:
+        return self._root / "store" / folder.name
+
     def _launch(self, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         """The supervisor of a run, and what writes its output to a log."""
-        command = [str(BIN / "panolog"), "run", str(self._scene), "-o", str(folder), *SETTINGS]
+        command = [str(BIN / "panolog"), "run", str(self._scene), "-o", f"file://{self._store(folder)}"]
+        command += ["--local", str(folder), *SETTINGS]
         command += ["--supervise", "--address", self._cluster.address]
         with (self._root / f"{folder.name}.log").open("ab") as log:
             terminal = subprocess.Popen("cat", stdin=subprocess.PIPE, stdout=log)
@@ -139,7 +144,9 @@ class ChaosRuns:
                 code = supervisor.wait(_POLL_S)
             except subprocess.TimeoutExpired:
                 self._cluster.keep()
-                victim = Victim(self._cluster, self._scene, folder, _driver(supervisor), terminal)
+                children = _children(supervisor)
+                store = self._store(folder)
+                victim = Victim(self._cluster, self._scene, folder, store, *children, terminal)
                 causing.step(victim)
                 continue
             if not code:
@@ -150,13 +157,13 @@ class ChaosRuns:
         return f"no end after {_TIMEOUT_S:.0f} s"
 
 
-def _driver(supervisor: subprocess.Popen[bytes]) -> psutil.Process | None:
-    """The driver that a supervisor has started; None between two."""
-    try:
-        children = psutil.Process(supervisor.pid).children()
-    except psutil.NoSuchProcess:
-        return None
-    return children[0] if children else None
+def _children(supervisor: subprocess.Popen[bytes]) -> tuple[psutil.Process | None, psutil.Process | None]:
+    """The driver that a supervisor has started, and its mirror; None between two."""
+    found: dict[bool, psutil.Process] = {}
+    with suppress(psutil.Error):
+        for child in psutil.Process(supervisor.pid).children():
+            found.setdefault("panolog.orchestrator.storage" in child.cmdline(), child)
+    return found.get(False), found.get(True)
 
 
 def _end(supervisor: subprocess.Popen[bytes]) -> None:
