@@ -46,12 +46,12 @@ class RayNodes:
             ray.wait(answers, num_returns=len(answers), timeout=_TIMEOUT_S)
 
     def alive(self) -> tuple[Node, ...]:
-        """The machines that tasks can run on."""
+        """The machines that tasks can run on, and the driver's own."""
         if time.monotonic() - self.queried > _INTERVAL_S:
             self._query()
         self._collect()
         nodes = (self._known[id] for id in sorted(self._alive) if id in self._known)
-        return tuple(node for node in nodes if node.cpus or node.gpus)
+        return tuple(node for node in nodes if node.cpus or node.gpus or node.id == self.home)
 
     def draining(self) -> dict[str, LeaveNotice]:
         """The machines on which Ray starts nothing more, by Node.id, as of the last query."""

@@ -67,7 +67,8 @@ class Others:
         """
         free = available_resources_per_node()  # type: ignore[no-untyped-call]
         for node in nodes:
-            total = float(len(node.gpus) or node.cpus)
+            if not (total := float(len(node.gpus) or node.cpus)):
+                continue
             left = free.get(node.id, {}).get("GPU" if node.gpus else "CPU", 0.0)
             taken = (total - left - held.get(node.id, 0.0)) / total
             looks = self._taken.setdefault(node.id, deque([0.0], _LOOKS))

@@ -79,7 +79,8 @@ class RayPool:
     @reported
     def nodes(self) -> tuple[Node, ...]:
         """The machines that are there now, but those on which nothing runs and nothing is to start."""
-        unused = self._nodes.draining().keys() - self._busy()  # the autoscaler removes them
+        own = {self._nodes.home}
+        unused = self._nodes.draining().keys() - self._busy() - own  # the autoscaler removes them
         nodes = tuple(node for node in self._nodes.alive() if node.id not in unused)
         if self._others is None:
             return nodes

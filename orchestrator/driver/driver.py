@@ -26,6 +26,7 @@ from panolog.orchestrator.driver.writers import Writers
 from panolog.orchestrator.resources import quarantine
 from panolog.orchestrator.resources.delivery import Large, payload
 from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.resources.placement import Placed
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
 from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run.folder import command_line
@@ -116,6 +117,7 @@ class Driver:
         self._nodes: tuple[Node, ...] = ()
         self._usages = Usages(job.folder, journal.database, clock)
         self._wrong: InputError | None = None  # what a worker has found
+        self._placed: list[Placed] = []  # that start next, unless something happens before
         self._news = True  # something has happened since it was last decided what to start
         self._again = math.inf  # Clock.monotonic() at which to decide that without news
 
@@ -181,10 +183,9 @@ class Driver:
         """Ends all tasks with fresh checkpoints: what follows is made of what there is."""
         self._wind_down()
         started = [task for task in self._attempts if self._state.status(task) == Status.RUNNING]
-        for task in self._attempts:
+        for task in list(self._attempts):
             self._pool.cancel(task)
-            self._writers.forget(task)
-        self._attempts.clear()
+            self._forget(task)
         measures = 0 if self._state.plan else len(self._later.measures)
         self._journal.record([*map(TaskYielded, started), replace(reached, measures=measures)])
         self._news = True
@@ -228,6 +229,9 @@ class Driver:
             self._start_ready(ready)
             if not self._attempts and (why := self._purse.gives_up(job.config.scaling.patience)):
                 return Outcome.LIMITED, why
+        turn = self._clock.monotonic() + _STARTS_S
+        while self._placed and self._clock.monotonic() <= turn:
+            self._start(*self._placed.pop(0))
         return None
 
     def _start_ready(self, ready: Sequence[TaskId]) -> None:
@@ -242,17 +246,11 @@ class Driver:
         self._journal.record(records)
 
     def _place(self, tasks: Sequence[TaskId]) -> None:
-        """Starts those of the tasks for which there is room, as far as messages need not wait for long."""
+        """Decides which of the tasks start now, and where."""
         demands = Demands(self._sizes, self._state)
         running = demands.running({t: it.placement for t, it in self._attempts.items()}, self._clock.time())
         nodes = quarantine.usable(self._state, self._nodes)
-        waiting = demands.of(tasks)
-        turn = self._clock.monotonic() + _STARTS_S
-        for task, where in self._machines.place(waiting, lambda: demands.work(tasks), running, nodes):
-            self._start(task, where)
-            if self._clock.monotonic() > turn:
-                self._news = True
-                break
+        self._placed = self._machines.place(demands.of(tasks), lambda: demands.work(tasks), running, nodes)
         if any(self._state.task(task).failures and task not in self._attempts for task in tasks):
             self._again = self._clock.monotonic() + _REVIEW_S
         if self._machines.expecting:
@@ -281,6 +279,7 @@ class Driver:
 
     def _wind_down(self) -> None:
         """Requests a last checkpoint of all tasks that train, and waits for these, but not for ever."""
+        self._placed.clear()
         training = [task for task, attempt in self._attempts.items() if attempt.ready and task.stage.trains]
         self._journal.record([StopRequested(len(training))])
         for task in training:
@@ -302,7 +301,8 @@ class Driver:
             held_up = written | self._writers.held_up()  # what follows relies on what is recorded
             for task in held_up & self._attempts.keys():
                 self._attempts[task].latest = self._clock.monotonic()
-            ready = self._pool.ready(0 if records or self._writers.busy or self._news else _WAIT_S, held_up)
+            at_once = records or self._placed or self._news or self._writers.busy
+            ready = self._pool.ready(0 if at_once else _WAIT_S, held_up)
             self._deadlines.turn(self._attempts.values(), ready)
             for task in ready:
                 records += self._take(task)

@@ -135,7 +135,8 @@ def calibrate(pool: Pool, scene: Scene, config: RunConfig) -> Basis:
     """
     cuda = config.device == "cuda"
     leave = pool.notices()  # of nodes that announce their end
-    nodes = [node for node in pool.nodes() if node.id not in leave] or pool.nodes()
+    there = placement.able(pool.nodes(), cuda=cuda)
+    nodes = [node for node in there if node.id not in leave] or there
     placed = placement.place([Demand(CALIBRATE, 0)], nodes, (), cuda=cuda)
     if not placed:
         return assumed(scene, config)

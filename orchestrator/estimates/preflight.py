@@ -154,7 +154,7 @@ def _potential(
     pool: Pool, scene: Scene, config: RunConfig, basis: Basis, prices: PriceList | None
 ) -> tuple[Node, ...]:
     """The machines that a job may have: those that are there, and those that an autoscaler would start."""
-    growth, nodes = pool.growth(), pool.nodes()
+    growth, nodes = pool.growth(), tuple(node for node in pool.nodes() if node.cpus or node.gpus)
     if not growth.groups:
         return nodes
     scaling = Scaling(

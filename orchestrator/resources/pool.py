@@ -80,7 +80,7 @@ class Pool(Sharing, Protocol):
     """Where tasks run."""
 
     def nodes(self) -> tuple[Node, ...]:
-        """The machines that are there now."""
+        """The machines that are there now; the driver's own also if tasks cannot run on it."""
 
     def notices(self) -> Mapping[str, LeaveNotice]:
         """Which machines have announced that they leave, by Node.id."""

@@ -15,6 +15,8 @@ from ray.autoscaler.v2.schema import ClusterStatus, LaunchRequest
 from panolog.orchestrator.cluster import autoscaler
 from panolog.orchestrator.cluster.autoscaler import groups_of, read_config
 from panolog.orchestrator.cluster.connection import connect
+from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.resources.placement import able
 from panolog.orchestrator.resources.scaling import Group, Growth
 from tests.orchestrator.cluster.autoscaled import autoscaled
 
@@ -89,15 +91,18 @@ def come_and_go(address: str, folder: Path) -> list[str]:
     """What a pool says of its machines, in a process that has the cluster's token."""
     said = list[str]()
 
+    def there() -> list[Node]:
+        return able(pool.nodes(), cuda=False)  # the head has no cores
+
     def until(count: int) -> None:
         end = time.monotonic() + 240
-        while len(pool.nodes()) != count and time.monotonic() < end:
+        while len(there()) != count and time.monotonic() < end:
             pool.ready(0.5)
-        known = sum(node.id in pool.growth().members for node in pool.nodes())
-        said.append(f"{len(pool.nodes())} nodes, {known} of the group")
+        known = sum(node.id in pool.growth().members for node in there())
+        said.append(f"{len(there())} nodes, {known} of the group")
 
     with connect(address, folder) as pool:
-        said.append(f"{len(pool.nodes())} of {pool.growth()}")
+        said.append(f"{len(there())} of {pool.growth()}")
         pool.request({"small": 2})
         until(2)
         pool.request({})
