@@ -123,7 +123,10 @@ class _Supervisor:
             if (number := self._taken(_POLL_S)) is not None:
                 driver.send_signal(number)
         state = _state(self.run.root)
-        self.taken = self.taken or (state.driver is not None and state.driver.pid == driver.pid)
+        own = state.driver is not None and state.driver.pid == driver.pid
+        self.taken = self.taken or own
+        if own and state.outcome == Outcome.DONE:
+            return 0, None  # what has ended it came afterwards, such as the end of the cluster's head
         return code, cause(code, state, driver.pid)
 
     def _taken(self, seconds: float) -> int | None:

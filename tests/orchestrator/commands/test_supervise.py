@@ -42,6 +42,8 @@ if word not in ("refused", "early"):
         database.append([CheckpointSaved(COARSE, number, "", 1)])
     if word == "fails":
         database.append([RunEnded(Outcome.FAILED, "the run is wrong")])
+    if word == "done":
+        database.append([RunEnded(Outcome.DONE)])
     if word == "lost":
         database.append([RunEnded(Outcome.FAILED, "Ray is lost", transient=True)])
 code = int(value)
@@ -116,6 +118,13 @@ def test_a_run_is_resumed_until_it_is_done(script: Script) -> None:
     ]
     assert all(other.startswith(f"resume {script.root} --nice 3 --resumed-after ") for other in others)
     assert script.said[0].endswith("(SIGKILL)); resume 1 of at most 3 without progress in 0 s")
+
+
+@pytest.mark.parametrize("code", [1, -9])
+def test_what_ends_a_driver_after_its_run_is_done_changes_nothing(script: Script, code: int) -> None:
+    """Ray ends a process, with exit code 1, whose cluster's head is gone when it leaves that."""
+    assert script.run(f"done {code}") == 0
+    assert len(script.drivers) == 1
 
 
 def test_a_driver_that_died_before_its_run_folder_was_there_is_started_anew(script: Script) -> None:
