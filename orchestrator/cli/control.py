@@ -52,10 +52,11 @@ def retry(run: RunArg, block: BlockArg) -> None:
 def release(
     run: RunArg,
     node: Annotated[
-        str, typer.Argument(metavar="NODE", help="Host of the machine, or the begin of its id; see status.")
+        str,
+        typer.Argument(metavar="NODE", help="Its name as in status, such as a host, or the begin of its id."),
     ],
 ) -> None:
-    """Use a machine in quarantine again."""
+    """Use a machine or a GPU in quarantine again."""
     _request(run, "release", node=node)
     say("requested; the machine gets the next task that waits")
 
