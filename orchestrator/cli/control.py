@@ -53,7 +53,7 @@ def release(
     run: RunArg,
     node: Annotated[
         str,
-        typer.Argument(metavar="NODE", help="Its name as in status, such as a host, or the begin of its id."),
+        typer.Argument(metavar="NODE", help="Its name in status, such as a host, or the begin of its id."),
     ],
 ) -> None:
     """Use a machine or a GPU in quarantine again."""
