@@ -104,6 +104,7 @@ $(READY): $(INPUTS)
 # Launchers that read files of deploy/ in tests. They pin versions of what PanoLOG needs too, so they have a place of their own.
 $(PEERS): pyproject.toml
 	$(PYTHON) -m venv build/peers
+	build/peers/bin/pip --disable-pip-version-check install --quiet --upgrade pip
 	build/peers/bin/pip --disable-pip-version-check install --quiet --group launchers
 	@touch $@
 
