@@ -102,7 +102,8 @@ class ChaosRuns:
     def disturbed(self, number: int, plan: Sequence[Planned]) -> Run:
         """A run with at least one fault: one that ended before the first is repeated with earlier ones."""
         while not (run := self.run(number, plan)).costs and not run.end:
-            rmtree(self.folder(number))
+            for folder in (self.folder(number), self._store(self.folder(number))):
+                rmtree(folder)
             plan = [replace(planned, after=planned.after / 2) for planned in plan]
         return run
 

@@ -102,7 +102,7 @@ def come_and_go(address: str, folder: Path) -> list[str]:
         said.append(f"{len(there())} nodes, {known} of the group")
 
     with connect(address, folder) as pool:
-        said.append(f"{len(there())} of {pool.growth()}")
+        said.append(f"{len(pool.nodes())} with the head, {len(there())} of {pool.growth()}")
         pool.request({"small": 2})
         until(2)
         pool.request({})
@@ -120,6 +120,6 @@ def test_machines_come_as_requested_and_go_when_they_are_idle(
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         said = process.submit(come_and_go, address, tmp_path).result()
     assert said == [
-        f"0 of {Growth((Group('small', 2, 1),))}",
+        f"1 with the head, 0 of {Growth((Group('small', 2, 1),))}",
         *("2 nodes, 2 of the group", "0 nodes, 0 of the group"),
     ]
