@@ -54,7 +54,7 @@ class Assignment:
         return _places(self.assigned, camera)
 
     def by_gradient(self, camera: int) -> NDArray[np.integer[Any]]:
-        """Those of them that its gradient scores have chosen, in order."""
+        """The blocks that a camera trains because of its gradient scores, in order."""
         return _places(self.gradient, camera)
 
     @property

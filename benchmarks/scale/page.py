@@ -129,7 +129,7 @@ def _pair(first: dict[str, float], second: dict[str, float], name: str) -> str:
 
 
 def plans(rows: Sequence[PlanSize]) -> str:
-    """Of cities of any size."""
+    """The table of plans: their size, the bytes of plan and scores, and how long these take."""
     head = (
         "panoramas",
         "blocks",

@@ -88,7 +88,7 @@ def camera_of(entry: RunEntry, row: int) -> PlanCamera | None:
 
 
 def scored_camera_of(entry: RunEntry, row: int) -> tuple[PlanCamera, tuple[float, ...]] | None:
-    """The same with its gradient scores, one for each block."""
+    """One camera of the plan with its gradient scores, one for each block; None if there is no such row."""
     plan, folder = _read_plan(entry), entry.folder
     if row not in plan.rows:
         return None

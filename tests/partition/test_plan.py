@@ -81,7 +81,7 @@ def test_a_plan_of_many_blocks_is_small_in_its_file_and_in_tasks() -> None:
 
 
 def test_a_plan_of_version_1_opens(tmp_path: Path) -> None:
-    """It has the scores in itself, and scores.npz has them densely."""
+    """A plan.json of version 1 has the scores in itself, and its scores.npz has them densely."""
     scores = np.random.default_rng(2).random((6, GRID.count)) * [1, 0, 1, 1]
     made = plan(scores)
     older = made.to_json() | {"version": 1}

@@ -167,7 +167,7 @@ def test_a_node_whose_notice_is_withdrawn_is_used_again(tmp_path: Path) -> None:
 
 
 def test_when_the_machine_of_the_driver_leaves_all_tasks_save_and_nothing_begins(tmp_path: Path) -> None:
-    """They end with it, wherever they are: those on other machines trained on, and that was lost."""
+    """A run ends with its driver's machine: what tasks elsewhere had trained on until then was lost."""
     head = Node("head", gethostname(), 0, 2**40)
     run, blocks = Harness(tmp_path, (head, A, B), retries=0), {TaskId.block(0), TaskId.block(1)}
     begun: list[int] = []

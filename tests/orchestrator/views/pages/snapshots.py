@@ -6,7 +6,7 @@ from typing import Any
 
 
 def snapshot_of(page: str) -> dict[str, Any]:
-    """Its answers and the messages of its stream."""
+    """The answers of the API and the messages of the stream that a page with a snapshot holds."""
     match = re.search(r'<script type="application/json" id="snapshot">(.*?)</script>', page, re.DOTALL)
     assert match is not None
     found: dict[str, Any] = json.loads(match[1], parse_constant=_no_json)
