@@ -87,7 +87,9 @@ class RayPool:
         if self._nodes.queried != self._looked:
             self._looked = self._nodes.queried
             self._others.look(nodes, self._held())
-        return tuple(replace(node, share=self._others.share(node.id)) for node in nodes)
+        shares = map(self._others.share, (node.id for node in nodes))
+        pairs = zip(nodes, shares, strict=True)
+        return tuple(node if share == node.share else replace(node, share=share) for node, share in pairs)
 
     def _held(self) -> dict[str, float]:
         """GPUs, or cores of tasks without, that tasks have, by Node.id."""

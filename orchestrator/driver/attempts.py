@@ -34,10 +34,10 @@ class Attempt:
     def started(self, hello: Hello, nodes: Sequence[Node]) -> TaskStarted:
         """The record of its Hello, after which it can be requested to stop. Args: nodes, those there are."""
         self.ready, spec = True, self.spec
-        for node in nodes:
-            for gpu, card in enumerate(node.gpus):
-                if node.id == self.placement.node and card.uuid == hello.card != "":
-                    self.placement = replace(self.placement, gpu=gpu, uuid=card.uuid)
+        if hello.card:
+            gpus = next((node.gpus for node in nodes if node.id == self.placement.node), ())
+            for gpu in (number for number, card in enumerate(gpus) if card.uuid == hello.card):
+                self.placement = replace(self.placement, gpu=gpu, uuid=hello.card)
         return TaskStarted(
             spec.task,
             self.number,

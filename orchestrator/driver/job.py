@@ -284,10 +284,7 @@ class Specs:
         """At most so many panoramas that train a block, and as many others, on which it is compared."""
         if not count:
             return ()
-        start, stop = self._scores.indptr[block : block + 2]
-        scores = np.zeros(len(self.plan.rows))
-        scores[self._scores.indices[start:stop]] = self._scores.data[start:stop]
-        return self.plan.compared(block, scores, count)
+        return self.plan.compared(block, self._scores[:, [block]].toarray()[:, 0], count)
 
     @cached_property
     def _scores(self) -> csc_array:

@@ -28,7 +28,7 @@ class Node:
 
     def card(self, gpu: int) -> str:
         """The id of one of its GPUs: its UUID if that is known."""
-        return self.gpus[gpu].uuid or f"{self.id}/{gpu}"
+        return _card(self.id, gpu, self.gpus[gpu].uuid)
 
     @property
     def differ(self) -> bool:
@@ -52,9 +52,13 @@ class Placement:
     @property
     def card(self) -> str:
         """`Node.card` of its GPU; "" for a task on the CPU."""
-        return "" if self.gpu is None else self.uuid or f"{self.node}/{self.gpu}"
+        return "" if self.gpu is None else _card(self.node, self.gpu, self.uuid)
 
     @property
     def threads(self) -> int:
         """Threads of its process."""
         return max(1, int(self.cpus))
+
+
+def _card(node: str, gpu: int, uuid: str) -> str:
+    return uuid or f"{node}/{gpu}"

@@ -28,11 +28,11 @@ _DIGITS = re.compile(r"\d+")  # reasons that differ in these are alike
 
 def usable(state: RunState, nodes: Iterable[Node]) -> list[Node]:
     """The nodes that are not in quarantine, with their GPUs that are marked."""
-    found = []
+    shut, found = {known.id for known in state.quarantined()}, list[Node]()
     for node in nodes:
-        closed = tuple(gpu for gpu in range(len(node.gpus)) if _until(state, node.card(gpu)))
-        if not _until(state, node.id) and (len(closed) < len(node.gpus) or not node.gpus):
-            found.append(replace(node, closed=closed))
+        closed = tuple(gpu for gpu in range(len(node.gpus)) if node.card(gpu) in shut) if shut else ()
+        if node.id not in shut and (len(closed) < len(node.gpus) or not node.gpus):
+            found.append(node if closed == node.closed else replace(node, closed=closed))
     return found
 
 
