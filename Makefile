@@ -66,7 +66,7 @@ lint: $(READY) $(TSC)  ## check style, types of Python and of the scripts, and t
 	$(BIN)/node $(TSC)
 
 types: $(READY)  ## write what the dashboard's scripts know of its API
-	$(BIN)/python -m tests.orchestrator.dashboard.api_types
+	$(BIN)/python -m tests.orchestrator.watch.dashboard.api_types
 
 wheel: $(READY)  ## build a wheel for this Python and any Linux with the same or a newer glibc, into dist/
 	@$(PIP) --group wheel

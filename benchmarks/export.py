@@ -22,10 +22,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks import report
-from panolog.orchestrator.commands.models import as_ply, frame_in, size_of
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import read_info
-from panolog.orchestrator.stages.scenes import scene_of
+from panolog.orchestrator.cli.commands.models import as_ply, frame_in, size_of
+from panolog.orchestrator.engine.stages.scenes import scene_of
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import read_info
 from panolog.renderer.render import render_panorama
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.model import Scene

@@ -17,7 +17,7 @@ import jinja2
 from benchmarks import report
 from benchmarks.rasterizer.cases import CaseSpec
 from benchmarks.rasterizer.rows import COUNTS, TIMES, WIDTHS, Row, benchmark, tables
-from panolog.orchestrator.resources.machine import cores
+from panolog.orchestrator.runs.machines.machine import cores
 from panolog.renderer.process import choose_device, prepare
 from panolog.scene.files import write_bytes
 

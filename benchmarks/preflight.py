@@ -18,8 +18,8 @@ from typing import Any
 
 from benchmarks import report
 from benchmarks.runs import history, panolog, stage_seconds
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import Progressed
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.records import Progressed
 from panolog.synthetic.make import make_town
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -57,7 +57,7 @@ def machine(device: str = "cpu") -> dict[str, str | int]:
     """The hardware and versions that a measurement belongs to."""
     import torch  # noqa: PLC0415  # a table needs none of these, and a page must survive what breaks them
 
-    from panolog.orchestrator.resources.machine import cores  # noqa: PLC0415
+    from panolog.orchestrator.runs.machines.machine import cores  # noqa: PLC0415
     from panolog.renderer import _core  # noqa: PLC0415
 
     lines = Path("/proc/cpuinfo").read_text().splitlines()

@@ -10,13 +10,13 @@ from pathlib import Path
 from shutil import copytree, rmtree
 from typing import Any, cast
 
-from panolog.orchestrator.resources.machine import cores
-from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import Pool
-from panolog.orchestrator.run.config import change
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import make_info, read_info, write_info
-from panolog.orchestrator.run.records import (
+from panolog.orchestrator.engine.scheduling.pool import Pool
+from panolog.orchestrator.runs.config import change
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import make_info, read_info, write_info
+from panolog.orchestrator.runs.machines.machine import cores
+from panolog.orchestrator.runs.machines.nodes import Node, Placement
+from panolog.orchestrator.runs.records import (
     ModelSaved,
     Noticed,
     Part,
@@ -26,7 +26,7 @@ from panolog.orchestrator.run.records import (
     TaskStarted,
     task_name,
 )
-from panolog.orchestrator.run.store import Database, read_records
+from panolog.orchestrator.runs.store import Database, read_records
 from panolog.scene.errors import RunError
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId
@@ -62,7 +62,7 @@ class OneAtATime:
 @contextmanager
 def one_at_a_time(root: Path) -> Iterator[Pool]:
     """Ray on this machine for one run, with tasks one at a time; fresh workers, so that peaks are its own."""
-    from panolog.orchestrator.cluster.connection import connect  # noqa: PLC0415  # other benchmarks do without
+    from panolog.orchestrator.engine.cluster.connection import connect  # noqa: PLC0415  # other benchmarks do without
 
     with connect(None, root) as pool:
         yield cast(Pool, OneAtATime(pool))

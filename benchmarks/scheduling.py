@@ -3,11 +3,10 @@
     python -m benchmarks.scheduling                   # the table
     python -m benchmarks.scheduling RUN ... --json    # block costs of finished runs, as in block_costs.json
 
-The driver's own decisions (`placement` and `costs` in orchestrator/resources/) are simulated on a clock that
-jumps from one event to the next. They know cameras and Gaussians of all blocks, and the duration of a block
-once 5 % of it are done: from its rate, which is constant here. The best possible knows all durations in
-advance; it is the lower bound that HiGHS proves for "each block on one GPU, the last to finish as soon
-as possible".
+The driver's own decisions (`placement` and `costs` in the engine) are simulated on a clock that jumps from
+one event to the next. They know cameras and Gaussians of all blocks, and the duration of a block once 5 % of
+it are done: from its rate, which is constant here. The best possible knows all durations in advance; it is
+the lower bound that HiGHS proves for "each block on one GPU, the last to finish as soon as possible".
 
 The recorded costs are those of Stage II on a CPU. There all blocks refine the whole Stage I model, so they
 differ by at most a third. The generated ones, drawn around a power of cameras × Gaussians, differ by a factor
@@ -24,12 +23,12 @@ import numpy as np
 from scipy.optimize import LinearConstraint, milp
 
 from benchmarks import report
-from panolog.orchestrator.estimates import costs
-from panolog.orchestrator.resources import placement
-from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.state import replay
-from panolog.orchestrator.run.store import read_milestones
+from panolog.orchestrator.engine.estimates import costs
+from panolog.orchestrator.engine.scheduling import placement
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.machines.nodes import Gpu, Node, Placement
+from panolog.orchestrator.runs.state import replay
+from panolog.orchestrator.runs.store import read_milestones
 from panolog.workers.tasks import TaskId
 
 RECORDED = Path(__file__).with_name("block_costs.json")

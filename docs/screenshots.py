@@ -16,10 +16,10 @@ from typing import Any, Literal
 import httpx
 from playwright.sync_api import Browser, Page, expect
 
-from panolog.orchestrator.dashboard import server
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.views.site.build import Wanted, site_of_run, write_file
-from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.watch.dashboard import server
+from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_file
+from tests.orchestrator.watch.dashboard.browser import DESK, PHONE, chromium
 
 HERE = Path(__file__).parent
 _PATIENCE = 600_000  # milliseconds: without a GPU each frame takes seconds

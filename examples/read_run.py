@@ -8,12 +8,12 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from panolog.orchestrator.run import lock
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import read_info
-from panolog.orchestrator.run.state import replay
-from panolog.orchestrator.run.store import read_milestones
-from panolog.orchestrator.views.queries import series
+from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import read_info
+from panolog.orchestrator.runs.state import replay
+from panolog.orchestrator.runs.store import read_milestones
+from panolog.orchestrator.watch.views.queries import series
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -9,10 +9,10 @@ import argparse
 from collections.abc import Sequence
 
 import panolog
-from panolog.orchestrator.driver.local_pool import local_pool
-from panolog.orchestrator.run.config import load_config
-from panolog.orchestrator.run.records import Stored
-from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.engine.driver.local_pool import local_pool
+from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.records import Stored
+from panolog.orchestrator.runs.state import RunState
 
 
 def show(_: RunState, news: Sequence[Stored]) -> None:

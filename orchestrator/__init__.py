@@ -1,4 +1,4 @@
-"""Decides and shows: configuration, run state, the Ray driver, preflight, the command line."""
+"""Decides and shows: runs as data, the engine that trains them, what looks at them, and the command line."""
 
 import os
 

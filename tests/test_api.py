@@ -97,9 +97,9 @@ def test_run_and_resume_take_strings_and_the_defaults(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[tuple[object, ...]] = []
-    monkeypatch.setattr("panolog.orchestrator.commands.session.start", lambda *given: calls.append(given))
+    monkeypatch.setattr("panolog.orchestrator.cli.session.session.start", lambda *given: calls.append(given))
     monkeypatch.setattr(
-        "panolog.orchestrator.commands.session.resume", lambda *given, **_: calls.append(given)
+        "panolog.orchestrator.cli.session.session.resume", lambda *given, **_: calls.append(given)
     )
     output = str(tmp_path / "run")
     panolog.run(panolog.read_scene(scene), output)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import dropwhile, pairwise
 
 from benchmarks.chaos.faults import DAY_S, LIMITS, Kind
-from panolog.orchestrator.run.records import (
+from panolog.orchestrator.runs.records import (
     CheckpointSaved,
     EvaluationSaved,
     Failure,
@@ -25,7 +25,7 @@ from panolog.orchestrator.run.records import (
     TaskFailed,
     TaskStarted,
 )
-from panolog.orchestrator.run.state import RunState, Status, replay
+from panolog.orchestrator.runs.state import RunState, Status, replay
 from panolog.workers.tasks import TaskId
 
 Done = ModelSaved | ScoresSaved | PlanSaved | Merged | MeasuresSaved | EvaluationSaved

@@ -16,7 +16,7 @@ from typing_extensions import assert_never
 from benchmarks.chaos.cable import Cable
 from benchmarks.chaos.cluster import DRIVER, GROUPS, HEAD, SECOND, LocalCluster
 from benchmarks.chaos.shim import READ, WRITE, Rule
-from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.runs.folder import RunFolder
 from panolog.workers.tasks import StrEnum
 
 SILENCE_S = 10.0  # deadlines.message; a worker reports every second

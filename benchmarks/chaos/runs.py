@@ -16,7 +16,7 @@ from benchmarks.chaos.cluster import DRIVER, LocalCluster
 from benchmarks.chaos.fault_costs import Fault, FaultCost, fault_costs, true_times
 from benchmarks.chaos.faults import HELLO_S, QUARANTINE, RETRY_S, SILENCE_S, Planned, Undo, Victim
 from benchmarks.runs import BIN, history
-from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.runs.folder import RunFolder
 from panolog.synthetic.make import make_town
 
 SETTINGS = (
@@ -163,7 +163,7 @@ def _children(supervisor: subprocess.Popen[bytes]) -> tuple[psutil.Process | Non
     found: dict[bool, psutil.Process] = {}
     with suppress(psutil.Error):
         for child in psutil.Process(supervisor.pid).children():
-            found.setdefault("panolog.orchestrator.storage" in child.cmdline(), child)
+            found.setdefault("panolog.orchestrator.runs.storage" in child.cmdline(), child)
     return found.get(False), found.get(True)
 
 

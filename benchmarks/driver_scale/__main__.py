@@ -24,18 +24,18 @@ from benchmarks.driver_scale.simulated_pool import SimulatedPool, grid
 from benchmarks.driver_scale.status_requests import Times, request_status
 from benchmarks.processes import fresh_process, peak_memory
 from benchmarks.runs import history
-from panolog.orchestrator.driver.driver import Driver
-from panolog.orchestrator.driver.job import Job
-from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.run import folder as run_folder
-from panolog.orchestrator.run import info, lock
-from panolog.orchestrator.run.config import PassesConfig, RunConfig
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import SceneRef
-from panolog.orchestrator.run.records import Merged, PlanSaved, Progressed, RunBegan, Stored
-from panolog.orchestrator.run.state import RunState
-from panolog.orchestrator.run.store import Database
-from panolog.orchestrator.run.thinning import DENSE
+from panolog.orchestrator.engine.driver.driver import Driver
+from panolog.orchestrator.engine.driver.job import Job
+from panolog.orchestrator.engine.driver.journal import Journal
+from panolog.orchestrator.runs import folder as run_folder
+from panolog.orchestrator.runs import info, lock
+from panolog.orchestrator.runs.config import PassesConfig, RunConfig
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import SceneRef
+from panolog.orchestrator.runs.records import Merged, PlanSaved, Progressed, RunBegan, Stored
+from panolog.orchestrator.runs.state import RunState
+from panolog.orchestrator.runs.store import Database
+from panolog.orchestrator.runs.thinning import DENSE
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import TaskId

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import torch
 
-from panolog.orchestrator.resources.leaving import LeaveNotice
-from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import NONE, Ended, Hello, InProcess, Message
-from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
+from panolog.orchestrator.engine.scheduling.pool import NONE, Ended, Hello, InProcess, Message
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.machines.nodes import Node, Placement
 from panolog.partition.cells import Cell, Grid
 from panolog.partition.contraction import expand
 from panolog.scene.gaussians import Gaussians

@@ -13,8 +13,8 @@ from statistics import median
 
 from benchmarks.runs import BIN
 from panolog.orchestrator.cli.run import status
-from panolog.orchestrator.run import lock
-from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.folder import RunFolder
 from panolog.scene.errors import RunError
 
 CALLS = 20  # function calls for each command

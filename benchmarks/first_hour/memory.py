@@ -9,8 +9,8 @@ import torch
 from benchmarks.first_hour.outcome import Context, Outcome
 from benchmarks.processes import in_fresh_process
 from benchmarks.report import markdown
-from panolog.orchestrator.estimates.calibration import assumed
-from panolog.orchestrator.run.config import load_config
+from panolog.orchestrator.engine.estimates.calibration import assumed
+from panolog.orchestrator.runs.config import load_config
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
 from panolog.workers.calibration import CalibrateSpec

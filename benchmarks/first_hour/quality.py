@@ -12,10 +12,10 @@ import panolog
 from benchmarks import runs
 from benchmarks.first_hour.outcome import Context, Outcome
 from benchmarks.report import markdown
-from panolog.orchestrator.commands.demo import SETTINGS
-from panolog.orchestrator.driver.local_pool import local_pool
-from panolog.orchestrator.run.config import load_config
-from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.cli.commands.demo import SETTINGS
+from panolog.orchestrator.engine.driver.local_pool import local_pool
+from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.folder import RunFolder
 from panolog.scene.errors import RunError
 from panolog.synthetic.make import make_town
 

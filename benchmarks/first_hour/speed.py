@@ -8,7 +8,7 @@ from benchmarks.first_hour.outcome import NO_CARD, ROOT, Context, Outcome, shown
 from benchmarks.rasterizer import peers
 from benchmarks.rasterizer.cases import CaseSpec
 from benchmarks.rasterizer.rows import Row, tables
-from panolog.orchestrator.resources.machine import cores
+from panolog.orchestrator.runs.machines.machine import cores
 from panolog.renderer.process import prepare
 from panolog.scene.errors import DeviceError
 from panolog.scene.files import write_bytes

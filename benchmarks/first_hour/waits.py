@@ -12,7 +12,7 @@ import torch
 import panolog
 from benchmarks.first_hour.outcome import ROOT, Context, Outcome
 from benchmarks.report import markdown
-from panolog.orchestrator.run.config import load_config
+from panolog.orchestrator.runs.config import load_config
 from panolog.synthetic.make import make_town
 from panolog.workers.events import Progress
 

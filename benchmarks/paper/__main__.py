@@ -25,9 +25,9 @@ from benchmarks.paper.results import Result, Results
 from benchmarks.paper.runner import Bench, run_all
 from benchmarks.paper.study import Study
 from benchmarks.paper.variants import Settings, Variant, groups, stages, variants
-from panolog.orchestrator.resources.machine import cores
-from panolog.orchestrator.run.config import load_config
-from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.folder import RunFolder, write_json
+from panolog.orchestrator.runs.machines.machine import cores
 from panolog.partition.plan import Plan, read_plan
 from panolog.partition.scores import read_scores
 from panolog.renderer.process import prepare

@@ -11,12 +11,12 @@ from hashlib import sha256
 from pathlib import Path
 
 import panolog
-from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.info import fingerprint
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.info import fingerprint
 from panolog.workers.training.recipes import RECIPES
 
 _ROOT = Path(panolog.__file__).parent
-_PACKAGES = ("scene", "renderer", "partition", "workers", "orchestrator/driver")
+_PACKAGES = ("scene", "renderer", "partition", "workers", "orchestrator/engine/driver")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from panolog.orchestrator.run.folder import write_json
+from panolog.orchestrator.runs.folder import write_json
 
 METRICS = ("psnr", "ssim", "lpips", "lpips_3dgs", "ws_psnr", "ws_ssim")
 _UNTRAINED = ("measure", "eval", "")  # stages that no training needs

@@ -32,14 +32,14 @@ from benchmarks.paper.variants import (
     same_stage_one,
     same_training,
 )
-from panolog.orchestrator.api import resume, run
-from panolog.orchestrator.commands.evaluate import evaluate_run
-from panolog.orchestrator.commands.repartition import repartition
-from panolog.orchestrator.resources.machine import cores
-from panolog.orchestrator.run.config import AUTO, RunConfig
-from panolog.orchestrator.run.folder import RunFolder, write_json
-from panolog.orchestrator.run.records import ModelSaved, Progressed, RunBegan, Stored
-from panolog.orchestrator.run.state import replay
+from panolog.orchestrator.cli.commands.api import resume, run
+from panolog.orchestrator.cli.commands.evaluate import evaluate_run
+from panolog.orchestrator.cli.commands.repartition import repartition
+from panolog.orchestrator.runs.config import AUTO, RunConfig
+from panolog.orchestrator.runs.folder import RunFolder, write_json
+from panolog.orchestrator.runs.machines.machine import cores
+from panolog.orchestrator.runs.records import ModelSaved, Progressed, RunBegan, Stored
+from panolog.orchestrator.runs.state import replay
 from panolog.partition.cells import Grid
 from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import ConfigError, InputError, RunError

@@ -21,8 +21,8 @@ from benchmarks.paper.measure import Gallery
 from benchmarks.paper.results import Point
 from benchmarks.paper.variants import POINTS
 from benchmarks.runs import clock, history
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import CheckpointSaved, ModelSaved
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.records import CheckpointSaved, ModelSaved
 from panolog.partition.plan import Plan, read_plan
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import read_ply

@@ -10,7 +10,7 @@ from benchmarks.paper.goals import Goal, goals
 from benchmarks.paper.results import Results, from_json
 from benchmarks.paper.tables import Overlap, Table, main_tables, overlap_table
 from benchmarks.paper.variants import Settings
-from panolog.orchestrator.run.folder import write_json
+from panolog.orchestrator.runs.folder import write_json
 from panolog.scene.errors import InputError
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from benchmarks import report
 from benchmarks.rasterizer.cases import BLOCKS, CaseSpec
 from benchmarks.rasterizer.rows import COUNTS, WIDTHS, benchmark, tables
-from panolog.orchestrator.resources.machine import cores
+from panolog.orchestrator.runs.machines.machine import cores
 from panolog.renderer.process import choose_device, prepare
 
 

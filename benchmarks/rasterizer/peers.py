@@ -24,7 +24,7 @@ from torch import Tensor
 from benchmarks import report
 from benchmarks.rasterizer.cases import Case, CaseSpec
 from benchmarks.rasterizer.iteration import SH_DEGREE, TrainingStep
-from panolog.orchestrator.resources.machine import cores
+from panolog.orchestrator.runs.machines.machine import cores
 from panolog.renderer import ops
 from panolog.renderer.camera import Camera, Lens, facing, perspective
 from panolog.renderer.process import choose_device, prepare

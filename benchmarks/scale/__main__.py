@@ -20,7 +20,7 @@ from benchmarks.driver_scale.__main__ import Load
 from benchmarks.paper.curves import standalone
 from benchmarks.scale import cities, driver, laws, merging, models, plans
 from benchmarks.scale.page import page
-from panolog.orchestrator.run.folder import write_json
+from panolog.orchestrator.runs.folder import write_json
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import write_bytes
 from panolog.synthetic.make import make_city

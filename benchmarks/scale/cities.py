@@ -13,11 +13,11 @@ from matplotlib.axes import Axes
 
 from benchmarks.paper.curves import svg
 from benchmarks.runs import history, panolog
-from panolog.orchestrator.estimates.parts import districts_of
-from panolog.orchestrator.estimates.suggestions import DETAIL
-from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.records import Merged, Progressed, Stored
-from panolog.orchestrator.views.palette import BLOCK_COLORS
+from panolog.orchestrator.engine.estimates.parts import districts_of
+from panolog.orchestrator.engine.estimates.suggestions import DETAIL
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.records import Merged, Progressed, Stored
+from panolog.orchestrator.watch.views.palette import BLOCK_COLORS
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_city

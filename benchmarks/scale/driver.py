@@ -16,19 +16,19 @@ from benchmarks.driver_scale.__main__ import Load, Stopwatch, prepare
 from benchmarks.driver_scale.simulated_pool import SimulatedPool
 from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.runs import BIN
-from panolog.orchestrator.driver.driver import Driver
-from panolog.orchestrator.driver.job import Job
-from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.estimates.costs import CostModel, predictor
-from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
-from panolog.orchestrator.resources.placement import Demand, Running, place
-from panolog.orchestrator.run import lock
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import read_info
-from panolog.orchestrator.run.records import ModelSaved, RunBegan, Stored, TaskStarted
-from panolog.orchestrator.run.state import RunState
-from panolog.orchestrator.run.store import Database
-from panolog.orchestrator.stages.scenes import scene_of
+from panolog.orchestrator.engine.driver.driver import Driver
+from panolog.orchestrator.engine.driver.job import Job
+from panolog.orchestrator.engine.driver.journal import Journal
+from panolog.orchestrator.engine.estimates.costs import CostModel, predictor
+from panolog.orchestrator.engine.scheduling.placement import Demand, Running, place
+from panolog.orchestrator.engine.stages.scenes import scene_of
+from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import read_info
+from panolog.orchestrator.runs.machines.nodes import Gpu, Node, Placement
+from panolog.orchestrator.runs.records import ModelSaved, RunBegan, Stored, TaskStarted
+from panolog.orchestrator.runs.state import RunState
+from panolog.orchestrator.runs.store import Database
 from panolog.workers.tasks import Stage, TaskId
 
 _STATUS = 3  # commands, of which the median counts

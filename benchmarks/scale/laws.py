@@ -15,14 +15,14 @@ from matplotlib.axes import Axes
 from benchmarks.paper.curves import svg
 from benchmarks.scale.models import PER_BLOCK
 from benchmarks.scale.places import city
-from panolog.orchestrator.driver.local_pool import local_pool
-from panolog.orchestrator.estimates.calibration import Basis, assumed, calibrate
-from panolog.orchestrator.estimates.costs import StageEstimate
-from panolog.orchestrator.estimates.estimate import Estimator
-from panolog.orchestrator.estimates.suggestions import DETAIL, balanced
-from panolog.orchestrator.resources.nodes import Node
-from panolog.orchestrator.run.config import RunConfig, change
-from panolog.orchestrator.views.palette import BLOCK_COLORS
+from panolog.orchestrator.engine.driver.local_pool import local_pool
+from panolog.orchestrator.engine.estimates.calibration import Basis, assumed, calibrate
+from panolog.orchestrator.engine.estimates.costs import StageEstimate
+from panolog.orchestrator.engine.estimates.estimate import Estimator
+from panolog.orchestrator.engine.estimates.suggestions import DETAIL, balanced
+from panolog.orchestrator.runs.config import RunConfig, change
+from panolog.orchestrator.runs.machines.nodes import Node
+from panolog.orchestrator.watch.views.palette import BLOCK_COLORS
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.workers.tasks import Stage

@@ -19,12 +19,12 @@ import numpy as np
 
 from benchmarks.processes import drop_from_page_cache, in_fresh_process, peak_memory
 from benchmarks.rasterizer.cases import street
-from panolog.orchestrator.run.folder import RunFolder, write_json
-from panolog.orchestrator.run.records import BlockPlan, ModelSaved, PlanSaved, Record
-from panolog.orchestrator.run.state import replay
-from panolog.orchestrator.run.store import Database, read_milestones
-from panolog.orchestrator.run.units import gib
-from panolog.orchestrator.stages.merging import merge_run
+from panolog.orchestrator.engine.stages.merging import merge_run
+from panolog.orchestrator.runs.folder import RunFolder, write_json
+from panolog.orchestrator.runs.records import BlockPlan, ModelSaved, PlanSaved, Record
+from panolog.orchestrator.runs.state import replay
+from panolog.orchestrator.runs.store import Database, read_milestones
+from panolog.orchestrator.runs.units import gib
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan, read_plan
 from panolog.partition.regions import Regions

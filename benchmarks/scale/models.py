@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 
 from benchmarks.processes import in_fresh_process, peak_memory, resident_memory
 from benchmarks.scale.places import city
-from panolog.orchestrator.estimates.suggestions import balanced
-from panolog.orchestrator.run.config import RunConfig, change
-from panolog.orchestrator.stages.surroundings import Surroundings
+from panolog.orchestrator.engine.estimates.suggestions import balanced
+from panolog.orchestrator.engine.stages.surroundings import Surroundings
+from panolog.orchestrator.runs.config import RunConfig, change
 from panolog.partition.contraction import contract
 from panolog.renderer.process import release_memory
 from panolog.scene.model import Scene

@@ -13,7 +13,7 @@ from benchmarks.scale.laws import Calibrated, Law
 from benchmarks.scale.merging import MergeRow, exponent
 from benchmarks.scale.models import LevelsRow
 from benchmarks.scale.plans import PlanSize
-from panolog.orchestrator.estimates.suggestions import DETAIL
+from panolog.orchestrator.engine.estimates.suggestions import DETAIL
 
 TEMPLATE = Path(__file__).with_name("page.md.j2")
 _GIB, _FAR = 2**30, (160_000_000, 1_000_000_000)

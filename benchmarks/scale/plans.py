@@ -9,8 +9,8 @@ from scipy.sparse import csr_array
 
 from benchmarks.driver_scale.simulated_pool import grid
 from benchmarks.processes import in_fresh_process, peak_memory
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.stages.partitioning import write_plan
+from panolog.orchestrator.engine.stages.partitioning import write_plan
+from panolog.orchestrator.runs.folder import RunFolder
 from panolog.partition.plan import PartitionConfig, make_plan, read_plan
 from panolog.partition.scores import read_scores
 

@@ -21,7 +21,7 @@ from panolog.orchestrator.cli import (
 )
 from panolog.orchestrator.cli.console import Lasting, say
 from panolog.orchestrator.cli.usage import Command, Group
-from panolog.orchestrator.run import log
+from panolog.orchestrator.runs import log
 from panolog.scene.errors import InputError, PanologError, in_one_line
 
 

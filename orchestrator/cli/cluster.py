@@ -26,8 +26,8 @@ from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
-    from panolog.orchestrator.preparation.settings import Options
-    from panolog.orchestrator.run.config import RunConfig
+    from panolog.orchestrator.runs.config import RunConfig
+    from panolog.orchestrator.runs.preparation.settings import Options
 
 app = typer.Typer(
     cls=Group,
@@ -88,10 +88,10 @@ def submit(
 
     What --notify names by @FILE or env:NAME is a file or a variable of the head node.
     """
-    from panolog.orchestrator.cluster.jobs import on_head
-    from panolog.orchestrator.follower.plan import words_elsewhere
-    from panolog.orchestrator.preparation.settings import as_arguments
-    from panolog.orchestrator.run.config import as_settings
+    from panolog.orchestrator.engine.cluster.jobs import on_head
+    from panolog.orchestrator.runs.config import as_settings
+    from panolog.orchestrator.runs.preparation.settings import as_arguments
+    from panolog.orchestrator.watch.follower.plan import words_elsewhere
 
     source, run = on_head(source, "SCENE"), on_head(output, "--output")
     for what, path in {
@@ -121,8 +121,8 @@ def resume(
     as_json: JsonOption = False,
 ) -> None:
     """Resume a run on the cluster from its last checkpoints."""
-    from panolog.orchestrator.cluster.jobs import on_head
-    from panolog.orchestrator.follower.plan import words_elsewhere
+    from panolog.orchestrator.engine.cluster.jobs import on_head
+    from panolog.orchestrator.watch.follower.plan import words_elsewhere
 
     run = on_head(run, "RUN")
     words = ["resume", run, *wanted(prices, max_cost, deadline).options()]
@@ -135,7 +135,7 @@ def resume(
 @app.command(cls=Command)
 def status(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption = False) -> None:
     """Show the job of a run on the cluster, and its status."""
-    from panolog.orchestrator.cluster.jobs import connect, on_head
+    from panolog.orchestrator.engine.cluster.jobs import connect, on_head
 
     run = on_head(run, "RUN")
     columns = f"COLUMNS={get_terminal_size().columns}"  # a table as wide as this terminal
@@ -163,7 +163,7 @@ def status(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption 
 @app.command(cls=Command)
 def stop(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption = False) -> None:
     """Stop a run on the cluster; returns when its checkpoints are written."""
-    from panolog.orchestrator.cluster.jobs import connect, on_head
+    from panolog.orchestrator.engine.cluster.jobs import connect, on_head
 
     run = on_head(run, "RUN")
     with progress_bar("waiting until the checkpoints are written"):
@@ -182,7 +182,7 @@ def leave(seconds: SecondsArg = 120, node: NodeOption = "") -> None:
     Returns once they have, at the latest after so many seconds: for the preStop hook of a pod, and for the
     signal of a batch system. Machines of Amazon EC2, Google Compute Engine and Azure announce it themselves.
     """
-    from panolog.orchestrator.cluster.leave import leave as leave_cluster
+    from panolog.orchestrator.engine.cluster.leave import leave as leave_cluster
 
     with progress_bar("waiting until the tasks of this machine have moved"):
         gone = leave_cluster(seconds, node)
@@ -190,7 +190,7 @@ def leave(seconds: SecondsArg = 120, node: NodeOption = "") -> None:
 
 
 def _start(address: str, run: str, words: Sequence[str], *, as_json: bool) -> None:
-    from panolog.orchestrator.cluster.jobs import connect
+    from panolog.orchestrator.engine.cluster.jobs import connect
 
     with progress_bar(f"waiting for the cluster at {address}"):
         cluster = connect(address)

@@ -9,7 +9,7 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, TextIO
 
-from panolog.orchestrator.run.folder import command_line
+from panolog.orchestrator.runs.folder import command_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -97,7 +97,7 @@ def progress_bar(step: str, *, resumable: bool = False) -> Iterator[Callable[[st
 def _bar(step: str) -> Iterator[Callable[[str, int, int], None]]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from panolog.orchestrator.run.units import duration
+    from panolog.orchestrator.runs.units import duration
 
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[count]}"))
     with Progress(*columns, TimeElapsedColumn(), console=err(), transient=True) as bars:
@@ -151,8 +151,8 @@ def _lines(step: str) -> Iterator[Callable[[str, int, int], None]]:
 
 def say_results(root: Path, state: Any) -> None:
     """Says what a run has made and where."""
-    from panolog.orchestrator.run.folder import RunFolder
-    from panolog.orchestrator.views.terminal import metrics_line
+    from panolog.orchestrator.runs.folder import RunFolder
+    from panolog.orchestrator.watch.views.terminal import metrics_line
 
     folder = RunFolder(root)
     if state.money.reached is not None:

@@ -13,15 +13,15 @@ from panolog.scene.errors import ConfigError, RunFolderError
 from panolog.scene.stores.url import is_url, parse_url
 
 if TYPE_CHECKING:
-    from panolog.orchestrator.retention.clean import Cleaned
+    from panolog.orchestrator.runs.retention.clean import Cleaned
 
 _POLL = 0.5  # seconds between two looks at a driver that stops
 
 
 def stop(run: RunArg) -> None:
     """Stop a run as Ctrl-C does; returns when its checkpoints are written."""
-    from panolog.orchestrator.run import control
-    from panolog.orchestrator.run.folder import RunFolder
+    from panolog.orchestrator.runs import control
+    from panolog.orchestrator.runs.folder import RunFolder
 
     _request(run, "stop")
     folder = RunFolder(run)
@@ -63,10 +63,10 @@ def release(
 
 def _request(run: Path, action: str, block: int | None = None, node: str | None = None) -> None:
     """Sends a request to the driver. Raises InputError if no driver runs or the state does not allow it."""
-    from panolog.orchestrator.run import control
-    from panolog.orchestrator.run.folder import RunFolder, read_head
-    from panolog.orchestrator.run.state import replay
-    from panolog.orchestrator.run.store import read_milestones
+    from panolog.orchestrator.runs import control
+    from panolog.orchestrator.runs.folder import RunFolder, read_head
+    from panolog.orchestrator.runs.state import replay
+    from panolog.orchestrator.runs.store import read_milestones
     from panolog.scene.errors import InputError
 
     folder, wanted = RunFolder(run), control.request(action, block, node)
@@ -121,8 +121,8 @@ def clean(
 
     Of a run in a store: versions of files that its last states do not have. What that is is listed first.
     """
-    from panolog.orchestrator.retention.clean import age, clean
-    from panolog.orchestrator.retention.survey import Wanted
+    from panolog.orchestrator.runs.retention.clean import age, clean
+    from panolog.orchestrator.runs.retention.survey import Wanted
 
     wanted = Wanted(keep_checkpoints, blocks, None if older_than is None else age(older_than))
     if any(map(is_url, folders)):
@@ -135,7 +135,7 @@ def clean(
 
 def _runs_in(folders: list[str]) -> list[Path]:
     """The runs that these are, or have below them. Raises RunFolderError if one has none."""
-    from panolog.orchestrator.dashboard.discovery import discover
+    from panolog.orchestrator.watch.dashboard.discovery import discover
 
     roots: dict[Path, None] = {}
     for folder in map(Path, folders):
@@ -150,7 +150,7 @@ def _clean_stores(
     urls: list[str], keep: int, older: float | None, *, yes: bool, dry: bool, as_json: bool
 ) -> None:
     """Lists what may be removed of runs in stores, and removes it if that is confirmed."""
-    from panolog.orchestrator.retention.stores import clean_stores, survey_stores
+    from panolog.orchestrator.runs.retention.stores import clean_stores, survey_stores
 
     with progress_bar("reading the stores"):
         found = survey_stores([parse_url(url) for url in urls], keep, older)

@@ -37,7 +37,7 @@ def dashboard(
     """Serve the runs below FOLDER as web pages, until Ctrl-C."""
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder")
-    from panolog.orchestrator.dashboard import guard, server
+    from panolog.orchestrator.watch.dashboard import guard, server
 
     shown = _queue() if queue is None else queue.absolute()
     token = guard.token_for(host)
@@ -56,7 +56,7 @@ def dashboard(
 
 def _queue() -> Path | None:
     """The user's queue; None for a user without a home."""
-    from panolog.orchestrator.queue.store import default_folder
+    from panolog.orchestrator.runs.queue.store import default_folder
     from panolog.scene.errors import QueueError
 
     try:

@@ -89,8 +89,8 @@ def export(
     box, direction = crop and _box(crop), up and _direction(up)
     with opened(source, "export") as (root, _), progress_bar("reading the model") as show:
         from panolog.export.splats import Selection
-        from panolog.orchestrator.commands.export import ExportSpec, export_model
-        from panolog.orchestrator.commands.models import size_of
+        from panolog.orchestrator.cli.commands.export import ExportSpec, export_model
+        from panolog.orchestrator.cli.commands.models import size_of
 
         spec = ExportSpec(
             formats=tuple(name for name, given in wanted.items() if given),

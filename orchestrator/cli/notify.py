@@ -25,8 +25,8 @@ def test(
     notify: NotifyOption = None,
 ) -> None:
     """Send a test message to the targets of --notify and of PANOLOG_NOTIFY."""
-    from panolog.orchestrator.follower.plan import read_plan
-    from panolog.orchestrator.follower.trial import try_targets
+    from panolog.orchestrator.watch.follower.plan import read_plan
+    from panolog.orchestrator.watch.follower.trial import try_targets
 
     plan, _ = read_plan(notify or (), (), os.environ)
     if not plan.targets:

@@ -11,9 +11,9 @@ import typer
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
-    from panolog.orchestrator.money.limits import Wanted
-    from panolog.orchestrator.preparation.settings import Options
-    from panolog.orchestrator.run.config import RunConfig
+    from panolog.orchestrator.runs.config import RunConfig
+    from panolog.orchestrator.runs.money.limits import Wanted
+    from panolog.orchestrator.runs.preparation.settings import Options
 
 SceneArg = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Pano360 scene.")]
 AnySceneArg = Annotated[
@@ -209,8 +209,8 @@ PartialOption = Annotated[
 
 def wanted(prices: str | None, max_cost: str | None, deadline: str | None) -> "Wanted":
     """The values of these options. Raises ConfigError if one is wrong."""
-    from panolog.orchestrator.money.limits import Wanted
-    from panolog.orchestrator.money.prices import find_prices
+    from panolog.orchestrator.runs.money.limits import Wanted
+    from panolog.orchestrator.runs.money.prices import find_prices
 
     return Wanted.of(max_cost, deadline, find_prices(prices))
 
@@ -245,7 +245,7 @@ def run_config(
     ] = None,
 ) -> "RunConfig":
     """The options that set up a run, as its settings."""
-    from panolog.orchestrator.run.config import load_config
+    from panolog.orchestrator.runs.config import load_config
 
     flags = {"blocks": blocks, "iterations": iterations, "width": width, "device": device}
     return load_config(config, settings or (), flags | {"memory": memory, "recipe": recipe})
@@ -288,7 +288,7 @@ def preparation(
     ] = None,
 ) -> "Options":
     """The options that make a scene of panoramas or a video, as far as they are not the defaults."""
-    from panolog.orchestrator.preparation.settings import Options
+    from panolog.orchestrator.runs.preparation.settings import Options
 
     values = {"parallax": parallax, "frames": frames, "distance": distance}
     sfm: dict[str, Any] = {name: value for name, value in values.items() if value is not None}

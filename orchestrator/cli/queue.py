@@ -15,7 +15,7 @@ from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import QueueError
 
 if TYPE_CHECKING:
-    from panolog.orchestrator.queue.entries import Needs
+    from panolog.orchestrator.runs.queue.entries import Needs
 
 _KEPT = {"prices", "max_cost", "deadline", "local", "force"}  # the run itself has them, or a queue has none
 app = typer.Typer(
@@ -105,8 +105,8 @@ def add(
     **given: Any,
 ) -> None:
     """Add a run to the queue: the arguments and options of `panolog run`."""
-    from panolog.orchestrator.queue.entries import Command as Words
-    from panolog.orchestrator.queue.store import opened
+    from panolog.orchestrator.runs.queue.entries import Command as Words
+    from panolog.orchestrator.runs.queue.store import opened
 
     given |= _absolute(given)
     root = Path(given["output"])
@@ -125,8 +125,8 @@ def list_(
     as_json: JsonOption = False,
 ) -> None:
     """Show the entries of the queue in order."""
-    from panolog.orchestrator.queue.store import opened
-    from panolog.orchestrator.queue.view import view_queue
+    from panolog.orchestrator.runs.queue.store import opened
+    from panolog.orchestrator.runs.queue.view import view_queue
 
     with opened(_folder(queue), make=False) as found:
         shown = view_queue(found, removed=all_)
@@ -142,8 +142,8 @@ def move(
     queue: QueueOption = None,
 ) -> None:
     """Move an entry that waits."""
-    from panolog.orchestrator.queue.entries import State
-    from panolog.orchestrator.queue.store import opened
+    from panolog.orchestrator.runs.queue.entries import State
+    from panolog.orchestrator.runs.queue.store import opened
 
     if (before is not None) + first + last != 1:
         raise QueueError("queue move: give one of --before ID, --first and --last")
@@ -156,8 +156,8 @@ def move(
 @app.command(cls=Command)
 def remove(id: IdArg, queue: QueueOption = None) -> None:
     """Remove an entry that is not running; its run folder stays."""
-    from panolog.orchestrator.queue.store import opened
-    from panolog.orchestrator.queue.view import remove_entry
+    from panolog.orchestrator.runs.queue.store import opened
+    from panolog.orchestrator.runs.queue.view import remove_entry
 
     with opened(_folder(queue), make=False) as found:
         remove_entry(found, id)
@@ -174,7 +174,7 @@ def retry(
     """Let a run that has failed or was stopped wait again; it is resumed. Options replace its share."""
     from dataclasses import replace
 
-    from panolog.orchestrator.queue.store import opened
+    from panolog.orchestrator.runs.queue.store import opened
 
     memory = None if ram is None else int(ram * 2**30)
     values = {"gpus": gpus, "cores": cores, "memory": memory}
@@ -200,8 +200,8 @@ def run(
     queue: QueueOption = None,
 ) -> None:
     """Run what waits, in order; first resume what was running."""
-    from panolog.orchestrator.queue.runner import Limits, run_queue, sole_runner
-    from panolog.orchestrator.queue.store import opened
+    from panolog.orchestrator.runs.queue.runner import Limits, run_queue, sole_runner
+    from panolog.orchestrator.runs.queue.store import opened
 
     folder = _folder(queue)
     with opened(folder) as found, sole_runner(folder):
@@ -210,7 +210,7 @@ def run(
 
 
 def _folder(given: Path | None) -> Path:
-    from panolog.orchestrator.queue.store import default_folder
+    from panolog.orchestrator.runs.queue.store import default_folder
 
     return default_folder() if given is None else given.absolute()
 
@@ -228,7 +228,7 @@ def _needs(device: str, address: str | None, given: dict[str, Any]) -> "Needs | 
 
     Args: given, by option. Raises QueueError for options that contradict the run's own.
     """
-    from panolog.orchestrator.queue.entries import Needs
+    from panolog.orchestrator.runs.queue.entries import Needs
 
     gpus, cores, ram = given.values()
     if address is not None:
@@ -248,7 +248,7 @@ def _check(given: dict[str, Any]) -> str:
 
     Raises InputError as it does.
     """
-    from panolog.orchestrator.follower.plan import read_plan
+    from panolog.orchestrator.watch.follower.plan import read_plan
 
     def made(make: Callable[..., Any]) -> Any:
         return make(**{name: given[name] for name in inspect.signature(make).parameters})
@@ -262,7 +262,7 @@ def _check(given: dict[str, Any]) -> str:
             f"{output}: is a run already; {command('resume', output)} resumes it, or give another -o"
         )
     with progress_bar("checking the scene"):
-        from panolog.orchestrator.commands import session
+        from panolog.orchestrator.cli.session import session
 
         session.check(given["source"], output, config, options)
     return str(config.device)

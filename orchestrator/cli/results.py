@@ -50,12 +50,12 @@ def evaluate(
     device: DeviceOption = None,
 ) -> None:
     """Measure the quality of a model on the held-out panoramas."""
-    from panolog.orchestrator.run.folder import RunFolder
-    from panolog.orchestrator.run.info import read_info
+    from panolog.orchestrator.runs.folder import RunFolder
+    from panolog.orchestrator.runs.info import read_info
 
     read_info(RunFolder(run))  # fails before torch is imported
     with progress_bar("reading the run") as show:
-        from panolog.orchestrator.commands.evaluate import evaluate_run, lines
+        from panolog.orchestrator.cli.commands.evaluate import evaluate_run, lines
 
         report = evaluate_run(
             run,
@@ -116,7 +116,7 @@ def render(
     if fps is not None and not mp4:
         raise InputError("--fps is of videos: give --mp4 too")
     with progress_bar("reading the model") as show:
-        from panolog.orchestrator.commands.render import FPS, parse_view, render_views
+        from panolog.orchestrator.cli.commands.render import FPS, parse_view, render_views
 
         view = parse_view(width, fov, size, yaw, pitch, (fps or FPS) if mp4 else None)
         written = render_views(
@@ -154,13 +154,13 @@ def partition(
     device: DeviceOption = None,
 ) -> None:
     """Recompute the partition of a run with other settings, without training."""
-    from panolog.orchestrator.run.folder import RunFolder
-    from panolog.orchestrator.run.info import read_info
+    from panolog.orchestrator.runs.folder import RunFolder
+    from panolog.orchestrator.runs.info import read_info
 
     read_info(RunFolder(run))  # fails before torch is imported
     changes = {"blocks": blocks, "partition.tau_grad": tau, "partition.rho_tri": rho}
     with progress_bar("reading the run") as show:
-        from panolog.orchestrator.commands.repartition import repartition
+        from panolog.orchestrator.cli.commands.repartition import repartition
 
         tried = repartition(run, changes, output, device=device, progress=show)
     print_result(tried.plan.to_json(), tried.lines(), as_json=as_json)
@@ -198,7 +198,7 @@ def view(
 ) -> None:
     """Show the model of a run, a block or a file in 3D, in the browser, until Ctrl-C."""
     _require(source)
-    from panolog.orchestrator.run.folder import RunFolder, read_head
+    from panolog.orchestrator.runs.folder import RunFolder, read_head
 
     if source.is_dir():
         read_head(RunFolder(source))
@@ -208,8 +208,8 @@ def view(
         raise InputError(f"{output.parent}: there is no such folder for the page")
     with ExitStack() as open_until_the_end:
         with progress_bar("reading the model") as show:
-            from panolog.orchestrator.commands.view import SiteServer, serve, site_of, write_view
-            from panolog.orchestrator.views.site.build import Wanted
+            from panolog.orchestrator.cli.commands.view import SiteServer, serve, site_of, write_view
+            from panolog.orchestrator.watch.views.site.build import Wanted
             from panolog.workers.tasks import TaskId
 
             wanted = Wanted(TaskId.parse(task) if task else None, camera, max_gaussians or most)
@@ -260,7 +260,7 @@ def report(
     output: PageOption = None,
 ) -> None:
     """Write a run as one page to share: RUN/report.html, or FILE.html; several, compared, as FILE.html."""
-    from panolog.orchestrator.run.folder import RunFolder
+    from panolog.orchestrator.runs.folder import RunFolder
 
     if len(runs) > 1:
         if output is None:
@@ -272,7 +272,7 @@ def report(
     if is_url(runs[0]) and output is None:
         raise InputError("a report of a run in a store: give -o FILE.html")
     with opened(runs[0], "report") as (root, _), progress_bar("writing the report"):
-        from panolog.orchestrator.views.pages.report import write_report
+        from panolog.orchestrator.watch.views.pages.report import write_report
 
         page = write_report(RunFolder(root), output)
     print(page)
@@ -280,8 +280,8 @@ def report(
 
 def compare(runs: RunsArg, as_json: JsonOption = False, output: PageOption = None) -> None:
     """Compare runs: settings that differ, sizes, times and metrics; with -o as one page to share."""
-    from panolog.orchestrator.views.comparison.compare import compare as compare_runs
-    from panolog.orchestrator.views.comparison.reading import picture_of, read_runs
+    from panolog.orchestrator.watch.views.comparison.compare import compare as compare_runs
+    from panolog.orchestrator.watch.views.comparison.reading import picture_of, read_runs
 
     comparison = compare_runs(read_runs(runs), picture_of)
     if as_json:
@@ -289,7 +289,7 @@ def compare(runs: RunsArg, as_json: JsonOption = False, output: PageOption = Non
     else:
         from rich.console import Console
 
-        from panolog.orchestrator.views.comparison.terminal import table, width_of
+        from panolog.orchestrator.watch.views.comparison.terminal import table, width_of
 
         console = Console()
         if not console.is_terminal:  # a file or a pipe has no width
@@ -304,7 +304,7 @@ def _write_comparison(runs: list[Path], output: Path, *, quiet: bool = False) ->
     if not output.parent.is_dir():
         raise InputError(f"{output.parent}: there is no such folder for the page")
     with progress_bar("writing the page"):
-        from panolog.orchestrator.views.comparison.page import write_comparison
+        from panolog.orchestrator.watch.views.comparison.page import write_comparison
 
         write_comparison(runs, output)
     if quiet:

@@ -44,8 +44,8 @@ from panolog.orchestrator.cli.options import (
 from panolog.orchestrator.cli.stores import mirrored, opened
 
 if TYPE_CHECKING:
-    from panolog.orchestrator.preparation.settings import Options
-    from panolog.orchestrator.run.config import RunConfig
+    from panolog.orchestrator.runs.config import RunConfig
+    from panolog.orchestrator.runs.preparation.settings import Options
 
 _POLL = 0.5  # seconds between two reads of a live run
 _RESUMES = 10  # of a supervisor in a row without progress
@@ -72,9 +72,9 @@ def run(
     at_end: AtEndOption = None,
 ) -> None:
     """Reconstruct a scene, a folder of panoramas or a 360° video: one model of the place."""
-    from panolog.orchestrator.commands.at_end import when_ended
-    from panolog.orchestrator.preparation.settings import as_arguments
-    from panolog.orchestrator.run.config import as_settings
+    from panolog.orchestrator.cli.session.at_end import when_ended
+    from panolog.orchestrator.runs.config import as_settings
+    from panolog.orchestrator.runs.preparation.settings import as_arguments
 
     driver, budget = _driver_options(address, nice, dashboard=dashboard), wanted(prices, max_cost, deadline)
     code, state = 0, None
@@ -86,7 +86,7 @@ def run(
                 code = _supervise(root, first, driver, budget.options(), address, max_resumes)
             else:
                 with progress_bar("starting"):
-                    from panolog.orchestrator.commands import session
+                    from panolog.orchestrator.cli.session import session
 
                 with _display(root, output, dashboard=dashboard) as show:
                     state = session.start(source, root, config, address, show, None, nice, options, budget)
@@ -115,9 +115,9 @@ def resume(
     has_mirror: Annotated[bool, typer.Option("--has-mirror", hidden=True)] = False,
 ) -> None:
     """Resume a run from its last checkpoints."""
-    from panolog.orchestrator.commands.at_end import when_ended
-    from panolog.orchestrator.run.folder import RunFolder
-    from panolog.orchestrator.run.info import read_info
+    from panolog.orchestrator.cli.session.at_end import when_ended
+    from panolog.orchestrator.runs.folder import RunFolder
+    from panolog.orchestrator.runs.info import read_info
 
     options, budget = _driver_options(address, nice, dashboard=dashboard), wanted(prices, max_cost, deadline)
     code, state = 0, None
@@ -132,7 +132,7 @@ def resume(
                     code = _supervise(root, first, options, once, address, max_resumes)
                 else:
                     with progress_bar("starting"):
-                        from panolog.orchestrator.commands import session
+                        from panolog.orchestrator.cli.session import session
 
                     with _display(root, run, dashboard=dashboard) as show:
                         given = (root, address, show, None, nice, after, budget)
@@ -169,7 +169,7 @@ def demo(
     """Reconstruct a synthetic place: a small town, minutes on two CPU cores."""
     root = output or Path("runs", "city" if city else "flight" if flight else "demo")
     with progress_bar("starting") as count:
-        from panolog.orchestrator.commands.demo import demo_of, make_place, run_demo
+        from panolog.orchestrator.cli.commands.demo import demo_of, make_place, run_demo
 
         place = demo_of(flight=flight, city=city)
         scene = make_place(root, place, lambda done, total: count(f"rendering {place.title}", done, total))
@@ -198,7 +198,7 @@ def doctor(
     with progress_bar(
         "checking this machine" if scene is None else "measuring on the machine that will train"
     ):
-        from panolog.orchestrator.commands.doctor import diagnose
+        from panolog.orchestrator.cli.commands.doctor import diagnose
 
         diagnosis = diagnose(scene, config, address, found)
     print_result(diagnosis.as_json(), diagnosis.lines(), as_json=as_json)
@@ -216,12 +216,12 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     """Prints the state of a run. Args: run, its name in commands; live, whether a driver elsewhere has it."""
     from dataclasses import replace
 
-    from panolog.orchestrator.run import lock, presence
-    from panolog.orchestrator.run.folder import RunFolder, head_of, read_json
-    from panolog.orchestrator.run.state import replay
-    from panolog.orchestrator.run.store import read_milestones
-    from panolog.orchestrator.storage.state import read_state
-    from panolog.orchestrator.views.preparation import prepared_share, view_preparation, with_step
+    from panolog.orchestrator.runs import lock, presence
+    from panolog.orchestrator.runs.folder import RunFolder, head_of, read_json
+    from panolog.orchestrator.runs.state import replay
+    from panolog.orchestrator.runs.storage.state import read_state
+    from panolog.orchestrator.runs.store import read_milestones
+    from panolog.orchestrator.watch.views.preparation import prepared_share, view_preparation, with_step
 
     folder = RunFolder(root)
     info = read_json(folder)
@@ -234,8 +234,8 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     prepared = view_preparation(folder, state, running=running)
     state = with_step(state, prepared)
     if as_json:
-        from panolog.orchestrator.views.summary import summarize
-        from panolog.orchestrator.views.timing import progress_of
+        from panolog.orchestrator.watch.views.summary import summarize
+        from panolog.orchestrator.watch.views.timing import progress_of
 
         progress = progress_of(state, info, prepared_share(prepared) if prepared else None)
         head = {"run": run, "scene": scene, "width": width, "progress": progress}
@@ -245,7 +245,7 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
         return
     from rich import get_console
 
-    from panolog.orchestrator.views.terminal import WIDE, page
+    from panolog.orchestrator.watch.views.terminal import WIDE, page
 
     console = get_console()
     shown = page(state, root=root, name=run, info=info, running=running, wide=console.width >= WIDE)
@@ -269,9 +269,9 @@ def events(
 
 
 def _print_events(run: Path, *, follow: bool) -> None:
-    from panolog.orchestrator.run import lock
-    from panolog.orchestrator.run.folder import RunFolder, read_head
-    from panolog.orchestrator.run.store import as_event, read_records
+    from panolog.orchestrator.runs import lock
+    from panolog.orchestrator.runs.folder import RunFolder, read_head
+    from panolog.orchestrator.runs.store import as_event, read_records
 
     folder = RunFolder(run)
     read_head(folder)
@@ -312,7 +312,7 @@ def _supervise(
     limit: int | None,
 ) -> int:
     """Runs drivers as children of this process. Returns the exit code of the last one."""
-    from panolog.orchestrator.commands.supervise import Supervised, supervise
+    from panolog.orchestrator.cli.session.supervise import Supervised, supervise
 
     first, options = [*first, *options, *limits], [*options, "--has-mirror"]
     return supervise(Supervised(root, first, options, limits, address, limit or _RESUMES, _complain))
@@ -327,8 +327,8 @@ def _complain(line: str) -> None:
 @contextmanager
 def _followed(root: Path, notify: list[str] | None, log: list[str] | None) -> Iterator[None]:
     """Follows a run while the context lasts, if that is wanted. Raises ConfigError for wrong options."""
-    from panolog.orchestrator.commands.companion import companion_follower
-    from panolog.orchestrator.follower.plan import read_plan
+    from panolog.orchestrator.cli.session.companion import companion_follower
+    from panolog.orchestrator.watch.follower.plan import read_plan
 
     plan, secret = read_plan(notify or (), log or (), os.environ)
     for name in secret:  # neither Ray nor a worker gets them
@@ -344,10 +344,10 @@ def _display(root: Path, name: str, *, dashboard: bool = False) -> Iterator[Any]
     Args: name, of the run in commands. If the run is interrupted, says how to resume it and exits with 130.
     Raises RunError for an error that nothing foresees, once the run's history has it.
     """
-    from panolog.orchestrator.commands.companion import companion_dashboard
-    from panolog.orchestrator.driver.ending import internal
-    from panolog.orchestrator.run.folder import RunFolder
-    from panolog.orchestrator.views.terminal import progress
+    from panolog.orchestrator.cli.session.companion import companion_dashboard
+    from panolog.orchestrator.engine.driver.ending import internal
+    from panolog.orchestrator.runs.folder import RunFolder
+    from panolog.orchestrator.watch.views.terminal import progress
     from panolog.scene.errors import PanologError, RunError
 
     try:

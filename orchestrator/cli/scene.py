@@ -42,7 +42,7 @@ BatchOption = Annotated[
 def info(scene: AnySceneArg, as_json: JsonOption = False) -> None:
     """Show what a scene contains."""
     with progress_bar("reading the scene"):
-        from panolog.orchestrator.commands.scene import describe, lines
+        from panolog.orchestrator.cli.commands.scene import describe, lines
         from panolog.scene.read import read_scene
 
         description = describe(read_scene(scene))
@@ -83,7 +83,7 @@ def import_(
     as_json: JsonOption = False,
 ) -> None:
     """Convert a scene of openMVG, OpenSfM, nerfstudio, Metashape, SphereSfM and others."""
-    from panolog.orchestrator.resources.machine import memory
+    from panolog.orchestrator.runs.machines.machine import memory
     from panolog.prepare.importers.import_scene import import_scene
     from panolog.prepare.importers.interface import ImportSource
 
@@ -172,8 +172,7 @@ def mask(
             "nothing to mask: give --nadir DEGREES, --static, --model M.onnx, or several of them"
         )
     angle = None if nadir is None else _nadir_angle(nadir)
-    from panolog.orchestrator.commands.scene import mask_scene
-    from panolog.prepare.networks.masks import mask_lines
+    from panolog.prepare.networks.masks import mask_lines, mask_scene
 
     with progress_bar("reading the panoramas", resumable=True) as show:
         described = mask_scene(
@@ -191,7 +190,7 @@ def depth(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate depth maps and sky masks with an ONNX network."""
-    from panolog.orchestrator.commands.scene import estimate_depth
+    from panolog.prepare.networks.depth_report import estimate_depth
 
     with progress_bar("reading the panoramas", resumable=True) as show:
         described = estimate_depth(scene, model, batch=batch, device=device, say=say, progress=show)

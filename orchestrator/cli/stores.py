@@ -23,8 +23,8 @@ def mirrored(
     if not mirror or not (is_url(run) or resumes or local):  # as most runs: nothing of stores is imported
         yield Path(run)
         return
-    from panolog.orchestrator.storage.companion import mirrored as kept
-    from panolog.orchestrator.storage.plan import plan_of
+    from panolog.orchestrator.runs.storage.companion import mirrored as kept
+    from panolog.orchestrator.runs.storage.plan import plan_of
 
     plan = plan_of(run, local, os.environ, resumes=resumes, force=force)
     with kept(plan, say):
@@ -41,7 +41,7 @@ def opened(run: str, reader: Literal["status", "events", "report", "export"]) ->
         yield Path(run), False
         return
     url = parse_url(run)
-    from panolog.orchestrator.storage import fetch
+    from panolog.orchestrator.runs.storage import fetch
 
     wanted = {"report": fetch.for_report, "export": fetch.for_export}.get(reader, fetch.for_status)
     with progress_bar(f"reading {url}") as _, fetch.viewed(url, wanted) as found:

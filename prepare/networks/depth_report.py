@@ -1,18 +1,22 @@
-"""How the depth maps of a scene fit its sparse points, and what `panolog scene depth` reports (eq. 4)."""
+"""What `panolog scene depth` does: makes depth maps, and reports how they fit the sparse points (eq. 4)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from panolog.prepare.networks.depth_maps import DepthJob
+from panolog.prepare.networks.depth_maps import DepthJob, make_depth, plan_depth
 from panolog.prepare.networks.inverse_depth import NEAREST
+from panolog.prepare.panorama_files import list_posed_panoramas
 from panolog.scene.depth_alignment import Alignment, AlignmentError, align_depth
 from panolog.scene.image_files import read_info
 from panolog.scene.images import load_layers
 from panolog.scene.model import Scene
-from panolog.scene.write import Progress
+from panolog.scene.read import read_scene
+from panolog.scene.write import Progress, StageProgress
 
 
 @dataclass(frozen=True)
@@ -111,3 +115,16 @@ def align_depth_maps(scene: Scene, progress: Progress) -> list[MapAlignment]:
             found.append(MapAlignment(panorama.name, None, str(error)))
         progress(done, len(rows))
     return found
+
+
+def estimate_depth(
+    scene: Path, model: Path, *, batch: int, device: str, say: Callable[[str], None], progress: StageProgress
+) -> DepthReport:
+    """Writes the depth maps and sky masks of a scene that are missing, and aligns all (eq. 4).
+
+    Raises InputError if a panorama, the network or the device cannot be used; RunError if the network fails.
+    """
+    job = plan_depth(list_posed_panoramas(scene), model, device)
+    say(f"{len(job.todo)} panoramas on {job.network.device}; {job.done} are done, {job.given} maps are given")
+    make_depth(job, batch, partial(progress, "depth"))
+    return report_depth(job, align_depth_maps(read_scene(scene), partial(progress, "alignment")))

@@ -10,8 +10,9 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.networks.nadir import black_nadir, nadir_cone
 from panolog.prepare.networks.static_regions import FEWEST, MOST, WIDTH, StaticRegion, static_region
-from panolog.prepare.panorama_files import PanoramaFile, load_resized, prefetch
+from panolog.prepare.panorama_files import PanoramaFile, list_panoramas, load_resized, prefetch
 from panolog.prepare.provenance import (
     Provenance,
     check_panorama_size,
@@ -32,7 +33,7 @@ from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.image_files import ImageInfo, decode_used, read_info, resize
 from panolog.scene.read import MASKS
-from panolog.scene.write import Progress, no_progress
+from panolog.scene.write import Progress, StageProgress, no_progress
 
 GIVEN = "masks.given"  # folder of the user's masks that were combined
 
@@ -228,3 +229,28 @@ def _key(job: MaskJob, given: Path | None, size: tuple[int, int], alpha: bool) -
     if alpha:
         parts["alpha"] = True
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def mask_scene(
+    scene: Path,
+    *,
+    nadir: float | Literal["auto"] | None,
+    static: bool,
+    model: Path | None,
+    batch: int,
+    device: str,
+    progress: StageProgress,
+) -> dict[str, Any]:
+    """Writes the masks of a scene that are missing, and returns what `panolog scene mask --json` prints.
+
+    Args: nadir, degrees around straight down, or "auto", what is black there; static, find the operator;
+    model, an ONNX network for movers.
+    Raises InputError if a panorama, the network or the device cannot be used.
+    """
+    pictures = list_panoramas(scene)
+    movers = MoverNetwork(model, device, batch) if model is not None else None
+    if nadir == "auto":
+        nadir = find_nadir(pictures, partial(progress, "black nadir"))
+    region = find_static(pictures, partial(progress, "static regions")) if static else None
+    masks = make_masks(pictures, MaskJob(nadir, region, movers), partial(progress, "masks"))
+    return masks_as_json(masks, region, nadir)

@@ -8,8 +8,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from panolog.orchestrator.api import evaluate, resume, run, train
-    from panolog.orchestrator.run.config import RunConfig
+    from panolog.orchestrator.cli.commands.api import evaluate, resume, run, train
+    from panolog.orchestrator.runs.config import RunConfig
     from panolog.renderer.camera import Camera
     from panolog.renderer.render import render
     from panolog.scene.errors import (
@@ -52,8 +52,8 @@ __all__ = [
 ]
 
 _MODULES = {
-    "panolog.orchestrator.api": ("evaluate", "resume", "run", "train"),
-    "panolog.orchestrator.run.config": ("RunConfig",),
+    "panolog.orchestrator.cli.commands.api": ("evaluate", "resume", "run", "train"),
+    "panolog.orchestrator.runs.config": ("RunConfig",),
     "panolog.renderer.camera": ("Camera",),
     "panolog.renderer.render": ("render",),
     "panolog.scene.gaussians": ("Gaussians",),

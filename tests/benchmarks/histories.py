@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from panolog.orchestrator.run.records import (
+from panolog.orchestrator.runs.records import (
     CheckpointSaved,
     Failure,
     Merged,

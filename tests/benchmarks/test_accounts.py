@@ -8,9 +8,9 @@ from benchmarks.driver_scale.__main__ import lost
 from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.runs import clock, stage_seconds
 from benchmarks.scale.merging import SKY, _check, fill, measure
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import Progressed, Stored
-from panolog.orchestrator.run.thinning import DENSE
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.records import Progressed, Stored
+from panolog.orchestrator.runs.thinning import DENSE
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import join_ply, ply_header
 from panolog.workers.tasks import TaskId

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from benchmarks.runs import history
-from panolog.orchestrator.run.records import ModelSaved, TaskStarted
+from panolog.orchestrator.runs.records import ModelSaved, TaskStarted
 from panolog.scene.colmap import write_colmap
 from panolog.workers.tasks import Stage
 from tests.deploy.files import ROOT

@@ -10,7 +10,7 @@ import pytest
 import ray
 import yaml
 
-from panolog.orchestrator.cluster.jobs import RUN_KEY
+from panolog.orchestrator.engine.cluster.jobs import RUN_KEY
 from tests.deploy.files import DEPLOY, load_all, parsed
 
 SCHEMA = json.loads((Path(__file__).parent / "rayjob.schema.json").read_text())

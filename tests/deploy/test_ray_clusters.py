@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from ray.autoscaler._private.util import prepare_config, validate_config
 
-from panolog.orchestrator.resources.scaling import IDLE_S
+from panolog.orchestrator.engine.scheduling.scaling import IDLE_S
 from tests.deploy.files import DEPLOY, commands, load, programs
 from tests.ray_head import BIN, environment
 

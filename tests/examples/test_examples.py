@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import panolog
-from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import SceneRef, make_info, write_info
-from panolog.orchestrator.run.records import Progressed, RunBegan
-from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
+from panolog.orchestrator.runs.records import Progressed, RunBegan
+from panolog.orchestrator.runs.store import Database
 from panolog.prepare.importers import import_scene
 from panolog.scene.image_files import read_info
 from panolog.workers.tasks import COARSE

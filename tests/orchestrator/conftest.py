@@ -18,7 +18,7 @@ def harness(tmp_path: Path) -> Harness:
 @pytest.fixture(scope="module")
 def browser() -> Iterator["Browser"]:
     """One browser for all tests of a file; the test skips where there is none."""
-    from tests.orchestrator.dashboard.browser import chromium  # noqa: PLC0415  # loading Playwright takes a while
+    from tests.orchestrator.watch.dashboard.browser import chromium  # noqa: PLC0415  # loading Playwright takes a while
 
     with chromium() as running:
         yield running

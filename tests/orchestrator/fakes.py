@@ -11,21 +11,21 @@ import cv2
 import numpy as np
 import torch
 
-from panolog.orchestrator.commands.delivery import deliver
-from panolog.orchestrator.driver.driver import Driver, Hooks
-from panolog.orchestrator.driver.job import Job
-from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.driver.requests import Stop
-from panolog.orchestrator.resources.delivery import announced
-from panolog.orchestrator.resources.leaving import LeaveNotice
-from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message, Pool
-from panolog.orchestrator.run.clock import CLOCK, Clock
-from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import Failure, RunBegan
-from panolog.orchestrator.run.state import OnChange, RunState, ignore, replay
-from panolog.orchestrator.run.store import Database, read_milestones, read_records
+from panolog.orchestrator.cli.session.delivery import deliver
+from panolog.orchestrator.engine.driver.driver import Driver, Hooks
+from panolog.orchestrator.engine.driver.job import Job
+from panolog.orchestrator.engine.driver.journal import Journal
+from panolog.orchestrator.engine.driver.requests import Stop
+from panolog.orchestrator.engine.scheduling.delivery import announced
+from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
+from panolog.orchestrator.engine.scheduling.pool import NONE, Ended, Failed, Hello, InProcess, Message, Pool
+from panolog.orchestrator.runs.clock import CLOCK, Clock
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.machines.nodes import Node, Placement
+from panolog.orchestrator.runs.records import Failure, RunBegan
+from panolog.orchestrator.runs.state import OnChange, RunState, ignore, replay
+from panolog.orchestrator.runs.store import Database, read_milestones, read_records
 from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.workers.evaluation import EvaluateSpec

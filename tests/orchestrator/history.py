@@ -1,7 +1,7 @@
 """Records of runs, made up, and the state that follows from them."""
 
-from panolog.orchestrator.run.records import ModelSaved, Record, RunBegan, Stored, TaskStarted
-from panolog.orchestrator.run.state import RunState, replay
+from panolog.orchestrator.runs.records import ModelSaved, Record, RunBegan, Stored, TaskStarted
+from panolog.orchestrator.runs.state import RunState, replay
 from panolog.workers.tasks import TaskId
 
 BEGAN = RunBegan("host", 1, resumed=False)

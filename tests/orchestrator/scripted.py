@@ -11,8 +11,8 @@ from threading import Thread
 
 import torch
 
-from panolog.orchestrator.resources.nodes import Placement
-from panolog.orchestrator.resources.pool import Ended, Failed, Message, Pool
+from panolog.orchestrator.engine.scheduling.pool import Ended, Failed, Message, Pool
+from panolog.orchestrator.runs.machines.nodes import Placement
 from panolog.scene.errors import DeviceError, InputError
 from panolog.scene.image_files import decode
 from panolog.scene.model import Scene

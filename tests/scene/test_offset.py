@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from panolog.orchestrator.commands.render import ViewSpec, render_views
-from panolog.orchestrator.commands.scene import describe, lines
+from panolog.orchestrator.cli.commands.render import ViewSpec, render_views
+from panolog.orchestrator.cli.commands.scene import describe, lines
 from panolog.scene.colmap import read_colmap, read_panoramas, write_colmap
 from panolog.scene.errors import PlyError
 from panolog.scene.image_files import decode_panorama

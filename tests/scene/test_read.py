@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.runs.folder import RunFolder
 from panolog.prepare.panorama_files import find_image_files, list_posed_panoramas
 from panolog.prepare.provenance import png_with_provenance
 from panolog.scene.errors import InputError

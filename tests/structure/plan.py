@@ -43,15 +43,11 @@ def packages(parent: str = "") -> list[str]:
 
 
 def purpose(package: str) -> str:
-    """What the docstring of a package says in its first sentence."""
+    """What the docstring of a package says in its first sentence, and the packages inside of it."""
     source = (ROOT / package.replace(".", "/") / "__init__.py").read_text()
-    return (
-        (ast.get_docstring(ast.parse(source)) or "")
-        .split("\n\n")[0]
-        .replace("\n", " ")
-        .split(". ")[0]
-        .rstrip(".")
-    )
+    first = (ast.get_docstring(ast.parse(source)) or "").split("\n\n")[0].replace("\n", " ").split(". ")[0]
+    inner = [name.rpartition(".")[2] for name in packages(package) if package not in OPENED]
+    return first.rstrip(".") + (f" ({', '.join(inner)})" if inner else "")
 
 
 def edges(names: Iterable[str]) -> Edges:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from playwright.sync_api import Browser, Page
 
-from tests.orchestrator.dashboard.browser import chromium
+from tests.orchestrator.watch.dashboard.browser import chromium
 from tests.visual.compare import Picture
 from tests.visual.fixed import NOW, fixed_fonts
 

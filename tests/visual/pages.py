@@ -7,11 +7,11 @@ from pathlib import Path
 
 from playwright.sync_api import Page, expect
 
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.views.comparison.page import write_comparison
-from panolog.orchestrator.views.pages.report import write_report
-from tests.orchestrator.dashboard.browser import DESK, PHONE
-from tests.orchestrator.dashboard.served import Served, serving
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.watch.views.comparison.page import write_comparison
+from panolog.orchestrator.watch.views.pages.report import write_report
+from tests.orchestrator.watch.dashboard.browser import DESK, PHONE
+from tests.orchestrator.watch.dashboard.served import Served, serving
 from tests.visual.fixed import fixed_machine
 from tests.visual.queue import queue_at_work
 from tests.visual.runs import all_runs

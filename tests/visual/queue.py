@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from panolog.orchestrator.queue.entries import Command, Needs, Share, State
-from panolog.orchestrator.queue.processes import Processes
-from panolog.orchestrator.queue.runner import lock_of
-from panolog.orchestrator.queue.store import Queue
-from panolog.orchestrator.run import lock
+from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.queue.entries import Command, Needs, Share, State
+from panolog.orchestrator.runs.queue.processes import Processes
+from panolog.orchestrator.runs.queue.runner import lock_of
+from panolog.orchestrator.runs.queue.store import Queue
 from tests.visual.fixed import Clock
 from tests.visual.runs import NAMES
 

@@ -9,7 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from panolog.orchestrator.preparation.notes import (
+from panolog.orchestrator.engine.stages.partitioning import plan_records, write_plan
+from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.folder import RunFolder, write_json
+from panolog.orchestrator.runs.info import PENDING, RunInfo, SceneRef, read_info, write_info
+from panolog.orchestrator.runs.machines.gpus import GpuUsage
+from panolog.orchestrator.runs.machines.usage import Usage
+from panolog.orchestrator.runs.preparation.notes import (
     Counts,
     StepProgress,
     StepResult,
@@ -19,14 +26,8 @@ from panolog.orchestrator.preparation.notes import (
     sfm_picture,
     write_note,
 )
-from panolog.orchestrator.preparation.settings import Settings, Step, write_settings
-from panolog.orchestrator.resources.gpus import GpuUsage
-from panolog.orchestrator.resources.usage import Usage
-from panolog.orchestrator.run import lock
-from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.folder import RunFolder, write_json
-from panolog.orchestrator.run.info import PENDING, RunInfo, SceneRef, read_info, write_info
-from panolog.orchestrator.run.records import (
+from panolog.orchestrator.runs.preparation.settings import Settings, Step, write_settings
+from panolog.orchestrator.runs.records import (
     CheckpointSaved,
     Delivered,
     EvaluationSaved,
@@ -51,9 +52,8 @@ from panolog.orchestrator.run.records import (
     TaskYielded,
     ViewEvaluated,
 )
-from panolog.orchestrator.run.store import Database
-from panolog.orchestrator.stages.partitioning import plan_records, write_plan
-from panolog.orchestrator.views.pages.report import write_report
+from panolog.orchestrator.runs.store import Database
+from panolog.orchestrator.watch.views.pages.report import write_report
 from panolog.workers.tasks import COARSE, EVAL, PREPARE, TaskId
 from tests.visual import town
 from tests.visual.fixed import HOST, Clock

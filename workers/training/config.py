@@ -1,6 +1,6 @@
 """The settings of training, each with its unit and the source of its default.
 
-Free of torch: `orchestrator.run` reads these settings and must not import it. The settings of all parts of
+Free of torch: `orchestrator.runs` reads these settings and must not import it. The settings of all parts of
 training are therefore here and not next to their code; those of its tasks, which no model depends on, are in
 `task_config`.
 

@@ -142,7 +142,7 @@ def test_an_unfinished_run_of_other_settings_or_code_begins_anew(
 
 
 def test_code_is_what_decides_a_training(tmp_path: Path) -> None:
-    for package in ("scene", "renderer", "partition", "workers", "orchestrator/driver", "prepare"):
+    for package in ("scene", "renderer", "partition", "workers", "orchestrator/engine/driver", "prepare"):
         (tmp_path / package).mkdir(parents=True)
         (tmp_path / package / "a.py").write_text("x = 1")
     before = present(tmp_path)

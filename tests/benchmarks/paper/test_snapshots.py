@@ -9,7 +9,7 @@ import panolog
 from benchmarks.paper.crops import best_windows
 from benchmarks.paper.measure import Gallery, haze
 from benchmarks.paper.snapshots import State, _assembled, _even, kept, look
-from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.runs.config import RunConfig
 from panolog.partition.cells import Grid
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import write_ply

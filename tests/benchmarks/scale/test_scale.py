@@ -11,7 +11,7 @@ from benchmarks.scale.laws import laws, pictures, shown
 from benchmarks.scale.merging import exponent
 from benchmarks.scale.page import TEMPLATE, page
 from benchmarks.scale.places import city
-from panolog.orchestrator.estimates.calibration import Basis
+from panolog.orchestrator.engine.estimates.calibration import Basis
 from tests.deploy.files import ROOT
 from tests.orchestrator.calibrated import calibrated
 

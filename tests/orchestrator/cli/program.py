@@ -7,9 +7,9 @@ from typing import Any
 from typer.testing import CliRunner, Result
 
 from panolog.orchestrator.cli import app
-from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.scene.ply import write_ply
 from panolog.scene.read import read_scene
 from panolog.workers.tasks import COARSE

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.resources.nodes import Node
-from panolog.orchestrator.run.records import Noticed, Progressed, RunBegan, TaskStarted
-from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.runs.machines.nodes import Node
+from panolog.orchestrator.runs.records import Noticed, Progressed, RunBegan, TaskStarted
+from panolog.orchestrator.runs.store import Database
 from panolog.scene.errors import RunError
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.calibrated import says
 from tests.orchestrator.cli.program import begun, call, finished, one_line, shown
 from tests.orchestrator.fakes import FakePool
-from tests.orchestrator.views.comparison.runs import metrics, write
+from tests.orchestrator.watch.views.comparison.runs import metrics, write
 from tests.scenes import write_scene
 
 
@@ -44,7 +44,7 @@ def calibrated(monkeypatch: pytest.MonkeyPatch, memory: int) -> None:
     def connect(*_: object) -> Iterator[FakePool]:
         yield FakePool(says, [Node("node", "host", 2, memory)])
 
-    monkeypatch.setattr("panolog.orchestrator.cluster.connection.connect", connect)
+    monkeypatch.setattr("panolog.orchestrator.engine.cluster.connection.connect", connect)
 
 
 @pytest.mark.parametrize(
@@ -87,11 +87,11 @@ def test_what_the_system_refuses_is_one_line(
     def refuse(*_: object) -> None:
         raise PermissionError(13, "Permission denied", "/root/runs")
 
-    monkeypatch.setattr("panolog.orchestrator.commands.repartition.write_plan", refuse)
+    monkeypatch.setattr("panolog.orchestrator.cli.commands.repartition.write_plan", refuse)
     out = tmp_path / "out"
     line = "panolog: /root/runs: Permission denied"
     assert one_line(call("partition", root, "--tau", "1", "-o", out)) == line
-    monkeypatch.setattr("panolog.orchestrator.commands.session.start", refuse)
+    monkeypatch.setattr("panolog.orchestrator.cli.session.session.start", refuse)
     assert one_line(call("run", scene, "-o", out)) == line
 
 
@@ -113,10 +113,10 @@ def test_a_failed_and_an_interrupted_run(
         begun(root)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("panolog.orchestrator.commands.session.start", fail)
+    monkeypatch.setattr("panolog.orchestrator.cli.session.session.start", fail)
     failed = call("run", scene, "-o", tmp_path / "run")
     assert (failed.exit_code, failed.stderr) == (1, "panolog: block 3 failed\n")
-    monkeypatch.setattr("panolog.orchestrator.commands.session.start", interrupt)
+    monkeypatch.setattr("panolog.orchestrator.cli.session.session.start", interrupt)
     root = tmp_path / "my run"
     interrupted = call("run", scene, "-o", root)
     assert interrupted.exit_code == 130
@@ -213,9 +213,10 @@ def test_what_only_reads_imports_neither_torch_nor_ray(run: Path, tmp_path: Path
     others = [str(write(tmp_path / name, measured=metrics()).root) for name in ("one", "other")]
     commands = [["--help"], ["status", str(run)], ["events", str(run)], ["compare", *others]]
     script = (
-        "import sys\nfrom panolog.orchestrator.cli.app import app\nimport panolog.orchestrator.queue.view\n"
+        "import sys\nfrom panolog.orchestrator.cli.app import app\n"
+        "import panolog.orchestrator.runs.queue.view\n"
         "assert 'pydantic' not in sys.modules\n"
-        "import panolog.orchestrator.commands.supervise\n"
+        "import panolog.orchestrator.cli.session.supervise\n"
         f"for command in {commands!r}:\n"
         "    app(command, standalone_mode=False)\n"
         "    assert not {'torch', 'ray', 'cv2'} & set(sys.modules), (command, sorted(sys.modules))"

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.runs.folder import RunFolder
 from tests.orchestrator.cli.program import call, one_line
-from tests.orchestrator.views.comparison.runs import metrics, write
+from tests.orchestrator.watch.views.comparison.runs import metrics, write
 
 ESCAPE = "\x1b[31m\x1b]0;title\x07red"
 

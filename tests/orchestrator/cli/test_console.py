@@ -20,11 +20,11 @@ from typer.main import get_command
 
 from panolog.orchestrator.cli import app, console
 from panolog.orchestrator.cli.console import Lasting
-from panolog.orchestrator.run import log
-from panolog.orchestrator.run.records import Outcome, Record, RunBegan, RunEnded, TaskFailed, TaskStarted
-from panolog.orchestrator.run.state import replay
-from panolog.orchestrator.run.store import Database
-from panolog.orchestrator.views.terminal import page, progress
+from panolog.orchestrator.runs import log
+from panolog.orchestrator.runs.records import Outcome, Record, RunBegan, RunEnded, TaskFailed, TaskStarted
+from panolog.orchestrator.runs.state import replay
+from panolog.orchestrator.runs.store import Database
+from panolog.orchestrator.watch.views.terminal import page, progress
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.cli.program import call
 

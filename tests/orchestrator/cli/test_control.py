@@ -8,12 +8,12 @@ from threading import Event, Thread
 
 import pytest
 
-from panolog.orchestrator.run import control, lock
-from panolog.orchestrator.run.control import Action, ControlRequest
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.presence import Presence
-from panolog.orchestrator.run.records import BlockPlan, NodeQuarantined, PlanSaved, RunBegan, TaskFailed
-from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.runs import control, lock
+from panolog.orchestrator.runs.control import Action, ControlRequest
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.presence import Presence
+from panolog.orchestrator.runs.records import BlockPlan, NodeQuarantined, PlanSaved, RunBegan, TaskFailed
+from panolog.orchestrator.runs.store import Database
 from panolog.workers.tasks import TaskId
 from tests.orchestrator.cli.program import begun, call, one_line, shown
 
@@ -57,7 +57,7 @@ def test_status_says_why_a_run_waits_where_its_database_takes_nothing(driven: Ru
 
 
 def test_what_makes_no_sense_is_one_line(driven: RunFolder) -> None:
-    """All reasons are in tests/orchestrator/run/test_control.py."""
+    """All reasons are in tests/orchestrator/runs/test_control.py."""
     line = f"panolog: {driven.root}: pause block 1: it is failed"
     assert one_line(call("pause", driven.root, 1)) == line
     assert control.take(driven) == []

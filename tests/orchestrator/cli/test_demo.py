@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from panolog.orchestrator.run.info import SceneRef
+from panolog.orchestrator.runs.info import SceneRef
 from tests.orchestrator.cli.program import begun, call, one_line
 
 
@@ -28,8 +28,8 @@ def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Demo:
         found.started.append((scene, root, f"{config.recipe} {config.blocks}"))
 
     for kind in ("town", "flight", "city"):
-        monkeypatch.setattr(f"panolog.orchestrator.commands.demo.make_{kind}", partial(make, kind))
-    monkeypatch.setattr("panolog.orchestrator.commands.session.start", start)
+        monkeypatch.setattr(f"panolog.orchestrator.cli.commands.demo.make_{kind}", partial(make, kind))
+    monkeypatch.setattr("panolog.orchestrator.cli.session.session.start", start)
     monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
     monkeypatch.chdir(tmp_path)
     return found

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from typer.testing import Result
 
 from panolog.export.reading import read_model
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import SceneRef
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import SceneRef
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import read_ply, write_ply
 from panolog.scene.read import read_scene

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from tests.orchestrator.cli.program import call, one_line
-from tests.orchestrator.follower import histories
-from tests.orchestrator.follower.mail_server import mailbox
-from tests.orchestrator.follower.receivers import receiver
+from tests.orchestrator.watch.follower import histories
+from tests.orchestrator.watch.follower.mail_server import mailbox
+from tests.orchestrator.watch.follower.receivers import receiver
 from tests.ray_head import living, wait_until
 from tests.scenes import write_scene
 
@@ -61,12 +61,12 @@ def test_a_run_gives_its_secrets_to_no_process_and_no_file(
 
     def start(_: object, root: Path, *__: object) -> None:
         seen.append(repr(os.environ))
-        wait_until(lambda: living("panolog.orchestrator.follower"), "the follower")
-        (follower,) = living("panolog.orchestrator.follower")
+        wait_until(lambda: living("panolog.orchestrator.watch.follower"), "the follower")
+        (follower,) = living("panolog.orchestrator.watch.follower")
         seen.append(repr((follower.cmdline(), follower.environ())))
         histories.write(root)
 
-    monkeypatch.setattr("panolog.orchestrator.commands.session.start", start)
+    monkeypatch.setattr("panolog.orchestrator.cli.session.session.start", start)
     monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
     secrets = ["HOOK", "PANOLOG_NOTIFY", "PANOLOG_NOTIFY_SECRET", "PANOLOG_NTFY_TOKEN"]
     secrets += ["PANOLOG_SMTP_USER", "PANOLOG_SMTP_PASSWORD"]

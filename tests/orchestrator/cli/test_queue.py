@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.queue.entries import Needs, State
-from panolog.orchestrator.queue.store import opened
-from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.queue.entries import Needs, State
+from panolog.orchestrator.runs.queue.store import opened
 from tests.orchestrator.cli.program import begun, call, one_line, shown
 from tests.scenes import write_scene
 
@@ -69,7 +69,7 @@ def test_run_and_resume_take_the_words_of_a_queue(
     monkeypatch.setattr("panolog.orchestrator.cli.run.say_results", lambda *_: None)
     for name in ("start", "resume"):
         monkeypatch.setattr(
-            f"panolog.orchestrator.commands.session.{name}", lambda *given_, **_: given.append(given_)
+            f"panolog.orchestrator.cli.session.session.{name}", lambda *given_, **_: given.append(given_)
         )
     add(here, "run", "--set", "sky.count=9", "--iterations", "70", "--nice", "5", "--address", "auto")
     with opened(here / "queue", make=False) as queue:
@@ -168,7 +168,7 @@ def test_the_list_and_what_changes_it(here: Path) -> None:
 
 
 def test_a_queue_runs_the_program(here: Path) -> None:
-    """Here one that is refused at once; what follows an end is proven in tests/orchestrator/queue."""
+    """Here one that is refused at once; what follows an end is proven in tests/orchestrator/runs/queue."""
     gone = write_scene(here / "gone")
     assert call("queue", "add", gone, "-o", here / "run").exit_code == 0
     shutil.rmtree(gone)

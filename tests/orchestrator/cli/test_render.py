@@ -7,7 +7,7 @@ import cv2
 import pytest
 from typer.testing import Result
 
-from panolog.orchestrator.commands.render import lens_like
+from panolog.orchestrator.cli.commands.render import lens_like
 from panolog.renderer.camera import Lens
 from panolog.scene.ply import write_ply
 from panolog.scene.read import read_scene
@@ -70,7 +70,7 @@ def test_a_video_that_is_cut_off_leaves_nothing(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("panolog.orchestrator.commands.render.perspective", interrupt)
+    monkeypatch.setattr("panolog.orchestrator.cli.commands.render.perspective", interrupt)
     out = tmp_path / "out"
     assert render(ply, "-o", out, "--poses", poses, "--fov", 90, "--size", "64x36", "--mp4").exit_code == 130
     assert list(out.iterdir()) == []

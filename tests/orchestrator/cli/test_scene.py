@@ -88,7 +88,7 @@ def test_ctrl_c_keeps_what_is_done(scene: Path, model: Path, monkeypatch: pytest
 
         real(job, batch, interrupt)
 
-    monkeypatch.setattr("panolog.orchestrator.commands.scene.make_depth", stopped)
+    monkeypatch.setattr("panolog.prepare.networks.depth_report.make_depth", stopped)
     result = call("depth", scene, "--model", model)
     assert result.exit_code == 130
     assert "finished work is kept; the same command resumes it" in result.stderr

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.storage.plan import local_folder, plan_from_json, plan_of, to_json
+from panolog.orchestrator.runs.storage.plan import local_folder, plan_from_json, plan_of, to_json
 from panolog.scene.errors import ConfigError
 from panolog.scene.stores.cache import FOLDER
 from tests.orchestrator.cli.program import call

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from panolog.orchestrator.commands import session
-from panolog.orchestrator.driver.local_pool import local_pool
-from panolog.orchestrator.run import control
-from panolog.orchestrator.run.config import load_config
-from panolog.orchestrator.run.control import Action
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import CheckpointSaved, Stored, TaskStarted, TaskYielded, ViewEvaluated
-from panolog.orchestrator.run.state import OnChange, RunState, ignore
-from panolog.orchestrator.run.store import read_records
+from panolog.orchestrator.cli.session import session
+from panolog.orchestrator.engine.driver.local_pool import local_pool
+from panolog.orchestrator.runs import control
+from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.control import Action
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.records import CheckpointSaved, Stored, TaskStarted, TaskYielded, ViewEvaluated
+from panolog.orchestrator.runs.state import OnChange, RunState, ignore
+from panolog.orchestrator.runs.store import read_records
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, EVAL, TaskId

@@ -10,13 +10,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from panolog.orchestrator.commands import session
-from panolog.orchestrator.driver.local_pool import local_pool
-from panolog.orchestrator.run.config import load_config
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import Noticed, Outcome, RunBegan, RunEnded, TaskYielded
-from panolog.orchestrator.run.state import RunState, ignore
-from panolog.orchestrator.run.store import read_records
+from panolog.orchestrator.cli.session import session
+from panolog.orchestrator.engine.driver.local_pool import local_pool
+from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.records import Noticed, Outcome, RunBegan, RunEnded, TaskYielded
+from panolog.orchestrator.runs.state import RunState, ignore
+from panolog.orchestrator.runs.store import read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.whole_runs.test_whole_runs import SETS, state_of

@@ -11,19 +11,19 @@ from pathlib import Path
 import psutil
 import pytest
 
-from panolog.orchestrator.cluster import connection
-from panolog.orchestrator.commands import session
-from panolog.orchestrator.driver.local_pool import LocalPool, local_pool
-from panolog.orchestrator.money.limits import Wanted
-from panolog.orchestrator.money.prices import read_prices
-from panolog.orchestrator.resources.nodes import Placement
-from panolog.orchestrator.run.config import load_config
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import CheckpointSaved, RunBegan, Stored, TaskStarted
-from panolog.orchestrator.run.state import RunState, replay
-from panolog.orchestrator.run.store import read_milestones, read_records
-from panolog.orchestrator.storage.layout import OBJECTS, current
-from panolog.orchestrator.storage.lease import holder
+from panolog.orchestrator.cli.session import session
+from panolog.orchestrator.engine.cluster import connection
+from panolog.orchestrator.engine.driver.local_pool import LocalPool, local_pool
+from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.machines.nodes import Placement
+from panolog.orchestrator.runs.money.limits import Wanted
+from panolog.orchestrator.runs.money.prices import read_prices
+from panolog.orchestrator.runs.records import CheckpointSaved, RunBegan, Stored, TaskStarted
+from panolog.orchestrator.runs.state import RunState, replay
+from panolog.orchestrator.runs.storage.layout import OBJECTS, current
+from panolog.orchestrator.runs.storage.lease import holder
+from panolog.orchestrator.runs.store import read_milestones, read_records
 from panolog.scene.ply import ply_header
 from panolog.scene.stores.store import open_store
 from panolog.synthetic.make import make_town
@@ -31,7 +31,7 @@ from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from tests.examples.test_examples import example
 from tests.orchestrator.cli.program import call, shown
-from tests.orchestrator.views.pages.snapshots import snapshot_of
+from tests.orchestrator.watch.views.pages.snapshots import snapshot_of
 
 pytestmark = pytest.mark.system
 
@@ -46,8 +46,8 @@ import json, os, sys
 from dataclasses import dataclass, replace
 from threading import Event
 from panolog.orchestrator.cli import app
-from panolog.orchestrator.commands import session
-from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.cli.session import session
+from panolog.orchestrator.engine.driver.driver import Driver
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.training.trainer import TrainSpec
 

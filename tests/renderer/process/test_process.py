@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch.torch_version import TorchVersion
 
-from panolog.orchestrator.commands.doctor import diagnose
-from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.cli.commands.doctor import diagnose
+from panolog.orchestrator.runs.config import RunConfig
 from panolog.renderer.process import choose_device, growing_segments
 from panolog.renderer.unused_gpu import unused_gpu
 from panolog.scene.errors import DeviceError

@@ -1,4 +1,4 @@
-"""A store with the faults that S3 has; URLs; the cache. tests/orchestrator/storage has all providers."""
+"""A store with the faults that S3 has; URLs; the cache. tests/orchestrator/runs/storage has all providers."""
 
 import os
 from collections.abc import Iterator

@@ -1,0 +1,234 @@
+"""`panolog export`: a run's model, or any model, as files that others open."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from panolog.export.compressed_ply import write_compressed_ply
+from panolog.export.detail import SIDE
+from panolog.export.frame import Frame
+from panolog.export.georeference import Georeference, georeference_from, georeference_of
+from panolog.export.gltf.glb import write_glb
+from panolog.export.gltf.tiles import TILESET, write_tiles
+from panolog.export.reading import sky_of
+from panolog.export.site.write import DESCRIPTION
+from panolog.export.sky import render_sky, write_sky_image
+from panolog.export.sog.write import write_sog
+from panolog.export.splats import ModelSource, Part, Selection
+from panolog.export.spz import Version, write_spz
+from panolog.orchestrator.cli.session.delivery import provenance
+from panolog.orchestrator.engine.stages.scenes import scene_of
+from panolog.orchestrator.runs.folder import RunFolder, model_of, write_json
+from panolog.orchestrator.runs.info import read_info
+from panolog.orchestrator.watch.views.site.build import Wanted, site_of_file, site_of_run, write_folder
+from panolog.scene.errors import ConfigError, InputError
+from panolog.scene.ply import read_sky
+from panolog.scene.write import StageProgress
+
+# By option, the ending of what it writes.
+FORMATS = {
+    "sog": ".sog",
+    "web": "-web",
+    "spz": ".spz",
+    "compressed-ply": ".compressed.ply",
+    "glb": ".glb",
+    "3dtiles": "-3dtiles",
+    "sky-image": ".jpg",
+}
+_GEOREFERENCE = "georef.json"
+
+
+@dataclass(frozen=True)
+class ExportSpec:
+    """What to export of a model, and how."""
+
+    formats: tuple[str, ...]  # of FORMATS; none = by the ending of the output
+    selection: Selection = field(default_factory=Selection)  # its part is that of each format
+    sky: bool = True  # whether files that can hold it have the sky
+    levels: int | None = None  # of detail, of streamed formats; None = as many as it takes
+    spz: Version = 3
+    up: tuple[float, float, float] | None = None  # in the model's coordinates; None = as the scene has it
+    epsg: int | None = None  # of the source's coordinates, instead of what the scene says
+    metres: float | None = None  # of a unit, likewise
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """A model to export."""
+
+    run: RunFolder | None
+    ply: Path
+    name: str
+    place: Georeference
+    made_of: dict[str, Any]
+
+
+def export_model(source: Path, output: Path, spec: ExportSpec, progress: StageProgress) -> list[Path]:
+    """Writes a model in some formats; returns what was written, files and folders.
+
+    With one format whose ending `output` has, that is the file; else it is a folder, with georef.json.
+
+    Args: source, the folder of a run or a PLY.
+    Raises InputError if the source is no model, the place or a format does not fit, or `output` exists as
+    something else; OSError if it cannot be written.
+    """
+    torch.set_num_threads(1)  # small pieces: threads would only wait for each other
+    model = _model(source, spec)
+    formats = spec.formats or _by_ending(output)
+    jobs: list[tuple[str, Path]] = [
+        (kind, _place(output, model.name, kind, len(formats))) for kind in formats
+    ]
+    for _, path in jobs:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    for done, (kind, path) in enumerate(jobs):
+        progress(f"writing {path.name}", done, len(jobs))
+        written += _WRITERS[kind](model, path, spec)
+    if output.is_dir() and written != [output]:
+        write_json(output / _GEOREFERENCE, model.place.as_json(model.made_of))
+        written.append(output / _GEOREFERENCE)
+    progress("writing", len(jobs), len(jobs))
+    return written
+
+
+def _model(source: Path, spec: ExportSpec) -> _Model:
+    folder = RunFolder(source) if source.is_dir() else None
+    if folder is not None:
+        info = read_info(folder)
+        ply = model_of(folder)
+        if ply.suffix != ".ply":
+            raise InputError(f"{source}: has no model yet; wait for the end of Stage I")
+        place, made_of, name = (
+            _place_of(folder),
+            provenance(info.scene.fingerprint, info.config, info.versions),
+            folder.root.absolute().name,
+        )
+    else:
+        ply, place, made_of, name = source, Georeference(), {}, source.stem
+    place = replace(
+        place, up=spec.up or place.up, epsg=spec.epsg or place.epsg, metres=spec.metres or place.metres
+    )
+    if spec.epsg is not None:
+        place = replace(place, origin=None, metres=spec.metres or 1.0)
+    _frame(place)
+    return _Model(folder, ply, name, place, made_of)
+
+
+def _place_of(folder: RunFolder) -> Georeference:
+    """By its scene, or where that is not here by the run's georef.json."""
+    try:
+        return georeference_of(scene_of(read_info(folder), folder))
+    except InputError as error:
+        if not folder.georeference.is_file():
+            raise InputError(f"{error}; without it nothing says where the model is") from error
+    try:
+        content = json.loads(folder.georeference.read_bytes())
+    except ValueError as error:
+        raise InputError(f"{folder.georeference}: is not JSON; remove it") from error
+    return georeference_from(content, folder.georeference)
+
+
+def _frame(place: Georeference) -> Frame:
+    try:
+        return place.frame
+    except ValueError as error:
+        raise ConfigError(f"--up {error}") from error
+
+
+def _by_ending(output: Path) -> tuple[str, ...]:
+    found = [kind for kind, ending in FORMATS.items() if ending[0] == "." and output.name.endswith(ending)]
+    if not found:
+        options = ", ".join(f"--{kind}" for kind in FORMATS)
+        raise InputError(f"{output}: which format? Give one of {options}, or a file that ends like it")
+    return (found[0],)
+
+
+def _place(output: Path, name: str, kind: str, count: int) -> Path:
+    """Where a format is written."""
+    ending = FORMATS[kind]
+    folder = ending[0] != "."
+    again = any((output / index).is_file() for index in (DESCRIPTION, TILESET))  # what this command has made
+    if count == 1 and (folder or output.name.endswith(ending)) and (again or not output.is_dir()):
+        return output
+    if output.exists() and not output.is_dir():
+        raise InputError(f"{output}: is a file; several formats go into a folder")
+    stem = "sky" if kind == "sky-image" else name
+    return output / (ending[1:] if folder else f"{stem}{ending}")
+
+
+def _source(model: _Model, spec: ExportSpec, part: Part, frame: Frame | None = None) -> ModelSource:
+    """Raises InputError if nothing is left of the model."""
+    selection = replace(spec.selection, part=part)
+    found = ModelSource(model.ply, selection, frame or model.place.frame)
+    if not found.count:
+        raise InputError(f"{model.ply}: nothing is left of it; select more")
+    return found
+
+
+def _whole(spec: ExportSpec) -> Part:
+    return "all" if spec.sky else "scene"
+
+
+def _sog(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
+    write_sog(path, _source(model, spec, _whole(spec), model.place.upside_down))
+    return [path]
+
+
+def _spz(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
+    """The sky, whose size SPZ may not hold, is a file of its own."""
+    write_spz(path, _source(model, spec, "scene"), spec.spz)
+    if not spec.sky or not len(read_sky(model.ply)):
+        return [path]
+    sky = sky_of(path)
+    write_spz(sky, _source(model, spec, "sky"), spec.spz)
+    return [path, sky]
+
+
+def _compressed_ply(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
+    write_compressed_ply(path, _source(model, spec, _whole(spec), model.place.upside_down))
+    return [path]
+
+
+def _glb(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
+    write_glb(path, _source(model, spec, "scene"))
+    return [path]
+
+
+def _tiles(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
+    side = SIDE / (model.place.metres or 1.0)
+    source = _source(model, spec, "scene")
+    write_tiles(path, source, to_ecef=model.place.tiles_to_ecef(), side=side, levels=spec.levels)
+    return [path]
+
+
+def _web(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
+    place, levels = model.place, spec.levels
+    wanted = Wanted(selection=spec.selection, sky=spec.sky, streams=True, levels=levels, place=place)
+    shown = site_of_run(model.run, wanted) if model.run else site_of_file(model.ply, wanted)
+    write_folder(shown, path)
+    return [path]
+
+
+def _sky_image(model: _Model, path: Path, _: ExportSpec) -> list[Path]:
+    sky = read_sky(model.ply)
+    if not len(sky):
+        raise InputError(f"{model.ply}: has no sky; leave out --sky-image")
+    image, paths = render_sky(sky, model.place.frame), [path, path.with_suffix(".exr")]
+    for file in paths:
+        write_sky_image(file, image)
+    return paths
+
+
+_WRITERS: dict[str, Callable[[_Model, Path, ExportSpec], list[Path]]] = {
+    "sog": _sog,
+    "web": _web,
+    "spz": _spz,
+    "compressed-ply": _compressed_ply,
+    "glb": _glb,
+    "3dtiles": _tiles,
+    "sky-image": _sky_image,
+}

@@ -1,0 +1,387 @@
+"""A run from its start or from where it stopped: checks, lock, pool, driver."""
+
+import logging
+import os
+import socket
+import sqlite3
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.orchestrator.cli.session import preparing
+from panolog.orchestrator.cli.session.delivery import deliver
+from panolog.orchestrator.engine.driver.driver import Driver, Hooks
+from panolog.orchestrator.engine.driver.ending import end_recorded
+from panolog.orchestrator.engine.driver.job import Job
+from panolog.orchestrator.engine.driver.journal import Journal, Patience
+from panolog.orchestrator.engine.driver.purse import require_enough
+from panolog.orchestrator.engine.driver.requests import interruptible, on_signals
+from panolog.orchestrator.engine.estimates.preflight import Preflight, examine
+from panolog.orchestrator.engine.scheduling.pool import Pool
+from panolog.orchestrator.engine.stages.measuring import Measuring
+from panolog.orchestrator.engine.stages.scenes import measured_scene, save_measured, scene_of
+from panolog.orchestrator.runs import control, lock
+from panolog.orchestrator.runs import folder as run_folder
+from panolog.orchestrator.runs import info as run_info
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import RunInfo
+from panolog.orchestrator.runs.money.limits import Wanted, prices_of
+from panolog.orchestrator.runs.money.losses import lost_with_driver
+from panolog.orchestrator.runs.money.prices import PriceList
+from panolog.orchestrator.runs.money.records import BudgetSet
+from panolog.orchestrator.runs.preparation.settings import Options, Settings, read_settings, write_settings
+from panolog.orchestrator.runs.presence import Presence, why_waiting
+from panolog.orchestrator.runs.records import (
+    Noticed,
+    Outcome,
+    Part,
+    PreflightSaved,
+    Preparing,
+    Record,
+    RunBegan,
+    Stored,
+)
+from panolog.orchestrator.runs.retention.clean import remove_models
+from panolog.orchestrator.runs.state import OnChange, RunState, ignore
+from panolog.orchestrator.runs.store import Database
+from panolog.orchestrator.watch.views.pages.report import report_or_notice
+from panolog.orchestrator.watch.views.plan_picture import write_plan_picture
+from panolog.partition.plan import Plan
+from panolog.renderer.process import choose_device
+from panolog.scene.errors import ClusterError, RunFolderError, RunLockedError
+from panolog.scene.files import remove_partial
+from panolog.scene.model import Scene
+
+_LOG = logging.getLogger(__name__)
+
+
+@interruptible()
+def start(
+    source: Path | str,
+    root: Path,
+    config: RunConfig,
+    address: str | None,
+    on_change: OnChange,
+    pool: Pool | None = None,
+    nice: int | None = None,
+    options: Options | None = None,
+    wanted: Wanted | None = None,
+) -> RunState:
+    """Runs a scene, or the panoramas of a folder or of a video, into the new run folder `root`, to the end.
+
+    The scene may be given by its URL in an object store.
+
+    Args: address of a Ray cluster, None for Ray on this machine; pool, where tasks run instead, without Ray;
+    nice, as `cluster.connection.connect`; options, how a scene is made if `source` is none; wanted, limits of
+    cost and time, with prices.
+    Raises InputError for anything that the user must fix, with `root` as it was if that is found before the
+    first task, or before there is anything to resume from; RunError if the run failed.
+    """
+    budget = (wanted or Wanted()).budget(RunState())
+    new = preparing.found(source, config, options or Options())
+    new.check_output(root)
+    folder = RunFolder(root)
+    made = run_folder.make(root)
+    with lock.hold(folder.lock), ExitStack() as undo:
+        new.check_output(root)  # another driver may have been quicker
+        undo.callback(preparing.discard, folder, made)
+        info = run_info.make_info(new.reference(folder), new.config)
+        if new.settings is not None:  # first, so that this can be resumed from now on
+            write_settings(folder, new.settings)
+            run_info.write_info(folder, info)
+        # what a driver has left that was killed during its preflight
+        run_info.clear(folder, keep_info=new.settings is not None)
+        if new.settings is None:
+            run_info.write_info(folder, info)
+        with closing(Database(folder.database)) as database:
+            begin = _Beginning(folder, Journal(database, on_change), address, pool, nice, new.scene)
+            with end_recorded(begin.journal):
+                begin.take_over(info.config, budget)
+                info = begin.prepare(info, new.settings)
+                with begin.workers() as workers:
+                    config = begin.preflight(workers, info)
+                    undo.pop_all()  # from here on it is a run
+                    return begin.drive(workers, config)
+
+
+@interruptible()
+def resume(
+    root: Path,
+    address: str | None,
+    on_change: OnChange,
+    pool: Pool | None = None,
+    nice: int | None = None,
+    after: str = "",
+    wanted: Wanted | None = None,
+    *,
+    accept_changes: bool = False,
+) -> RunState:
+    """Resumes a run, to the end; does nothing if it is done, or at a limit that stays as it is.
+
+    Args: as `start`; after, why the supervisor resumes it, which becomes a notice; accept_changes, go on with
+    other settings in run.json than those that the run was begun with.
+    Raises InputError if `root` is no run, its scene or its settings have changed, its device is missing or
+    another driver is at work on it; RunError if the run failed.
+    """
+    folder = RunFolder(root)
+    info = run_info.read_info(folder)
+    with lock.hold(folder.lock), closing(_opened(folder, info.config)) as database:
+        journal = Journal(database, on_change)
+        budget = (wanted or Wanted()).budget(journal.state)
+        if _is_over(journal.state, budget):
+            done = journal.state.outcome == Outcome.DONE
+            return _retained(folder, journal, info.config) if done else journal.state
+        changes: Sequence[str] = ()
+        if prepared := journal.state.prepared:
+            changes = run_info.changes(folder, info.config, database.milestones(), accept=accept_changes)
+        settings = read_settings(folder) if info.scene.fingerprint == run_info.PENDING else None
+        scene = None if settings else scene_of(info, folder)
+        remove_partial(root)
+        begin = _Beginning(folder, journal, address, pool, nice, scene)
+        with end_recorded(journal):
+            begin.take_over(info.config, budget, resumed=True, changes=changes)
+            if after:
+                journal.record([Noticed(None, f"resumed by the supervisor after: {after}")])
+            info = begin.prepare(info, settings)
+            with begin.workers() as workers:
+                config = info.config
+                if prepared:
+                    _device(config.device, workers, begin.warn, local=address is None)
+                else:
+                    config = begin.preflight(workers, info)
+                return begin.drive(workers, config)
+
+
+def _is_over(state: RunState, budget: BudgetSet | None) -> bool:
+    """Whether a driver would have nothing to do. Args: budget, another than before, if there is one."""
+    if state.outcome != Outcome.LIMITED:
+        return state.outcome == Outcome.DONE
+    before = state.money.budget or BudgetSet()
+    return budget is None or (budget.max_cost, budget.deadline) == (before.max_cost, before.deadline)
+
+
+def _opened(folder: RunFolder, config: RunConfig) -> Database:
+    """The database of a run; waits for its disk as the driver does. Raises RunFolderError if it is none."""
+    said = ""
+    while True:
+        try:
+            return Database(folder.database)
+        except RunFolderError as error:
+            if not (reason := why_waiting(error, folder.root)):
+                raise
+            if reason != said:
+                _LOG.warning("%s", reason)
+            said = reason
+            time.sleep(config.disk.retry)
+
+
+@dataclass
+class _Beginning:
+    """A driver before its first task. The caller holds the lock."""
+
+    folder: RunFolder
+    journal: Journal
+    address: str | None
+    pool: Pool | None
+    nice: int | None
+    made: Scene | None = None  # None until it is prepared
+
+    @property
+    def scene(self) -> Scene:
+        """The scene, once there is one."""
+        assert self.made is not None  # `prepare` comes first
+        return self.made
+
+    def prepare(self, info: RunInfo, settings: Settings | None) -> RunInfo:
+        """Makes the scene of a run that was given none, and returns run.json with it.
+
+        Raises as `Preparation.make`.
+        """
+        if settings is None:
+            return info
+        self.made = preparing.Preparation(self.folder, settings, self.journal).make()
+        config = preparing.with_width(self.made.width, info.config)
+        info = info.model_copy(update={"scene": preparing.reference(self.made), "config": config})
+        self.journal.until_done(lambda: run_info.write_info(self.folder, info))
+        return info
+
+    def take_over(
+        self,
+        config: RunConfig,
+        budget: BudgetSet | None,
+        *,
+        resumed: bool = False,
+        changes: Sequence[str] = (),
+    ) -> None:
+        """Makes this the run's driver, which takes requests and from now on waits for a full disk.
+
+        Args: changes of settings that were accepted.
+        """
+        presence, state = Presence(self.folder.presence), self.journal.state
+        self.journal.patience = Patience(self.folder.root, config.disk.retry, presence)
+        settings = config.model_dump(mode="json") if state.prepared else {}
+        code, before = run_info.own_code(), state.driver.code if state.driver else ""
+        began = RunBegan(socket.gethostname(), os.getpid(), resumed, state.latest, code, settings)
+        notices = [f"resumed with other settings: {'; '.join(changes)}"] if changes else []
+        if before and before != code:
+            notices.append(f"resumed with other sources ({before} → {code}): what is trained now may differ")
+        said: list[Record] = [*([budget] if budget else []), *(Noticed(None, line) for line in notices)]
+        self.journal.record([*lost_with_driver(state), began, *said, *control.begin(self.folder)])
+
+    @contextmanager
+    def workers(self) -> Iterator[Pool]:
+        """The pool that was given, else Ray's, which also exports the state as metrics."""
+        if self.pool is None:
+            self.journal.record([Preparing("connecting to the cluster" if self.address else "starting Ray")])
+        with _workers(self.address, self.folder.root, self.pool, self.nice) as workers:
+            if self.pool is None:
+                self.journal.on_change = _exported(self.folder.root, self.journal.on_change)
+            yield workers
+
+    def preflight(self, workers: Pool, info: RunInfo) -> RunConfig:
+        """The resolved settings of a run, once they are in run.json. Raises InputError if it does not fit."""
+        folder, root = self.folder, self.folder.root
+        self._measure(info.config)
+        self.journal.record([Preparing("calibrating")])
+        prices, local = prices_of(self.journal.state), self.address is None
+        found = _examine(workers, self.scene, info.config, root, self.warn, prices, self._doing, local=local)
+        found.require()
+        info = info.model_copy(update={"config": found.config})
+        self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
+        self.journal.until_done(lambda: run_info.write_info(folder, info))
+        seconds = {str(stage.name): stage.seconds for stage in found.estimate.stages}
+        settings = found.config.model_dump(mode="json")
+        done = PreflightSaved(folder.relative(folder.preflight), seconds, settings)
+        if budget := self.journal.state.money.budget:
+            require_enough(seconds, budget, workers.nodes())
+        self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), done])
+        return found.config
+
+    def _measure(self, config: RunConfig) -> None:
+        """Keeps what Stage I begins with, if it is to learn how panoramas were captured."""
+        found = Measuring(self.scene, config, self._doing, self.warn).found()
+        self.journal.until_done(lambda: save_measured(self.folder, found, self.scene))
+
+    def _doing(self, what: str) -> None:
+        self.journal.record([Preparing(what)])
+
+    def warn(self, line: str) -> None:
+        """Something the user should read once."""
+        self.journal.record([Noticed(None, line)])
+
+    def drive(self, workers: Pool, config: RunConfig) -> RunState:
+        """Runs all tasks, and writes the report."""
+        folder = self.folder
+        self.journal.record([Preparing("starting workers")])
+
+        def draw(plan: Plan, means: NDArray[np.float32]) -> None:
+            write_plan_picture(folder.plan_picture, plan, means)
+
+        with on_signals() as stop:
+            try:
+                with end_recorded(self.journal):
+                    job = Job(folder, measured_scene(folder, self.scene), config)
+                    Driver(job, self.journal, workers, Hooks(draw, deliver), stop).run()
+            finally:
+                _report(folder, self.journal)
+        return _retained(folder, self.journal, config)
+
+
+def check(source: Path, root: Path, config: RunConfig, options: Options) -> None:
+    """All that `start` checks before it makes anything. Raises InputError as it does."""
+    preparing.found(source, config, options).check_output(root)
+
+
+def estimate_run(
+    scene: Scene, config: RunConfig, address: str | None, prices: PriceList | None = None
+) -> Preflight:
+    """What a run of a scene would need, on this machine or on a cluster, with its folder in the current one.
+
+    Args: config, with a width. Raises InputError as `start`, except if the run does not fit: that is the
+    problem of the preflight.
+    """
+    with _workers(address, scene.root, None) as pool:
+        return _examine(pool, scene, config, Path.cwd(), ignore, prices, local=address is None)
+
+
+def _examine(
+    pool: Pool,
+    scene: Scene,
+    config: RunConfig,
+    root: Path,
+    warn: Callable[[str], None],
+    prices: PriceList | None,
+    say: Callable[[str], None] = ignore,
+    *,
+    local: bool,
+) -> Preflight:
+    device = _device(config.device, pool, warn, local=local)
+    return examine(pool, scene, config.model_copy(update={"device": device}), root, prices, say)
+
+
+@contextmanager
+def _workers(address: str | None, root: Path, pool: Pool | None, nice: int | None = None) -> Iterator[Pool]:
+    """The pool that is given, else Ray's."""
+    if pool is not None:
+        yield pool
+        return
+    from panolog.orchestrator.engine.cluster.connection import connect  # other pools need no Ray
+
+    with connect(address, root, nice) as ray_pool:
+        yield ray_pool
+
+
+def _exported(root: Path, on_change: OnChange) -> OnChange:
+    """`on_change`, which also exports the state as metrics of Ray."""
+    from panolog.orchestrator.engine.cluster.telemetry import Telemetry
+
+    telemetry = Telemetry(root)
+
+    def both(state: RunState, news: Sequence[Stored]) -> None:
+        telemetry.show(state, news)
+        on_change(state, news)
+
+    return both
+
+
+def _report(folder: RunFolder, journal: Journal) -> None:
+    """Writes the report of a run that has ended, however. A full disk has been reported already,
+    and in a run that another driver has taken over nothing is written.
+    """
+    with suppress(sqlite3.Error, RunLockedError):
+        journal.database.require_own()
+        if notice := report_or_notice(folder):
+            journal.record(notice)
+
+
+def _retained(folder: RunFolder, journal: Journal, config: RunConfig) -> RunState:
+    """The state of a run that is done, once the models that its settings do not keep are removed."""
+    if not config.retention.models and (
+        notice := journal.until_done(lambda: remove_models(folder, journal.state))
+    ):
+        journal.record([notice])
+    return journal.state
+
+
+def _moved(scene: Scene) -> list[Record]:
+    """A notice, if the world of the run is not that of the scene's model."""
+    message = (
+        f"the scene is far from its origin: add {scene.offset} to the coordinates of the run for the scene's"
+    )
+    return [Noticed(None, message)] if any(scene.offset) else []
+
+
+def _device(wanted: str, pool: Pool, warn: Callable[[str], None], *, local: bool) -> str:
+    """The device that "auto" means here. Raises InputError if CUDA is wanted and there is none."""
+    if local:
+        return choose_device(wanted, warn)
+    gpus = any(node.gpus for node in pool.nodes()) or any(group.gpus for group in pool.growth().groups)
+    if wanted == "cuda" and not gpus:
+        raise ClusterError("--device cuda: no node of the cluster has a GPU; see `ray status`")
+    return "cuda" if wanted != "cpu" and gpus else "cpu"

@@ -1,0 +1,125 @@
+"""Ray for as long as a run needs it: a cluster's, or one of its own on this machine."""
+
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from tempfile import mkdtemp
+
+import psutil
+import ray
+
+from panolog.orchestrator.engine.cluster import cleaner as ray_cleaner
+from panolog.orchestrator.engine.cluster.files import FileSharing, key_of
+from panolog.orchestrator.engine.cluster.pool import RayPool
+from panolog.orchestrator.engine.scheduling.pool import first_line
+from panolog.orchestrator.runs import log
+from panolog.orchestrator.runs.machines.machine import cores, memory
+from panolog.scene.errors import ClusterError, ConfigError
+
+_TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
+_TIMEOUT_S = 10.0  # in which a cluster must answer, and Ray's own processes must end
+_STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
+
+
+@contextmanager
+def connect(address: str | None, root: Path, nice: int | None = None) -> Iterator[RayPool]:
+    """Ray for as long as the context lasts: a cluster's at `address`, or one of its own on this machine.
+
+    Args: root, the folder of the run; nice, by how much workers are nicer than this process (setpriority(2),
+    0 to 19), by default RAY_worker_niceness, else 0. Raises InputError if there is no cluster at the address,
+    or for `nice` with one: its workers have the priority that its nodes gave them.
+    """
+    if address and nice is not None:
+        raise ConfigError(
+            f"--nice {nice}: only for runs on this machine; a cluster's workers have the priority that"
+            " RAY_worker_niceness had when its nodes were started; leave the option out"
+        )
+    before = signal.getsignal(signal.SIGTERM)
+    with redirect_stdout(sys.stderr), _joined(address) if address else _own(nice):  # Ray prints what is lost
+        # Ray has installed its own handler of SIGTERM: make it a Ctrl-C, so that the run records its end.
+        unset = before in (None, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, signal.default_int_handler if unset else before)
+        sharing = FileSharing(root) if address else None
+        pool = RayPool(sharing, key_of(root))
+        try:
+            yield pool
+        finally:
+            pool.close()
+        if sharing is not None:
+            sharing.clear()
+
+
+@contextmanager
+def _joined(address: str) -> Iterator[None]:
+    """A cluster's Ray."""
+    try:
+        _join(address)
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _join(address: str) -> None:
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if address != "auto" and not (colon and port.isdecimal()):
+        raise ClusterError(f"--address {address}: write auto or HOST:PORT")
+    try:
+        if address != "auto":  # Ray itself would try for two minutes
+            socket.create_connection((host, int(port)), timeout=_TIMEOUT_S).close()
+        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=bool(log.environment()))
+    except (OSError, OverflowError) as error:  # ConnectionError is an OSError
+        raise ClusterError(
+            f"--address {address}: no Ray cluster answers there ({first_line(str(error))});"
+            " one that requires a token needs RAY_AUTH_MODE=token here"
+        ) from error
+
+
+@contextmanager
+def _own(nice: int | None) -> Iterator[None]:
+    """A session of this machine, with a process that clears up, also if this one is killed."""
+    folder = mkdtemp(prefix="panolog-ray-", dir=_TMP)
+    command = [sys.executable, "-m", ray_cleaner.__name__, folder]
+    cleaner = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+    try:
+        _start(folder, nice)
+        yield
+    finally:
+        try:
+            _shut_down(cleaner.pid)
+        finally:
+            cleaner.communicate(b"ended")
+
+
+def _start(folder: str, nice: int | None) -> None:
+    ray.init(
+        address="local",  # also if RAY_ADDRESS is set
+        num_cpus=cores(),
+        include_dashboard=False,
+        log_to_driver=bool(log.environment()),
+        logging_level=logging.ERROR,
+        object_store_memory=min(_STORE, memory() // 4),
+        _temp_dir=folder,
+        _system_config={"worker_niceness": _niceness() if nice is None else nice},
+    )
+
+
+def _niceness() -> int:
+    """As the variable says, else 0: next to a busy process workers with Ray's own 15 hardly run."""
+    given = os.environ.get("RAY_worker_niceness", "0")  # noqa: SIM112  # Ray's name
+    try:
+        return int(given)
+    except ValueError as error:
+        raise ConfigError(f"RAY_worker_niceness={given}: give a number from 0 to 19, or unset it") from error
+
+
+def _shut_down(cleaner: int) -> None:
+    """Ends Ray and waits until its processes have stopped to write."""
+    processes = [p for p in psutil.Process().children(recursive=True) if p.pid != cleaner]
+    ray.shutdown()
+    psutil.wait_procs(processes, timeout=_TIMEOUT_S)

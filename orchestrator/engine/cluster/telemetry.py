@@ -1,0 +1,112 @@
+"""The state of a run for Prometheus and the dashboards of Ray: as metrics of `ray.util.metrics`.
+
+Only the driver exports, from the state that it has anyway: workers know nothing of it, and no number has two
+sources. Ray puts "ray_" before the names. It forgets a gauge that is not set again for some seconds, so all
+are set every few: a task that has ended keeps its results, and the node that it has left loses them.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ray.util.metrics import Counter, Gauge
+
+from panolog.orchestrator.runs.records import Record, Stored, TaskFailed, Transferred
+from panolog.orchestrator.runs.state import RunState, Status, TaskState
+from panolog.workers.tasks import TaskId
+
+GAUGES = {
+    "panolog_iteration": "Iterations that a task has done.",
+    "panolog_iterations": "Iterations of a task in all.",
+    "panolog_iterations_per_second": "Recent speed of a task that runs.",
+    "panolog_loss": "Training loss, mean since the last report.",
+    "panolog_psnr_db": "PSNR over the training views, mean since the last report.",
+    "panolog_gaussians": "Gaussians of a task.",
+    "panolog_memory_bytes": "Memory of a task that runs: of the device on CUDA, of the process on the CPU.",
+}
+COUNTERS = {
+    "panolog_retries_total": "Attempts that failed and are repeated.",
+    "panolog_moved_bytes_total": "Bytes that a task has sent to or received from other machines.",
+}
+TAGS = ("run", "task", "node")
+_INTERVAL = (
+    5.0  # seconds between two exports of all gauges; Ray reports every ten and forgets after twice that
+)
+
+
+@dataclass(frozen=True)
+class MetricSample:
+    """A value of a gauge, or what is added to a counter."""
+
+    metric: str
+    task: str
+    node: str
+    value: float
+
+
+def gauges(state: RunState) -> Iterator[MetricSample]:
+    """Where every task stands that has reported something."""
+    for task in state.tasks.values():
+        for metric, value in _standing(task).items():
+            if value is not None:
+                yield MetricSample(metric, str(task.id), task.node, value)
+
+
+def _standing(task: TaskState) -> dict[str, float | None]:
+    progress = task.progress
+    if progress is None:
+        return {}
+    values: dict[str, float | None] = {
+        "panolog_iteration": progress.iteration,
+        "panolog_iterations": progress.iterations,
+        "panolog_loss": progress.loss,
+        "panolog_psnr_db": progress.psnr,
+        "panolog_gaussians": progress.gaussians,
+    }
+    if task.status == Status.RUNNING:
+        values |= {"panolog_iterations_per_second": progress.rate, "panolog_memory_bytes": progress.memory}
+    return values
+
+
+def counts(state: RunState, record: Record) -> Iterator[MetricSample]:
+    """What a record adds to the counters; `state` is after it."""
+    values: dict[str, int] = {}
+    match record:
+        case TaskFailed(final=False):
+            values = {"panolog_retries_total": 1}
+        case Transferred():
+            values = {"panolog_moved_bytes_total": record.received + record.sent}
+    for metric, value in values.items():
+        if value and isinstance(record.task, TaskId):  # Ray refuses to add nothing
+            yield MetricSample(metric, str(record.task), state.task(record.task).node, value)
+
+
+class Telemetry:
+    """Exports the metrics of one run. Needs Ray to be initialised."""
+
+    def __init__(self, run: Path) -> None:
+        self._run = str(run.absolute())
+        self._gauges = {name: Gauge(name, text, TAGS) for name, text in GAUGES.items()}
+        self._counters = {name: Counter(name, text, TAGS) for name, text in COUNTERS.items()}
+        self._exported = -_INTERVAL
+
+    def show(self, state: RunState, news: Sequence[Stored]) -> None:
+        """Exports a state: called with every change, and often without one."""
+        for stored in news:
+            for sample in counts(state, stored.record):
+                self._counters[sample.metric].inc(sample.value, self._tags(sample))
+        now = time.monotonic()
+        if now - self._exported >= _INTERVAL:
+            self._exported = now
+            for sample in gauges(state):
+                self._gauges[sample.metric].set(sample.value, self._tags(sample))
+
+    def _tags(self, sample: MetricSample) -> dict[str, str]:
+        values = (self._run, sample.task, sample.node)
+        return {tag: _ascii(value) for tag, value in zip(TAGS, values, strict=True)}
+
+
+def _ascii(text: str) -> str:
+    """Ray refuses a tag with other letters."""
+    return text.encode("ascii", "backslashreplace").decode()

@@ -1,0 +1,139 @@
+"""The machines of a run, as its driver sees them from turn to turn."""
+
+from collections.abc import Callable, Sequence
+from datetime import datetime
+
+from panolog.orchestrator.engine.driver.job import Job
+from panolog.orchestrator.engine.driver.journal import Journal
+from panolog.orchestrator.engine.estimates.calibration import basis_of
+from panolog.orchestrator.engine.scheduling import leaving, placement, quarantine
+from panolog.orchestrator.engine.scheduling.expected import Coming, Expected
+from panolog.orchestrator.engine.scheduling.placement import Demand, Placed, Running
+from panolog.orchestrator.engine.scheduling.pool import Pool
+from panolog.orchestrator.engine.scheduling.scaling import IDLE_S, Growth, Work
+from panolog.orchestrator.runs.clock import Clock
+from panolog.orchestrator.runs.machines.nodes import Node
+from panolog.orchestrator.runs.money.prices import of_record, price_by
+from panolog.orchestrator.runs.records import NodeLeaving, Noticed, Record, RunContinued, RunWaiting
+
+
+class Machines:
+    """Which there are, which leave, which are in quarantine, and which are on their way."""
+
+    def __init__(self, pool: Pool, journal: Journal, job: Job, clock: Clock) -> None:
+        self._pool = pool
+        self._journal = journal
+        self._config = job.config
+        self._clock = clock
+        self._expected = Expected(clock, basis_of(job.folder, job.scene, job.config).joined)
+        self._waits = ""  # why nothing runs, as it was recorded last
+        self._since = 0.0  # Clock.monotonic() of that
+
+    @property
+    def _cuda(self) -> bool:
+        return self._config.device == "cuda"
+
+    def review(self) -> tuple[list[Node], bool]:
+        """The nodes that can run tasks and do not leave, and whether others may be used than before.
+
+        Records which nodes have announced that they leave, and quarantines.
+        """
+        there = self._pool.nodes()
+        able = placement.able(there, cuda=self._cuda)
+        left = self._review_leaving(there, able)
+        nodes = leaving.staying(self._journal.state, able)
+        return nodes, self._review_quarantines(nodes) or left
+
+    def leaves(self, node: str) -> str:
+        """The host of a node if its tasks must move because it leaves, else "". Args: node, Node.id."""
+        state = self._journal.state
+        if not leaving.announced(state, node):
+            return ""
+        able = placement.able(self._pool.nodes(), cuda=self._cuda)
+        stays = any(other.id == node for other in leaving.staying(state, able))
+        return "" if stays else state.nodes[node].host
+
+    def place(
+        self,
+        waiting: Sequence[Demand],
+        work: Callable[[], Work],
+        running: Sequence[Running],
+        nodes: Sequence[Node],
+    ) -> list[Placed]:
+        """The tasks that start now; requests the machines that the others should have.
+
+        Args: waiting, all tasks that wait; work, which they are; running, what runs; nodes that can be used.
+        """
+        growth = self._pool.growth()
+        come = self._grow(growth, work(), running, nodes) if growth.groups else Coming()
+        every, busy = [*nodes, *come.nodes], [*running, *come.fill]
+        placed = placement.place(waiting, every, busy, cuda=self._cuda)
+        idle = bool(waiting) and not placed and not running
+        self._explain(self._why(growth) if idle else "")
+        return placed
+
+    @property
+    def idle(self) -> float | None:
+        """Seconds after which a machine goes on which nothing runs; None if all stay."""
+        return IDLE_S if self._pool.growth().groups else None
+
+    @property
+    def expecting(self) -> bool:
+        """Whether machines have been requested that are not there yet, or one is needed."""
+        return bool(self._expected.since or self._waits)
+
+    def _grow(self, growth: Growth, work: Work, running: Sequence[Running], nodes: Sequence[Node]) -> Coming:
+        """Requests what a stage should have besides, and returns what is coming."""
+        budget = self._journal.state.money.budget
+        prices = of_record(budget.prices) if budget else None
+        settings, cuda = self._config.scaling, self._cuda
+        scaling = self._expected.scaling(growth, nodes, settings.overhead, price_by(prices), cuda=cuda)
+        found = self._expected.decide(scaling, work, running, nodes, settings.patience)
+        if found.more:
+            texts = {group.name: group.text() for group in growth.groups}
+            names = ", ".join(f"{count} more of {texts[name]}" for name, count in found.more.items())
+            stage = work.demands[0].task.stage
+            self._journal.record([Noticed(None, f"requested from Ray's autoscaler for {stage}: {names}")])
+        self._pool.request(found.wanted)
+        return found
+
+    def _why(self, growth: Growth) -> str:
+        """Why nothing can start."""
+        what = "GPU" if self._cuda else "core"
+        if not growth.groups:
+            able = placement.able(self._pool.nodes(), cuda=self._cuda)
+            return "" if able else f"waiting for a machine with a {what}: the cluster has none now"
+        since = self._expected.since
+        if not since:
+            why = f"waiting for a machine with a {what}: Ray's autoscaler has started all that it may"
+            return why + growth.report
+        when = f"{datetime.fromtimestamp(self._expected.first).astimezone():%H:%M:%S}"
+        texts = {group.name: group.text() for group in growth.groups}
+        names = ", ".join(f"{len(times)} of {texts[name]}" for name, times in since.items())
+        return f"waiting for machines: {names}, requested from Ray's autoscaler at {when}{growth.report}"
+
+    def _explain(self, why: str) -> None:
+        """Records that nothing runs, and why, or that something does again."""
+        if why == self._waits:
+            return
+        now = self._clock.monotonic()
+        self._since = self._since if self._waits else now
+        self._waits = why
+        record: Record = RunWaiting(why) if why else RunContinued(now - self._since)
+        self._journal.record([record])
+
+    def _review_leaving(self, there: Sequence[Node], able: Sequence[Node]) -> bool:
+        records = leaving.changes(self._journal.state, there, self._pool.notices())
+        if records:
+            self._journal.record(records)
+            if any(isinstance(record, NodeLeaving) for record in records):
+                self._journal.record(leaving.notice(self._journal.state, able))
+        return bool(records)
+
+    def _review_quarantines(self, nodes: Sequence[Node]) -> bool:
+        state, config = self._journal.state, self._config.quarantine
+        changes = quarantine.changes(state, nodes, config, self._clock.time())
+        if changes:
+            self._journal.record(changes)
+            self._journal.record(quarantine.notice(self._journal.state, nodes, config))
+        return bool(changes)

@@ -1,0 +1,272 @@
+"""The merge in a run: which files make up the final model."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from panolog.orchestrator.engine.stages.scenes import save_captured
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.records import Merged, ModelSaved, Noticed, Record
+from panolog.orchestrator.runs.state import RunState, Status
+from panolog.partition.cells import Volume
+from panolog.partition.contraction import contract
+from panolog.partition.districts import Districts
+from panolog.partition.plan import Plan
+from panolog.partition.regions import Regions
+from panolog.scene.errors import RunError
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.model import Scene
+from panolog.scene.ply import (
+    join_ply,
+    ply_exact,
+    ply_header,
+    ply_offset,
+    read_ply_chunks,
+    read_sky,
+    write_ply_parts,
+)
+from panolog.workers.capture.captured import Captured, joined
+from panolog.workers.merge import merge, retained
+from panolog.workers.tasks import COARSE, MERGE, TaskId
+from panolog.workers.training.checkpoint import SavedModel
+
+_TRAINED = 0.5  # of its iterations, from which on a checkpoint is used: measured in docs/money.md
+
+
+@dataclass(frozen=True, eq=False)
+class Early:
+    """How a run merges that a limit has ended early."""
+
+    scene: Scene
+    least: float  # opacity of what a block keeps
+    iterations: int  # that a block was to train for
+
+    def uses(self, folder: RunFolder, state: RunState, task: TaskId) -> bool:
+        """Whether a block that has not ended is taken from its checkpoint, and not from Stage I."""
+        done = state.task(task).checkpoint or 0
+        return done >= _TRAINED * self.iterations and folder.checkpoint(task).exists()
+
+
+def merge_run(
+    folder: RunFolder, state: RunState, plan: Plan, near: Regions, early: Early | None = None
+) -> Merged:
+    """Writes the merged model: every block as trained or else as Stage I left it, then the sky (eq. 13).
+
+    Args: near, what is near faces: where that was repaired, it is taken from there; early, of a run that a
+    limit has ended: which blocks are taken from their checkpoints.
+    Raises OSError, InputError or RunError if that fails.
+    """
+    started = time.monotonic()
+    parts, faces = _block_plys(folder, state, plan, early), range(len(near.faces))
+    repaired = [face for face in faces if state.status(TaskId.repair(face)) == Status.DONE]
+    if repaired:
+        _merge_repaired(folder, parts, near, repaired)
+    else:
+        merge(parts, folder.model(COARSE), folder.point_cloud)
+    return _merged(folder, started)
+
+
+def unite_blocks(folder: RunFolder, state: RunState, plan: Plan, task: TaskId) -> ModelSaved:
+    """Writes the union of all blocks as they are by then, for the tasks of the next pass.
+
+    Raises OSError, InputError or RunError if that fails.
+    """
+    started = time.monotonic()
+    output = folder.model(task)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    count = merge(_block_plys(folder, state, plan), folder.model(COARSE), output)
+    return _saved(folder, task, count, 0, started)
+
+
+def _merge_repaired(
+    folder: RunFolder, blocks: Sequence[Path], near: Regions, repaired: Sequence[int]
+) -> None:
+    """Writes what no repair has trained of each block, what the repairs have, and the sky."""
+    coarse = folder.model(COARSE)
+    sky = read_sky(coarse)
+
+    def parts() -> Iterator[Gaussians]:
+        for path in blocks:
+            for piece in read_ply_chunks(path):
+                yield piece.select(torch.from_numpy(~np.isin(near.of(piece.means.numpy()), repaired)))
+        for face in repaired:
+            yield from read_ply_chunks(folder.model(TaskId.repair(face)))
+        yield sky
+
+    _write(folder.point_cloud, parts, len(sky), coarse)
+
+
+def join_districts(folder: RunFolder, scene: Scene, districts: Districts, iterations: int) -> ModelSaved:
+    """Writes the Stage I model: what each district has in its cell, in order, and the mean of their skies.
+
+    What they have learnt about how panoramas of the scene were captured is joined, too.
+
+    Raises OSError, InputError or RunError if that fails.
+    """
+    started = time.monotonic()
+    tasks = [TaskId.district(number) for number in range(districts.count)]
+    files = [(folder.model(task), districts.cell(task.number)) for task in tasks]
+    learnt = [Captured.load(path) for task in tasks if (path := folder.captured(task)).exists()]
+    if learnt:
+        save_captured(folder, joined(learnt), scene)
+    sky = _mean([read_sky(path) for path, _ in files])
+
+    def parts() -> Iterator[Gaussians]:
+        for path, cell in files:
+            yield from _kept(path, cell)
+        yield sky
+
+    count = _write(folder.model(COARSE), parts, len(sky), files[0][0])
+    return _saved(folder, COARSE, count, iterations, started)
+
+
+def _mean(skies: Sequence[Gaussians]) -> Gaussians:
+    """Row by row: they began as the same. One that has lost rows, which were not finite, does not count."""
+    most = max(map(len, skies))
+    whole = [sky.tensors() for sky in skies if len(sky) == most]
+    means = {name: torch.stack([sky[name] for sky in whole]).mean(0) for name in whole[0]}
+    return skies[0].with_tensors(means, sky=most)
+
+
+def merge_unfinished(
+    folder: RunFolder, state: RunState, scene: Scene, tasks: Sequence[tuple[TaskId, Volume | None]]
+) -> list[Record]:
+    """Writes a model of a Stage I that a limit has ended: of each task its model, or its last checkpoint.
+
+    Args: tasks of Stage I, each with the cell that it keeps, None = all. Of districts that have neither, a
+    notice says that the model has nothing there. Raises as `merge_run`.
+    """
+    started, found = time.monotonic(), list[tuple[Path, Volume | None]]()
+    for task, cell in tasks:
+        if state.status(task) == Status.DONE:
+            found.append((folder.model(task), cell))
+        elif folder.checkpoint(task).exists():
+            found.append((write_saved(folder, task, scene), cell))
+    skies = [read_sky(path) for path, _ in found]
+    sky = skies[0] if len(skies) == 1 else _mean(skies)
+
+    def parts() -> Iterator[Gaussians]:
+        for path, cell in found:
+            for piece in read_ply_chunks(path):
+                scenery = piece.select(torch.arange(len(piece)) < piece.scene.stop)
+                yield scenery if cell is None else retained(scenery, cell, 0.0)
+        yield sky
+
+    _write(folder.point_cloud, parts, len(sky), found[0][0])
+    missing = len(tasks) - len(found)
+    what = f"{missing} of {len(tasks)} districts were not begun: the model has nothing there"
+    return [*([Noticed(MERGE, what)] if missing else []), _merged(folder, started)]
+
+
+def write_saved(
+    folder: RunFolder, task: TaskId, scene: Scene, cell: Volume | None = None, least: float = 0.0
+) -> Path:
+    """Writes the model in the checkpoint of a task as a PLY, and returns its path.
+
+    Args: scene of the run; cell, of which alone the Gaussians are kept, without sky; least opacity of these.
+    Raises OSError or RunError if that fails.
+    """
+    path, saved = folder.early(task), SavedModel(folder.checkpoint(task))
+
+    def parts() -> Iterator[Gaussians]:
+        for piece in saved.pieces():
+            yield piece if cell is None else retained(piece, cell, least)
+
+    count = sum(map(len, parts()))
+    sky = saved.sky if cell is None else 0
+    write_ply_parts(path, parts(), count=count, sky=sky, offset=scene.offset, exact=saved.exact)
+    return path
+
+
+def copy_coarse(folder: RunFolder) -> Merged:
+    """Without refinement the Stage I model is the final one. Raises OSError if it cannot be written."""
+    started = time.monotonic()
+    source = folder.model(COARSE)
+    count, sky = ply_header(source)
+    rows, offset, exact = [(source, range(count))], ply_offset(source), ply_exact(source)
+    join_ply(folder.point_cloud, rows, sky=sky, offset=offset, exact=exact)
+    return _merged(folder, started)
+
+
+def _block_plys(folder: RunFolder, state: RunState, plan: Plan, early: Early | None = None) -> list[Path]:
+    """The files of all blocks that have Gaussians; made from Stage I for those not trained, or in vain."""
+    blocks: list[int] = np.flatnonzero(plan.gaussians).tolist()
+    found = {block: _trained_ply(folder, state, plan, block, early) for block in blocks}
+    _keep_coarse(folder, plan, [block for block, path in found.items() if path is None])
+    return [path or folder.kept(block) for block, path in found.items()]
+
+
+def _trained_ply(
+    folder: RunFolder, state: RunState, plan: Plan, block: int, early: Early | None
+) -> Path | None:
+    """The latest file of a block; None if it keeps Stage I."""
+    for task in (TaskId.round(block), TaskId.block(block)):
+        if state.status(task) == Status.DONE:
+            return folder.model(task)
+    if early is not None and early.uses(folder, state, task):
+        return write_saved(folder, task, early.scene, plan.cell(block), early.least)
+    return None
+
+
+def _keep_coarse(folder: RunFolder, plan: Plan, blocks: Sequence[int]) -> None:
+    """Writes what the Stage I model has in the cells of some blocks, after one look at all of it.
+
+    Raises RunError if a Gaussian has a position that is not finite.
+    """
+    if not blocks:
+        return
+    coarse = folder.model(COARSE)
+    labels = np.concatenate([_labels(piece, plan) for piece in read_ply_chunks(coarse)])
+    offset, exact = ply_offset(coarse), ply_exact(coarse)
+    for block in blocks:
+        path = folder.kept(block)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        join_ply(path, [(coarse, np.flatnonzero(labels == block))], sky=0, offset=offset, exact=exact)
+
+
+def _labels(piece: Gaussians, plan: Plan) -> NDArray[np.int64]:
+    """(N,) the block of each Gaussian; -1 for what no block keeps: sky, and what is fully transparent."""
+    labels = np.full(len(piece), -1)
+    seen = (piece.opacities[piece.scene] > -math.inf).numpy()
+    try:
+        blocks = plan.grid.block_of(contract(piece.means[piece.scene].numpy(), plan.aabb))
+    except ValueError as error:
+        raise RunError(f"the Stage I model cannot be cut: {error}") from error
+    labels[piece.scene] = np.where(seen, blocks, -1)
+    return labels
+
+
+def _kept(coarse: Path, cell: Volume) -> Iterator[Gaussians]:
+    """What the Stage I model has in a cell, in pieces."""
+    for piece in read_ply_chunks(coarse):
+        yield retained(piece, cell, 0.0)
+
+
+def _write(path: Path, parts: Callable[[], Iterator[Gaussians]], sky: int, like: Path) -> int:
+    """Writes Gaussians as one model, with the offset and the projection of another; returns how many.
+
+    Args: parts is called twice, since the header, which comes first, has their number; sky, how many of them
+    at the end are sky.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    count = sum(map(len, parts()))
+    write_ply_parts(path, parts(), count=count, sky=sky, offset=ply_offset(like), exact=ply_exact(like))
+    return count
+
+
+def _saved(folder: RunFolder, task: TaskId, count: int, iterations: int, started: float) -> ModelSaved:
+    output = folder.model(task)
+    size, seconds = output.stat().st_size, time.monotonic() - started
+    return ModelSaved(task, folder.relative(output), count, size, iterations, seconds)
+
+
+def _merged(folder: RunFolder, started: float) -> Merged:
+    count, sky = ply_header(folder.point_cloud)
+    size = folder.point_cloud.stat().st_size
+    return Merged(folder.relative(folder.point_cloud), count, sky, size, time.monotonic() - started)

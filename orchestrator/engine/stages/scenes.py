@@ -1,0 +1,101 @@
+"""The scene of a run, and how its panoramas were captured: measured before Stage I, and learnt in it.
+
+Stage I trains on the scene with what was measured, later stages on the scene with what Stage I has learnt:
+blocks agree on both sides of their faces.
+"""
+
+import math
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from panolog.orchestrator.engine.stages.measuring import Measured
+from panolog.orchestrator.engine.stages.movers import write_movers
+from panolog.orchestrator.engine.stages.poses import save_poses
+from panolog.orchestrator.runs.folder import RunFolder, write_json
+from panolog.orchestrator.runs.info import RunInfo
+from panolog.scene.errors import SceneError
+from panolog.scene.model import Panorama, Scene
+from panolog.scene.read import read_scene
+from panolog.scene.stores.url import is_url
+from panolog.workers.capture.captured import Captured
+from panolog.workers.tasks import COARSE
+
+
+def scene_of(info: RunInfo, folder: RunFolder) -> Scene:
+    """The scene of a run. Raises InputError if it is gone or no longer what the run began with.
+
+    One that the run has made is looked for in its folder, which may have been brought to another place.
+    """
+    path = info.scene.path
+    if not (is_url(path) or Path(path).exists()) and folder.scene.is_dir():
+        path = str(folder.scene)
+    scene = read_scene(path)
+    if scene.fingerprint != info.scene.fingerprint:
+        raise SceneError(
+            f"{path}: the scene has changed since the run began{_newest(scene, info)}; put back what it"
+            " was and resume, or start a new run"
+        )
+    return scene
+
+
+def _newest(scene: Scene, info: RunInfo) -> str:
+    """The file that was written last, if that was after the run began: most likely the cause."""
+    files = [file for panorama in scene.panoramas for file in panorama.files]
+    written, file = max((file.stat().st_mtime, file) for file in files)
+    began = datetime.fromisoformat(info.created.replace("Z", "+00:00")).timestamp()
+    return f" ({file.relative_to(scene.root)} was written since)" if written > began else ""
+
+
+def measured_scene(folder: RunFolder, scene: Scene) -> Scene:
+    """The scene as Stage I trains on it. Raises RunError if a file is damaged."""
+    return _with(folder.measured, _with(folder.adjusted, scene))
+
+
+def learnt_scene(folder: RunFolder, scene: Scene) -> Scene:
+    """The scene as later stages use it, from when Stage I has ended. Raises as `measured_scene`."""
+    return _with(folder.captured(COARSE), measured_scene(folder, scene))
+
+
+def _with(path: Path, scene: Scene) -> Scene:
+    return Captured.load(path).applied(scene) if path.exists() else scene
+
+
+def save_captured(folder: RunFolder, captured: Captured, scene: Scene) -> None:
+    """Writes what Stage I has learnt, for later stages and to be read. Raises OSError if that fails."""
+    captured.save(folder.captured(COARSE))
+    learnt = captured.applied(scene)
+    adjusted = Captured.load(folder.adjusted) if folder.adjusted.exists() else None
+    if captured.exposure is not None:
+        write_json(folder.exposure, {"panoramas": _exposures(learnt)})
+    if captured.movers is not None:
+        write_movers(folder, learnt)
+    if captured.poses is not None:
+        save_poses(folder, captured, adjusted, scene)
+
+
+def save_measured(folder: RunFolder, found: Measured, scene: Scene) -> None:
+    """Writes what was measured before Stage I. Args: scene, as its files have it.
+
+    Raises OSError if the disk takes no file, SceneError if the COLMAP model can no longer be read.
+    """
+    if found.captured is not None:
+        found.captured.save(folder.measured)
+    if found.adjusted is not None:
+        found.adjusted.save(folder.adjusted)
+        save_poses(folder, None, found.adjusted, found.adjusted.applied(scene))
+
+
+def _exposures(scene: Scene) -> list[dict[str, Any]]:
+    return [_exposure(scene.panoramas[row]) for row in scene.train]
+
+
+def _exposure(panorama: Panorama) -> dict[str, Any]:
+    assert panorama.exposure is not None
+    log_gain, black = panorama.exposure.tolist()
+    return {
+        "name": panorama.name,
+        "stops": sum(log_gain) / 3 / math.log(2),  # over the mean of all
+        "gain": [math.exp(value) for value in log_gain],  # RGB, in linear light
+        "black": black,  # RGB, of encoded colours in [0, 1]
+    }

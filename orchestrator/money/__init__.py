@@ -1,1 +1,0 @@
-"""What machines cost, and how much of it a run may use."""

@@ -1,1 +1,0 @@
-"""What machines have, and where on them tasks run."""

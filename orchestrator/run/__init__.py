@@ -1,1 +1,0 @@
-"""A run as data: settings, records, state, files. Imports neither torch nor Ray."""

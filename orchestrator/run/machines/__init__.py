@@ -1,1 +1,0 @@
-"""The machines of a run: its settings of them, and what its records say of each."""

@@ -1,1 +1,0 @@
-"""What a run costs, as its records say it."""

@@ -1,0 +1,1 @@
+"""What machines are: what there is, settings, and what the records of a run say of each."""

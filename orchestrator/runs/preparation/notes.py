@@ -1,0 +1,121 @@
+"""RUN/prepare/progress.json and RUN/prepare/STEP.json: how far the preparation is, and what its steps made.
+
+The driver writes them, anything may read them. What is read may be of another version, damaged or made to do
+harm: it is bounded, and what is not of the format counts as missing.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from panolog.orchestrator.runs.folder import RunFolder, write_json
+from panolog.orchestrator.runs.preparation.settings import MOST_BYTES, Step
+
+_LINES, _LINE = 100, 500  # that a result keeps, characters of each
+_Count = Annotated[int, Field(ge=0, lt=2**53)]
+_Words = Annotated[str, StringConstraints(max_length=200)]
+_Note = TypeVar("_Note", bound="_Model")
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class StepProgress(_Model):
+    """What is done now; a `total` of 0 is not known."""
+
+    step: Step
+    what: _Words  # a part of the step: "features"
+    done: _Count = 0
+    total: _Count = 0
+    time: float = 0.0  # seconds since the epoch; 0 = not known
+
+    def __str__(self) -> str:
+        return f"{self.what} {self.done:,} of {self.total:,}" if self.total else self.what
+
+
+class Counts(_Model):
+    """What the reconstruction has kept and refused."""
+
+    panoramas: _Count
+    registered: _Count
+    points: _Count
+    weak_links: _Count
+    contradictions: _Count
+
+
+class StepResult(_Model):
+    """A step that is done."""
+
+    step: Step
+    settings: dict[str, Any] = Field(description="what it was made with: `Settings.of`")
+    seconds: float = Field(ge=0, description="of the driver that ended it")
+    lines: tuple[Annotated[str, StringConstraints(max_length=_LINE)], ...] = Field(max_length=_LINES)
+    counts: Counts | None = None  # of the reconstruction
+
+
+def progress_path(folder: RunFolder) -> Path:
+    """Where the progress is."""
+    return folder.preparation / "progress.json"
+
+
+def result_path(folder: RunFolder, step: Step) -> Path:
+    """Where the result of a step is: there is one if the step is done."""
+    return folder.preparation / f"{step}.json"
+
+
+def masks_picture(folder: RunFolder) -> Path:
+    """Some panoramas with their masks, in one picture."""
+    return folder.preparation / "masks.jpg"
+
+
+def sfm_picture(folder: RunFolder) -> Path:
+    """The poses from above."""
+    return folder.scene / "sfm.png"
+
+
+def write_note(path: Path, note: StepProgress | StepResult) -> None:
+    """Writes one of them. Raises OSError if that is impossible."""
+    write_json(path, note.model_dump(mode="json"))
+
+
+def shortened(lines: Sequence[str]) -> tuple[str, ...]:
+    """What a result keeps of lines."""
+    kept = [line if len(line) <= _LINE else f"{line[: _LINE - 1]}…" for line in lines[:_LINES]]
+    if len(lines) > _LINES:
+        kept[-1] = f"… and {len(lines) - _LINES + 1:,} more lines"
+    return tuple(kept)
+
+
+def read_plain(path: Path) -> bytes:
+    """The bytes of a file of a folder that is trusted. Raises OSError if there is none."""
+    with path.open("rb") as file:
+        return file.read(MOST_BYTES + 1)
+
+
+def read_progress(folder: RunFolder, read: Callable[[Path], bytes] = read_plain) -> StepProgress | None:
+    """What is done now; None if that is not known. Args: read, returns the bytes of a file."""
+    return _read(progress_path(folder), StepProgress, read)
+
+
+def read_result(
+    folder: RunFolder, step: Step, read: Callable[[Path], bytes] = read_plain
+) -> StepResult | None:
+    """The result of a step; None if it is not done."""
+    found = _read(result_path(folder, step), StepResult, read)
+    return found if found is not None and found.step is step else None
+
+
+def _read(path: Path, kind: type[_Note], read: Callable[[Path], bytes]) -> _Note | None:
+    try:
+        content = read(path)
+    except OSError:
+        return None
+    if len(content) > MOST_BYTES:
+        return None
+    try:
+        return kind.model_validate_json(content)
+    except ValidationError:
+        return None

@@ -1,0 +1,139 @@
+"""RUN/prepare/settings.json: of what a run makes its scene, and how. Written before the first step begins."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from panolog.orchestrator.runs.folder import RunFolder, write_json
+from panolog.scene.errors import RunFolderError
+from panolog.workers.tasks import StrEnum
+
+NADIR = (
+    10.0  # degrees around straight down: stitching and the end of a stick, which neighbours see from aside
+)
+MOST_BYTES = 1_000_000  # of a file in RUN/prepare
+
+
+class Step(StrEnum):
+    """A step of the preparation, in order."""
+
+    MASKS = "masks"
+    SFM = "sfm"
+    DEPTH = "depth"
+    CHECK = "check"
+
+
+class Options(BaseModel):
+    """What a user may set of the preparation; None where a default depends on the source."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    sfm: dict[str, Any] = Field(default={}, description="fields of `SfmSettings` that are not the default")
+    nadir: float | None = Field(
+        default=None, ge=0, le=90, description="degrees around straight down; 0 = none"
+    )
+    static: bool | None = Field(default=None, description="mask what is the same in all panoramas")
+    depth_model: str | None = Field(default=None, description="ONNX network; its manifest is next to it")
+
+    @field_validator("sfm")
+    @classmethod
+    def _as_stored(cls, given: dict[str, Any]) -> dict[str, Any]:
+        """Tuples become lists, as in the file, so that settings compare equal."""
+        return {name: list(it) if isinstance(it, tuple) else it for name, it in given.items()}
+
+    @property
+    def given(self) -> bool:
+        """Whether anything is set."""
+        return self != Options()
+
+
+class Settings(Options):
+    """How the scene of a run is made."""
+
+    format: Literal[1] = 1
+    source: str  # folder or video
+    video: bool
+    panoramas: int  # in the folder, or frames in the video by its header
+    width: int  # of each in pixels
+    nadir: float = Field(ge=0, le=90, description="degrees around straight down; 0 = none")
+    static: bool = Field(description="mask what is the same in all panoramas")
+
+    def steps(self) -> tuple[Step, ...]:
+        """Those that there are, in order."""
+        wanted = {Step.MASKS: bool(self.nadir or self.static), Step.DEPTH: self.depth_model is not None}
+        return tuple(step for step in Step if wanted.get(step, True))
+
+    def of(self, step: Step) -> dict[str, Any]:
+        """What the result of a step depends on, besides that of the steps before."""
+        match step:
+            case Step.SFM:
+                return {"source": self.source, **self.sfm}
+            case Step.MASKS:
+                return {"nadir": self.nadir, "static": self.static}
+            case Step.DEPTH:
+                return {"model": self.depth_model}
+        return {}
+
+
+def settings_path(folder: RunFolder) -> Path:
+    """Where the settings are."""
+    return folder.preparation / "settings.json"
+
+
+def write_settings(folder: RunFolder, settings: Settings) -> None:
+    """Writes the settings. Raises OSError if that is impossible."""
+    write_json(settings_path(folder), settings.model_dump(mode="json"))
+
+
+def read_settings(folder: RunFolder) -> Settings | None:
+    """The settings of a run that makes its scene; None of one that was given a scene.
+
+    Raises RunFolderError if they cannot be read or are of another format.
+    """
+    path = settings_path(folder)
+    try:
+        with path.open("rb") as file:
+            content = file.read(MOST_BYTES + 1)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise RunFolderError(f"{path}: cannot be read: {error.strerror}") from error
+    settings = parse_settings(content)
+    if settings is None:
+        raise RunFolderError(f"{path}: is not of this PanoLOG's format; start a new run")
+    return settings
+
+
+def parse_settings(content: bytes) -> Settings | None:
+    """The settings from the bytes of their file; None if they are of another format."""
+    if len(content) > MOST_BYTES:
+        return None
+    try:
+        return Settings.model_validate(json.loads(content))
+    except (ValidationError, ValueError, RecursionError):
+        return None
+
+
+def as_arguments(options: Options) -> Iterator[str]:
+    """The options of `panolog run` that set these."""
+    for name, value in options.sfm.items():
+        match name, value:
+            case "distance", [one, other, metres]:
+                yield from ("--distance", str(one), str(other), str(metres))
+            case "gps", False:
+                yield "--no-gps"
+            case "partial", True:
+                yield "--partial"
+            case "pairing", _:
+                yield from ("--pairs", str(value))
+            case _:
+                yield from (f"--{name}", str(value))
+    if options.nadir is not None:
+        yield from ("--nadir", str(options.nadir))
+    if options.static is not None:
+        yield "--static" if options.static else "--no-static"
+    if options.depth_model is not None:
+        yield from ("--depth-model", options.depth_model)

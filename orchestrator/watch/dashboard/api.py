@@ -1,0 +1,379 @@
+"""The routes: the contract between the server and its pages, or any other program.
+
+All JSON, typed in `messages`; times in seconds since the epoch, sizes in bytes, rates per second. A run is
+named by an id of 16 hex digits: no path ever comes from a client. An error is {"error": one line} with 403
+(see `guard`), 404, 409 (not possible now), 422 (a bad parameter) or 503 (the run cannot be read at present).
+
+GET /, /runs/{id}, /compare, /static/… pages, scripts and styles; plotly.min.js is that of its package
+GET /api/runs                         RunList
+GET /api/runs/{id}                    RunPage
+GET /api/runs/{id}/map                a plotly figure: see `figures.map_figure`; all its blocks are waiting
+GET /api/runs/{id}/camera/{row}       CameraView
+GET /api/runs/{id}/camera/{row}/panorama
+                                      JPEG, the panorama of the scene at a width of at most 1,024 pixels
+GET /api/runs/{id}/block/{number}     BlockCameras
+GET /api/runs/{id}/series?task=&points=
+    {"loss": Series, "psnr", "gaussians", "rate", "memory", "rate/means"…}: at most `points` (600) of each
+GET /api/runs/{id}/events?before=&after=&limit=&type=&task=&text=
+    EventList, newest first, at most `limit` (200). `type` may be repeated; with "-" before it is left out. If
+    "more", continue with before="next": a search for a text can return few events or none and still have more
+    records to search.
+GET /api/runs/{id}/previews[?task=]   PreviewList: the latest of each task, or all of one, newest first
+GET /api/runs/{id}/previews/{event}   JPEG, the render above the photograph
+GET /api/runs/{id}/views              HeldOutViews
+GET /api/runs/{id}/views/{number}     JPEG, the render above the photograph
+GET /api/runs/{id}/preparation/{name} PNG or JPEG, what a step of the preparation has made: `PictureView.name`
+GET /api/runs/{id}/exposure           ExposureCurve
+GET /api/runs/{id}/findings           Findings: metrics of held-out panoramas, seams, refined poses, movers
+GET /api/runs/{id}/findings/{name}    PNG or JPEG, one of `Findings.pictures`
+GET /api/runs/{id}/point_cloud.ply    the model, to save
+GET /api/runs/{id}/report.html[?save=1]the report, to read in a sandbox of its own, or to save
+GET /api/compare?run=ID&run=ID…       Comparison of two to eight runs; of one that cannot be read the error
+GET /api/compare/curves?run=ID&run=ID…
+                                      CurvesOfRuns
+GET /api/stream[?run=ID][&changes=1]
+    Server-sent events; without `run` of the list. The first message is complete: "runs" (RunList) or "run"
+    (RunPage); again whenever it has changed, at most twice a second. "events" (EventList) has the records
+    since the connection began, at most 200 and of progress only the latest of each task. "gone": {"error"}:
+    the run cannot be read (any more). With changes=1 "changes" (RunChanges) takes the place of all "run" but
+    the first, unless most has changed.
+POST /api/runs/{id}/actions           {"action": "stop"|"resume"|"retry"|"pause"|"unpause"|"release", "block":
+                                      n|null, "node": null|host or begin of an id} → 202 {"accepted": true}
+POST /api/queue                       {"action": "move"|"remove"|"retry", "entry": n, "before": n|null} → 202
+                                      {"accepted": true}; `before` is where to move, null = to the end
+POST /api/runs/{id}/viewer            {"task": null|"coarse"|"block/003", "camera": null|name} → {"url"} of a
+                                      page with the model in 3D, which takes seconds to make. It begins at the
+                                      panorama of that name in the plan: `PlanCamera.name`
+GET /models/{key}/…                   its files, and photographs; the key grants them
+
+A POST needs `X-PanoLOG: 1` and the content type application/json.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+from urllib.parse import quote
+
+from fastapi import APIRouter, HTTPException, Query, Request
+from fastapi.responses import Response, StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from panolog.orchestrator.watch.dashboard import maps, pictures, stream
+from panolog.orchestrator.watch.dashboard.dependencies import (
+    ComparedRuns,
+    Registry,
+    Run,
+    body_of,
+    find_run,
+    fresh_watch,
+    read_watch,
+    respond,
+    respond_json,
+)
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry, read_below
+from panolog.orchestrator.watch.dashboard.messages import CameraView
+from panolog.orchestrator.watch.dashboard.model_pages import ModelPages, page_policy
+from panolog.orchestrator.watch.dashboard.queues.panel import QueueAction
+from panolog.orchestrator.watch.dashboard.responses import json_response, model_download, report_download
+from panolog.orchestrator.watch.dashboard.watch import Watch, error_line
+from panolog.orchestrator.watch.views import queries
+from panolog.orchestrator.watch.views.comparison.compare import compare
+from panolog.orchestrator.watch.views.comparison.curves import curves_of
+from panolog.orchestrator.watch.views.comparison.reading import ReadRun, UnreadRun
+from panolog.orchestrator.watch.views.comparison.schema import Comparison
+from panolog.orchestrator.watch.views.exposures import MOST_BYTES, ExposureCurve, exposure_curve
+from panolog.orchestrator.watch.views.pages.encoding import encode
+from panolog.scene.errors import InputError
+from panolog.scene.stores.outline import local_folder, made_here
+from panolog.scene.stores.url import is_url
+
+router = APIRouter()
+_EventId = Annotated[int, Field(ge=0, lt=2**63)]
+
+
+class ActionRequest(BaseModel):
+    """The body of a POST to /actions."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    action: Literal["stop", "resume", "retry", "pause", "unpause", "release"]
+    block: int | None = None
+    node: Annotated[str, Field(max_length=255)] | None = None
+
+
+class QueueRequest(BaseModel):
+    """The body of a POST to /queue."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    action: QueueAction
+    entry: Annotated[int, Field(ge=1, lt=2**63)]
+    before: Annotated[int, Field(ge=1, lt=2**63)] | None = None
+
+
+class ViewerRequest(BaseModel):
+    """The body of a POST to /viewer."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    task: str | None = None
+    camera: str | None = None
+
+
+@router.get("/api/runs")
+async def get_runs(request: Request, registry: Registry) -> Response:
+    """The list."""
+    await registry.list.refresh()
+    return json_response(request, registry.data)
+
+
+@router.get("/api/runs/{id}")
+async def get_run(request: Request, registry: Registry, run: Run) -> Response:
+    """All about one run."""
+    return await registry.call(json_response, request, run.snapshot.data)
+
+
+@router.get("/api/runs/{id}/map")
+async def get_map(request: Request, run: Run) -> Response:
+    """Its plan from above."""
+    cache: maps.MapCache = request.app.state.maps
+    return await respond(request, 404, lambda: json_response(request, cache.map_of(run.entry)))
+
+
+@router.get("/api/runs/{id}/camera/{row}")
+async def get_camera(request: Request, run: Run, row: int) -> Response:
+    """One training camera of its plan."""
+    return await respond_json(request, _camera_view, run, row, status=404)
+
+
+@router.get("/api/runs/{id}/camera/{row}/panorama")
+async def get_panorama(request: Request, run: Run, row: int) -> Response:
+    """Its picture."""
+    return await respond(request, 404, _panorama, request.app.state.panoramas, run, row)
+
+
+@router.get("/api/runs/{id}/block/{number}")
+async def get_block(request: Request, run: Run, number: int) -> Response:
+    """The cameras of a block of its plan."""
+    return await respond_json(request, maps.cameras_of, run.entry, number, status=404)
+
+
+def _exposure_curve(entry: RunEntry) -> ExposureCurve | None:
+    return exposure_curve(entry.folder, lambda path: read_below(path, entry.folder.root, MOST_BYTES))
+
+
+def _camera_view(run: Watch, row: int) -> CameraView | None:
+    found = maps.scored_camera_of(run.entry, row)
+    if found is None:
+        return None
+    camera, scores = found
+    try:
+        pictures.open_panorama(_scene_of(run), camera.name).close()
+        why = None
+    except InputError as error:
+        why = str(error)
+    return CameraView(**camera.model_dump(exclude={"center"}), scores=scores, no_picture=why)
+
+
+def _panorama(cache: pictures.PanoramaCache, run: Watch, row: int) -> Response:
+    camera = maps.camera_of(run.entry, row)
+    if camera is None:
+        raise InputError("the plan of this run has no such panorama")
+    return cache.small(_scene_of(run), camera.name)
+
+
+def _scene_of(run: Watch) -> Path:
+    """The folder that the run has recorded, or the outline of the URL.
+
+    Raises InputError if it has recorded none, or this machine has not read what is at the URL.
+    """
+    scene = run.snapshot.page.info.get("scene") if run.snapshot.page else None
+    path = scene.get("path") if isinstance(scene, dict) else None
+    if not isinstance(path, str) or "\0" in path:
+        raise InputError("run.json names no scene")
+    folder = local_folder(path)
+    if is_url(path) and not made_here(folder):
+        raise InputError(f"the scene {path} is in a store, and this machine has not read it yet")
+    return folder
+
+
+@router.get("/api/runs/{id}/series")
+async def get_series(
+    request: Request, run: Run, task: str, points: Annotated[int, Query(ge=2, le=5_000)] = 600
+) -> Response:
+    """The curves of a task."""
+    return await respond_json(request, queries.series, run.database, task, points)
+
+
+@router.get("/api/runs/{id}/events")
+async def get_events(
+    request: Request,
+    run: Run,
+    before: _EventId | None = None,
+    after: _EventId = 0,
+    limit: Annotated[int, Query(ge=1, le=1_000)] = 200,
+    type: Annotated[list[str] | None, Query(max_length=50)] = None,
+    task: str | None = None,
+    text: Annotated[str, Query(max_length=200)] = "",
+) -> Response:
+    """A page of its history."""
+    types = frozenset(filter(None, type or ()))
+    without = frozenset(name[1:] for name in types if name.startswith("-"))
+    only = frozenset(name for name in types if not name.startswith("-"))
+    wanted = queries.Filter(before, after, only, without, task or None, text)
+    return await respond_json(request, queries.events, run.database, wanted, limit)
+
+
+@router.get("/api/runs/{id}/previews")
+async def get_previews(request: Request, run: Run, task: str | None = None) -> Response:
+    """Which previews of training views there are."""
+    return await respond_json(request, pictures.previews, run.entry, task)
+
+
+@router.get("/api/runs/{id}/previews/{event}")
+async def get_preview(request: Request, run: Run, event: _EventId) -> Response:
+    """One of these pictures."""
+    return await respond(request, 404, pictures.preview, run.entry, event)
+
+
+@router.get("/api/runs/{id}/views")
+async def get_views(request: Request, run: Run) -> Response:
+    """The held-out panoramas with their metrics."""
+    return await respond_json(request, pictures.views, run.database)
+
+
+@router.get("/api/runs/{id}/views/{number}")
+async def get_view(request: Request, run: Run, number: _EventId) -> Response:
+    """One of these compared with its render."""
+    return await respond(request, 404, pictures.view, run.entry, number)
+
+
+@router.get("/api/runs/{id}/preparation/{name}")
+async def get_preparation_picture(request: Request, run: Run, name: str) -> Response:
+    """What a step of the preparation has made."""
+    return await respond(request, 404, pictures.of_preparation, run.entry, name)
+
+
+@router.get("/api/runs/{id}/exposure")
+async def get_exposure(request: Request, run: Run) -> Response:
+    """How bright each training panorama is."""
+    return await respond_json(request, _exposure_curve, run.entry, status=404)
+
+
+@router.get("/api/runs/{id}/findings")
+async def get_findings(request: Request, run: Run) -> Response:
+    """What was measured."""
+    return await respond_json(request, pictures.findings, run.entry, status=404)
+
+
+@router.get("/api/runs/{id}/findings/{name}")
+async def get_finding_picture(request: Request, run: Run, name: str) -> Response:
+    """One of its pictures."""
+    return await respond(request, 404, pictures.of_findings, run.entry, name)
+
+
+@router.get("/api/runs/{id}/point_cloud.ply")
+async def get_model(request: Request, run: Run) -> Response:
+    """The merged model."""
+    return await respond(request, 404, model_download, run.entry)
+
+
+@router.get("/api/runs/{id}/report.html")
+async def get_report(request: Request, run: Run, save: bool = False) -> Response:
+    """The report."""
+    return await respond(request, 404, report_download, run.entry, save)
+
+
+@router.get("/api/compare")
+async def get_comparison(request: Request, runs: ComparedRuns) -> Response:
+    """Runs side by side."""
+    return await respond_json(request, _comparison, runs)
+
+
+@router.get("/api/compare/curves")
+async def get_compared_curves(request: Request, runs: ComparedRuns) -> Response:
+    """The curves of runs on one axis."""
+    return await respond_json(request, lambda: curves_of([read_watch(run) for run in runs]))
+
+
+def _comparison(runs: Sequence[Watch | UnreadRun]) -> Comparison:
+    """The comparison with the URLs of its pictures."""
+    found = [read_watch(run) for run in runs]
+    numbers = {run.id: pictures.numbers(run.folder.database) for run in found if isinstance(run, ReadRun)}
+
+    def url(run: ReadRun, view: str) -> str | None:
+        number = numbers[run.id].get(view)
+        return None if number is None else f"/api/runs/{run.id}/views/{number}"
+
+    return compare(found, url)
+
+
+@router.get("/api/stream")
+async def get_stream(registry: Registry, run: str | None = None, changes: bool = False) -> Response:
+    """The list or a run, again whenever it has changed."""
+    if run is None:
+        messages = stream.runs(registry)
+    else:
+        watch, topic = await find_run(registry, run)
+        messages = stream.run(registry, watch, topic, changes=changes)
+    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    return StreamingResponse(messages, 200, headers, "text/event-stream")
+
+
+@router.post("/api/runs/{id}/actions")
+async def post_action(request: Request, registry: Registry, id: str) -> Response:
+    """Requests something of the run's driver, or starts one."""
+    body = await body_of(request, ActionRequest)
+    watch = await fresh_watch(registry, id)
+    try:
+        await registry.call(watch.act, body.action, body.block, body.node)
+    except InputError as error:
+        raise HTTPException(409, error_line(error, registry.root)) from error
+    except OSError as error:
+        raise HTTPException(403, f"the run cannot be written: {error.strerror}") from error
+    return json_response(request, encode({"accepted": True}), 202)
+
+
+@router.post("/api/queue")
+async def post_queue(request: Request, registry: Registry) -> Response:
+    """Changes the queue."""
+    body = await body_of(request, QueueRequest)
+    try:
+        await registry.call(registry.queue.act, body.action, body.entry, body.before)
+    except InputError as error:
+        raise HTTPException(409, error_line(error, registry.root)) from error
+    await registry.list.refresh()
+    return json_response(request, encode({"accepted": True}), 202)
+
+
+@router.post("/api/runs/{id}/viewer")
+async def post_viewer(request: Request, registry: Registry, id: str) -> Response:
+    """Makes a page with the run's model, or a task's, in 3D."""
+    body = await body_of(request, ViewerRequest)
+    watch = await fresh_watch(registry, id)
+    pages: ModelPages = request.app.state.pages
+    try:
+        if body.camera is not None:
+            await registry.call(maps.require_camera, watch.entry, body.camera)
+        key = await pages.make(watch.entry, body.task, _scene_folder(watch))
+    except (InputError, OSError) as error:
+        raise HTTPException(409, error_line(error, registry.root)) from error
+    start = "" if body.camera is None else f"#camera={quote(body.camera, safe='')}"
+    return json_response(request, encode({"url": f"/models/{key}/{start}"}))
+
+
+@router.get("/models/{key}/{path:path}")
+async def get_model_page(request: Request, key: str, path: str) -> Response:
+    """A file of one of these pages."""
+    pages: ModelPages = request.app.state.pages
+    policy = page_policy(request.headers.get("host", ""), key)
+    return await respond(request, 404, pages.file, key, path, policy, request.app.state.panoramas)
+
+
+def _scene_folder(run: Watch) -> Path | None:
+    """Where the photographs of a run are, if that is on this machine."""
+    try:
+        scene = _scene_of(run)
+    except InputError:
+        return None
+    return scene if scene.is_absolute() and scene.is_dir() else None

@@ -1,0 +1,192 @@
+"""Which requests pass: a layer around the whole server, so that no route can be forgotten.
+
+On a loopback address there is no token, but a page of another site must neither read nor act through the
+browser of a user who has the dashboard open: the Host header must name this machine (DNS rebinding), and
+nothing but a GET is accepted from another origin or without the header that only our pages send. On any other
+address every request needs the token, as a cookie that the URL with the token has set, or as a bearer. The
+page of a model has an origin of its own, from which browsers send no cookie: the address of its files, which
+only clients with the token learn, is as secret as the token and grants these files alone.
+"""
+
+import base64
+import hashlib
+import ipaddress
+import os
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from http.cookies import CookieError, SimpleCookie
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import HTMLResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from panolog.orchestrator.watch.views.pages.encoding import encode
+from panolog.orchestrator.watch.views.pages.shell import LIVE_IMPORTS
+from panolog.scene.errors import InputError
+from panolog.scene.files import user_folder
+
+_LOCAL = {"localhost", "127.0.0.1", "[::1]"}
+_SAFE = {"GET", "HEAD"}
+_OWN_HEADER = "x-panolog"  # a header that no other site can send without being allowed to
+_IMPORTS = base64.b64encode(hashlib.sha256(LIVE_IMPORTS.encode()).digest()).decode()
+# plotly writes its own style elements and attributes; scripts are files of ours only, and where they are.
+CSP = (
+    f"default-src 'none'; script-src 'self' 'sha256-{_IMPORTS}';"
+    " style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:;"
+    " font-src 'self'; connect-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none';"
+    " frame-ancestors 'none'"
+)
+_HEADERS = {
+    "Content-Security-Policy": CSP,
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+}
+# A redirect would not send the strict cookie when the link came from another site, such as a web mail.
+_ENTRY_PAGE = '<!doctype html><meta http-equiv="refresh" content="0;url=./"><a href="./">PanoLOG</a>'
+
+
+@dataclass(frozen=True)
+class Access:
+    """What a request needs."""
+
+    token: str | None  # None: requests come from this machine alone
+    port: int
+
+    @property
+    def cookie(self) -> str:
+        """The name of the cookie, with the port: browsers share cookies between the ports of a host."""
+        return f"panolog-{self.port}"
+
+
+def is_local(host: str) -> bool:
+    """Whether an address to listen on can be reached from this machine alone."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def token_for(host: str, file: Path | None = None) -> str | None:
+    """The token that clients must send: None on a loopback address, else the user's, made if needed.
+
+    It is kept in a file, by default `token_file`, so that open pages work again after a restart; remove the
+    file for a new one.
+    Raises InputError if the file holds no token, OSError if it can be neither read nor written.
+    """
+    if is_local(host):
+        return None
+    file = file or token_file()
+    file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    try:
+        handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        token = file.read_text().strip()
+        if len(token) < 32:
+            raise InputError(f"{file}: holds no token; remove it") from None
+        return token
+    with os.fdopen(handle, "w") as new:
+        token = secrets.token_urlsafe(32)
+        new.write(token)
+    return token
+
+
+def token_file() -> Path:
+    """Where a user's token is stored. Raises InputError if this user has no home."""
+    folder = user_folder("XDG_STATE_HOME", ".local/state")
+    if folder is None:
+        raise InputError("there is no home folder for the dashboard's token: set HOME or XDG_STATE_HOME")
+    return folder / "dashboard-token"
+
+
+class Guard:
+    """Refuses what must not pass, and adds the security headers to every response."""
+
+    def __init__(self, app: ASGIApp, access: Access, granted: Callable[[str], bool]) -> None:
+        """Args: granted says whether the path of an address is itself a grant of what is there."""
+        self._app = app
+        self._access = access
+        self._granted = granted
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+
+        async def send_guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        refusal = self._intercept(scope)
+        await (refusal or self._app)(scope, receive, send_guarded)
+
+    def _intercept(self, scope: Scope) -> Response | None:
+        """The response in place of the requested one; None if the request may pass."""
+        headers, token = Headers(scope=scope), self._access.token
+        if token is None:
+            host = headers.get("host", "").lower()
+            name = host if host.endswith("]") else host.rpartition(":")[0] or host
+            if name not in _LOCAL:
+                return _refuse("this dashboard can be reached as localhost only")
+        elif (given := _token_of(scope)) is not None and _same(given, token):
+            return self._set_cookie(token)
+        elif not (self._has_token(headers, token) or self._granted(scope["path"])):
+            return _refuse("open the address with the token that `panolog dashboard` has printed")
+        if scope["method"] not in _SAFE and not _is_ours(headers):
+            return _refuse("this request came from another site")
+        return None
+
+    def _set_cookie(self, token: str) -> Response:
+        answer = HTMLResponse(_ENTRY_PAGE, headers={"Cache-Control": "no-store"})
+        answer.set_cookie(
+            self._access.cookie, token, max_age=400 * 86_400, path="/", httponly=True, samesite="strict"
+        )
+        return answer
+
+    def _has_token(self, headers: Headers, token: str) -> bool:
+        kind, _, bearer = headers.get("authorization", "").partition(" ")
+        if kind.lower() == "bearer" and _same(bearer.strip(), token):
+            return True
+        try:
+            morsel = SimpleCookie(headers.get("cookie", "")).get(self._access.cookie)
+        except CookieError:
+            return False
+        return morsel is not None and _same(morsel.value, token)
+
+
+def _token_of(scope: Scope) -> str | None:
+    """The token in the query, which only the first page accepts."""
+    if scope["path"] != "/" or scope["method"] not in _SAFE:
+        return None
+    values: list[str] = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
+    return values[0] if values else None
+
+
+def _same(given: str, token: str) -> bool:
+    """Compares in constant time."""
+    return secrets.compare_digest(given.encode(), token.encode())
+
+
+def _is_ours(headers: Headers) -> bool:
+    """Whether a request comes from one of our pages, or from no page at all."""
+    origin = headers.get("origin")
+    if origin is not None and urlsplit(origin).netloc.lower() != headers.get("host", "").lower():
+        return False
+    if headers.get("sec-fetch-site", "same-origin") != "same-origin":
+        return False
+    kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+    return headers.get(_OWN_HEADER) == "1" and kind == "application/json"
+
+
+def _refuse(line: str) -> Response:
+    return Response(encode({"error": line}), 403, {"Cache-Control": "no-store"}, "application/json")

@@ -1,0 +1,256 @@
+"""The JSON of the API as models. static/shared/messages.d.ts is made from them: `make types`."""
+
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict
+
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
+from panolog.orchestrator.watch.views.comparison.schema import Comparison, CurvesOfRuns
+from panolog.orchestrator.watch.views.exposures import ExposureCurve
+from panolog.orchestrator.watch.views.pages.findings import Findings
+from panolog.orchestrator.watch.views.run_view import LiveView, RunView
+from panolog.orchestrator.watch.views.summary import STAGES, SummaryHead, TaskView, Text, ViewModel
+from panolog.partition.plan_json import Reason
+
+
+class Actions(ViewModel):
+    """What can be done with a run now, why nothing can, and the last line of a driver that failed."""
+
+    allowed: bool
+    why: Text | None
+    available: tuple[str, ...]
+    failed: Text | None
+
+
+class Results(ViewModel):
+    """Which results of a run can be downloaded.
+
+    `exposure` changes with the exposures, if there are any, `findings` with what was measured.
+    """
+
+    model: bool
+    report: bool
+    exposure: str | None = None
+    findings: str = ""
+
+
+class RunPage(RunView):
+    """GET /api/runs/{id} and the stream's "run"."""
+
+    id: str
+    name: Text
+    path: Text
+    actions: Actions
+    result: Results
+
+
+class RunChanges(LiveView):
+    """The stream's "changes": what has changed since the last message; of the tasks those that have."""
+
+    id: str
+    actions: Actions
+    result: Results
+    summary: SummaryHead
+    tasks: tuple[TaskView, ...]
+
+
+class RunRow(ViewModel):
+    """A run in the list: `status` also "unread" or "unreadable"; `created` and `latest` in epoch seconds."""
+
+    id: str
+    name: Text
+    status: str = "unread"
+    label: str = ""
+    scene: Text | None = None
+    stage: str | None = None
+    stage_label: str = ""
+    progress: float = 0.0
+    eta: float | None = None
+    psnr: float | None = None
+    gaussians: int | None = None
+    size: int | None = None
+    created: float | None = None
+    latest: float | None = None
+    seconds: float | None = None
+    error: Text | None = None
+
+    @staticmethod
+    def of_page(page: RunPage) -> "RunRow":
+        """The row of a run that could be read."""
+        summary, scene, made = page.summary, page.info.get("scene"), page.preparation
+        source = made.source if made else str(scene.get("path", "")) if isinstance(scene, dict) else ""
+        model = summary.model
+        return RunRow(
+            id=page.id,
+            name=page.name,
+            status=summary.status,
+            label=summary.label,
+            scene=Path(source).name,
+            stage=summary.stage,
+            stage_label=STAGES.get(summary.stage, ""),
+            progress=page.progress,
+            eta=page.eta,
+            psnr=(summary.metrics or {}).get("psnr"),
+            gaussians=summary.kept_gaussians,
+            size=model.bytes if model else None,
+            created=_epoch(page.info.get("created")) or page.began,
+            latest=page.latest,
+            seconds=summary.seconds,
+        )
+
+    @staticmethod
+    def unread(entry: RunEntry) -> "RunRow":
+        """The row of a run of which only its place is known."""
+        return RunRow(id=entry.id, name=entry.name)
+
+
+def _epoch(moment: Any) -> float | None:
+    """Seconds since the epoch of a time in run.json."""
+    try:
+        return datetime.fromisoformat(str(moment).replace("Z", "+00:00")).timestamp()
+    except (ValueError, OverflowError):
+        return None
+
+
+class QueueRow(ViewModel):
+    """An entry of the queue. `run` is the id of its run, if that is below the dashboard's folder.
+
+    `label` is its state, or "interrupted" where no process of a running one is alive; `share`, what it has of
+    the machine, or is to get as stated, "" if neither is known; `time`, in epoch seconds, that of its end,
+    else of its start, else of its addition.
+    """
+
+    id: int
+    name: Text
+    run: str | None
+    state: str
+    label: str
+    reason: Text
+    share: str
+    time: float
+
+
+class QueueList(ViewModel):
+    """The queue: those that run, those that wait in order, and the latest that have ended.
+
+    `hidden` entries are not shown; `error` says why the queue cannot be read.
+    """
+
+    folder: Text
+    runner: bool = False
+    hidden: int = 0
+    entries: tuple[QueueRow, ...] = ()
+    error: Text | None = None
+
+
+class RunList(ViewModel):
+    """GET /api/runs and the stream's "runs": newest first. `queue` is null where there is none."""
+
+    folder: Text
+    runs: tuple[RunRow, ...]
+    queue: QueueList | None = None
+
+
+class RunEvent(ViewModel):
+    """A record of a run, with the fields of its type."""
+
+    model_config = ConfigDict(extra="allow")
+
+    id: int
+    time: float
+    type: str
+    task: Text
+
+
+class EventList(ViewModel):
+    """GET …/events and the stream's "events": newest first. To continue: `before` = `next`."""
+
+    events: tuple[RunEvent, ...]
+    more: bool = False
+    next: int | None = None
+
+
+class SavedPreview(ViewModel):
+    """A render of a training view, above the photograph."""
+
+    event: int
+    task: Text
+    iteration: int
+    view: Text
+    time: float
+
+
+class PreviewList(ViewModel):
+    """GET …/previews."""
+
+    previews: tuple[SavedPreview, ...]
+
+
+class HeldOutView(ViewModel):
+    """A held-out panorama with its metrics."""
+
+    number: int
+    name: Text
+    metrics: dict[str, float | None] | None
+
+
+class HeldOutViews(ViewModel):
+    """GET …/views."""
+
+    views: tuple[HeldOutView, ...]
+
+
+class CameraView(ViewModel):
+    """GET …/camera/{row}: a training panorama of the plan.
+
+    `scores` has one for each block, `assigned` why it trains which of them.
+    """
+
+    row: int
+    name: Text
+    block: int  # that it is in
+    scores: tuple[float, ...]
+    assigned: dict[int, Reason]
+    no_picture: Text | None  # why its panorama cannot be shown
+
+
+class BlockCamera(ViewModel):
+    """A camera that trains a block, and which criterion chose it."""
+
+    row: int
+    name: Text
+    reason: Reason
+
+
+class BlockCameras(ViewModel):
+    """GET …/block/{number}: the cameras that train a block."""
+
+    block: int
+    cameras: tuple[BlockCamera, ...]
+
+
+class Series(ViewModel):
+    """A curve: iterations, epoch seconds, values. GET …/series has one for each name."""
+
+    iteration: tuple[float, ...]
+    time: tuple[float, ...]
+    value: tuple[float | None, ...]
+
+
+MESSAGES = (
+    RunList,
+    RunPage,
+    RunChanges,
+    EventList,
+    PreviewList,
+    HeldOutViews,
+    Series,
+    ExposureCurve,
+    Findings,
+    CameraView,
+    BlockCameras,
+    Comparison,
+    CurvesOfRuns,
+)

@@ -1,0 +1,214 @@
+"""Pages of models in 3D for the dashboard: what a finished run has written, or made by a process on request.
+
+A model needs torch and far more memory than a server should use, so this file is also the program that
+makes one page: `python -m panolog.orchestrator.watch.dashboard.model_pages ROOT RUN TASK OUTPUT`.
+
+A page is a folder whose scripts fetch the model in parts. It runs in an origin of its own, from which
+browsers send no cookie, so its address has a random key that grants its files, and nothing else.
+"""
+
+import asyncio
+import os
+import re
+import secrets
+import shutil
+import sys
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from fastapi.responses import Response
+
+from panolog.export.site.page import described, photograph_number
+from panolog.export.site.write import media_type
+from panolog.orchestrator.runs.folder import model_of
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry, by_handle, open_below, read_below
+from panolog.orchestrator.watch.dashboard.pictures import PanoramaCache
+from panolog.orchestrator.watch.dashboard.responses import Download
+from panolog.orchestrator.watch.views.site.photographs import WIDE
+from panolog.scene.errors import InputError, PanologError
+from panolog.workers.tasks import TaskId
+
+_CACHED = 8  # pages
+_QUEUED = 4  # requests that may wait at a time
+_TIMEOUT_S = 300.0  # for one page
+_MOST = 1_000_000  # Gaussians of a page that is made on request
+_DESCRIPTION_BYTES = 32_000_000  # of a scene.json at most
+_PATH = re.compile(r"/models/([0-9a-f]{48})/.*", re.DOTALL)
+_FILE = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*(/[A-Za-z0-9_-][A-Za-z0-9_.-]*)*")
+_HOST = re.compile(r"[A-Za-z0-9.-]+(:[0-9]+)?")
+
+
+def page_policy(host: str, key: str) -> str:
+    """The content security policy of a page: an origin of its own, and no other address than its files'.
+
+    It is third-party code, and needs nothing else from this server.
+    Args: host, as the client named it; where a policy cannot name it, such as an IPv6 address, the files of
+    the whole server may be requested, which that does not let the page read.
+    """
+    own = f"{host}/models/{key}/" if _HOST.fullmatch(host) else "'self'"
+    return (
+        f"sandbox allow-scripts allow-downloads; default-src 'none'; script-src {own}; style-src {own};"
+        f" img-src {own} data: blob:; connect-src {own} data: blob:; worker-src blob:;"
+        " base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Site:
+    """A page that was written."""
+
+    folder: Path
+    temporary: bool  # whether it was made for this server
+    description: bytes  # scene.json
+    names: list[str]  # of the cameras, whose photographs are in `scene`
+    scene: Path | None  # None: the photographs are not on this machine
+
+    @staticmethod
+    def of(folder: Path, scene: Path | None, *, temporary: bool) -> "_Site":
+        """Raises InputError if it is no page."""
+        data, names = read_below(folder / "scene.json", folder, _DESCRIPTION_BYTES), list[str]()
+        if scene is not None:
+            data, names = described(data)
+        return _Site(folder, temporary, data, names, scene)
+
+
+class ModelPages:
+    """The pages that were requested last; those that no run has written are in a temporary folder."""
+
+    def __init__(self) -> None:
+        self._folder = TemporaryDirectory(prefix="panolog-dashboard-")
+        self._sites: OrderedDict[str, _Site] = OrderedDict()  # by key
+        self._keys: dict[tuple[object, ...], str] = {}  # by what they show
+        self._lock = asyncio.Lock()
+        self._waiting = 0
+
+    async def make(self, entry: RunEntry, task: str | None, scene: Path | None) -> str:
+        """Makes the page of the current model of a run, or of one of its tasks, and returns its key.
+
+        Args: scene, the folder of the run's photographs, None if that is not on this machine.
+        Raises InputError if there is no such model, it cannot be read, or too many requests wait.
+        """
+        model = model_of(entry.folder, TaskId.parse(task) if task else None)
+        known = model.stat()
+        shown = (entry.id, task, model.name, known.st_mtime_ns, known.st_size, scene)
+        if self._key(shown) is None:
+            if self._waiting == _QUEUED:
+                raise InputError("other 3D views are being made: try again in a minute")
+            self._waiting += 1
+            try:
+                async with self._lock:
+                    if self._key(shown) is None:
+                        self._add(shown, await self._site(entry, task, scene, known.st_mtime))
+            finally:
+                self._waiting -= 1
+        return self._keys[shown]
+
+    def grants(self, path: str) -> bool:
+        """Whether a path of an address is below that of a page."""
+        match = _PATH.fullmatch(path)
+        return match is not None and match[1] in self._sites
+
+    def file(self, key: str, path: str, policy: str, panoramas: PanoramaCache) -> Response:
+        """A file of a page, or a photograph. Raises InputError if there is none, or the page was removed."""
+        site = self._sites.get(key)
+        if site is None:
+            raise InputError("this 3D view was removed: open it again")
+        # Only pages in an origin of their own, which is "null", may read it: other sites may not.
+        headers = {"Content-Security-Policy": policy, "Access-Control-Allow-Origin": "null"}
+        if path == "scene.json":
+            return Response(site.description, 200, headers | {"Cache-Control": "no-store"}, media_type(path))
+        if site.scene is not None and (number := photograph_number(path)) is not None:
+            if number >= len(site.names):
+                raise InputError("there is no such photograph")
+            answer = panoramas.small(site.scene, site.names[number], WIDE)
+            answer.headers.update(headers)
+            return answer
+        path = path or "index.html"
+        if _FILE.fullmatch(path) is None:
+            raise InputError("there is no such file")
+        handle = open_below(site.folder / path, site.folder)
+        headers["Cache-Control"] = "private, max-age=3600"
+        return Download(handle, media_type(path), headers, None)
+
+    def close(self) -> None:
+        """Removes all pages."""
+        self._folder.cleanup()
+
+    def _key(self, shown: tuple[object, ...]) -> str | None:
+        key = self._keys.get(shown)
+        if key is not None:
+            self._sites.move_to_end(key)
+        return key
+
+    def _add(self, shown: tuple[object, ...], site: _Site) -> None:
+        key = secrets.token_hex(24)
+        self._sites[key], self._keys[shown] = site, key
+        while len(self._sites) > _CACHED:
+            old, removed = self._sites.popitem(last=False)
+            self._keys = {what: key for what, key in self._keys.items() if key != old}
+            if removed.temporary:
+                shutil.rmtree(removed.folder, ignore_errors=True)
+
+    async def _site(self, entry: RunEntry, task: str | None, scene: Path | None, newest: float) -> _Site:
+        """What the run has written for its model, if that is current, else a page made now."""
+        web = entry.folder.web
+        written = web / "scene.json"
+        if task is None and not web.is_symlink() and written.is_file() and written.stat().st_mtime >= newest:
+            return await asyncio.to_thread(_Site.of, web, scene, temporary=False)
+        output = Path(self._folder.name) / secrets.token_hex(8)
+        await self._write(entry, task, output)
+        return await asyncio.to_thread(_Site.of, output, scene, temporary=True)
+
+    async def _write(self, entry: RunEntry, task: str | None, output: Path) -> None:
+        arguments = [str(entry.root), entry.path, task or "", str(output)]
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", __name__, *arguments),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        try:
+            _, errors = await asyncio.wait_for(process.communicate(), _TIMEOUT_S)
+        except asyncio.TimeoutError as error:
+            raise InputError(f"the 3D view was not made within {_TIMEOUT_S:.0f} seconds") from error
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+        if process.returncode:
+            lines = errors.decode(errors="replace").strip().splitlines()
+            raise InputError(lines[-1] if lines else "the 3D view could not be made")
+
+
+def _main(root: str, run: str, task: str, output: str) -> None:
+    """Makes one page, of files that are really below the run alone."""
+    import torch  # noqa: PLC0415
+
+    from panolog.export.site.write import write_site  # noqa: PLC0415
+    from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run  # noqa: PLC0415
+
+    os.nice(10)  # the run may be training on this machine
+    torch.set_num_threads(1)
+    folder = RunEntry(Path(root), run).folder
+    names: dict[str, str] = {}
+
+    def locate(path: Path) -> Path:
+        opened = by_handle(open_below(path, folder.root))
+        names[str(opened)] = path.name
+        return opened
+
+    try:
+        wanted = Wanted(TaskId.parse(task) if task else None, most=_MOST)
+        shown = site_of_run(folder, wanted, locate)
+        write_site(Path(output), shown.write_model, shown.page)
+    except PanologError as error:
+        text = str(error)
+        for opened, name in names.items():
+            text = text.replace(opened, name)
+        sys.exit(text)
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

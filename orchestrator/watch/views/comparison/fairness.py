@@ -1,0 +1,96 @@
+"""Why a comparison of runs is not fair: one line for each reason."""
+
+from collections.abc import Callable, Iterator, Sequence
+
+from panolog.orchestrator.watch.views.comparison.reading import ReadRun
+from panolog.orchestrator.watch.views.comparison.schema import ComparedRun
+
+Pair = tuple[ReadRun, ComparedRun]  # a run as it was read and as it is shown
+
+
+def warnings(runs: Sequence[Pair]) -> Iterator[str]:
+    """The reasons, of runs that could be read; the first is what the others are compared with."""
+    yield from _unfinished(runs)
+    yield from (f"{run.name}: {run.problem}" for run, _ in runs if run.problem)
+    yield from _differing(runs, "not of the same scene", lambda _, shown: _short(shown.fingerprint))
+    measured = [pair for pair in runs if pair[0].measured is not None]
+    missing = [shown.name for run, shown in runs if run.measured is None and not run.problem]
+    if missing:
+        yield f"not measured yet, without metrics: {', '.join(missing)}"
+    yield from _outdated(measured)
+    yield from _differing(measured, "not measured at the same width", lambda run, _: _width(run))
+    yield from _differing(
+        measured, "not measured with the same crop at the bottom", lambda run, _: _crop(run)
+    )
+    yield from _differing(
+        measured, "not measured with the same levels of detail", lambda run, _: _detail(run)
+    )
+    yield from _held_out(measured)
+    yield from _differing(
+        runs,
+        "not on the same machines, so their minutes say little",
+        lambda _, shown: ", ".join(shown.machines),
+    )
+
+
+def _unfinished(runs: Sequence[Pair]) -> Iterator[str]:
+    open_runs = [
+        f"{shown.name} ({shown.label}, {int(100 * shown.progress)}%)"
+        for _, shown in runs
+        if shown.status != "done"
+    ]
+    if open_runs:
+        yield f"not finished: {', '.join(open_runs)}"
+
+
+def _differing(runs: Sequence[Pair], what: str, text: Callable[[ReadRun, ComparedRun], str]) -> Iterator[str]:
+    """A line with what each run has, if that is not the same; what a run does not state is left out."""
+    texts = [(shown.name, text(run, shown)) for run, shown in runs]
+    if len({value for _, value in texts if value}) > 1:
+        yield f"{what}: {', '.join(f'{name} {value}' for name, value in texts if value)}"
+
+
+def _short(fingerprint: str | None) -> str:
+    return "" if fingerprint is None else fingerprint[:12]
+
+
+def _width(run: ReadRun) -> str:
+    width = run.measured.head.width if run.measured else None
+    return "" if width is None else f"{width} pixels"
+
+
+def _crop(run: ReadRun) -> str:
+    return f"{run.measured.head.crop_bottom or 0.0:g}" if run.measured else ""
+
+
+def _detail(run: ReadRun) -> str:
+    detail = run.measured.head.detail if run.measured else None
+    return f"of {detail:g} pixels" if detail else "none"
+
+
+def _outdated(runs: Sequence[Pair]) -> Iterator[str]:
+    """Metrics of a model that the run has replaced."""
+    for run, shown in runs:
+        merged = run.view.summary.model
+        count = shown.measured.gaussians if shown.measured else None
+        if merged is not None and count is not None and count != merged.gaussians:
+            yield (
+                f"{shown.name}: its metrics are of a model with {count:,} Gaussians, and the run's has"
+                f" {merged.gaussians:,}; `panolog eval` measures it"
+            )
+
+
+def _held_out(runs: Sequence[Pair]) -> Iterator[str]:
+    """Different held-out panoramas than those of the first run that has metrics."""
+    if not runs:
+        return
+    (first, shown), *others = runs
+    views = first.measured.views if first.measured else {}
+    for run, other in others:
+        theirs = run.measured.views if run.measured else {}
+        if theirs.keys() != views.keys():
+            common = len(theirs.keys() & views.keys())
+            yield (
+                f"not measured on the same panoramas: {shown.name} on {len(views):,}, {other.name} on"
+                f" {len(theirs):,}; differences are of the {common:,} that both have"
+            )

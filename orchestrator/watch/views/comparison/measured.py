@@ -1,0 +1,96 @@
+"""What metrics.json says of a run, whatever it holds: the file may come from elsewhere."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from panolog.orchestrator.watch.views.comparison.schema import METRICS, MeasuredView
+from panolog.scene.errors import RunFolderError
+
+MOST_BYTES = 16_000_000  # of metrics.json: of 70,000 panoramas; hostile JSON may need 20 times the memory
+_VIEWS = 70_000
+
+Values = Mapping[str, float | None]  # metrics by name
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The metrics of a run: of each held-out panorama, and how they were measured."""
+
+    head: MeasuredView
+    views: Mapping[str, Values]
+    mean: Values
+
+    @property
+    def conditions(self) -> tuple[int | None, float]:
+        """What must be the same for values to be comparable: width and crop."""
+        return self.head.width, self.head.crop_bottom or 0.0
+
+
+def parse_measured(path: Path, raw: bytes | None = None) -> Measured:
+    """The content of metrics.json; a value that is no finite number counts as not measured.
+
+    Args: path of the file; raw, its bytes if they are read already.
+    Raises RunFolderError if it is no JSON object, OSError if it cannot be read.
+    """
+    try:
+        content = json.loads(path.read_bytes() if raw is None else raw)
+    except (ValueError, RecursionError) as error:
+        raise RunFolderError(f"{path}: is not JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise RunFolderError(f"{path}: is not of this PanoLOG's format: it holds no object")
+    given, left_out = content.get("views"), content.get("left_out")
+    items = list(given.items())[:_VIEWS] if isinstance(given, dict) else []
+    views = {name: _values(values) for name, values in items}
+    head = MeasuredView(
+        width=_whole(content.get("width")),
+        crop_bottom=_number(content.get("crop_bottom")),
+        detail=_number(content.get("detail")),
+        panoramas=len(views),
+        left_out=len(left_out) if isinstance(left_out, dict) else 0,
+        gaussians=_whole(content.get("gaussians")),
+    )
+    mean = means(views.values()) if views else _values(content.get("mean"))
+    return Measured(head, views, mean)
+
+
+def means(views: Iterable[Values]) -> dict[str, float | None]:
+    """The mean of each metric over the views that have it; None where none has."""
+    found: dict[str, list[float]] = {name: [] for name in METRICS}
+    for values in views:
+        for name in METRICS:
+            if (value := values.get(name)) is not None:
+                found[name].append(value)
+    return {name: fmean(numbers) if numbers else None for name, numbers in found.items()}
+
+
+def finite(value: float | None) -> float | None:
+    """The same, None for what is not a finite number: JSON has none of these."""
+    return value if value is not None and math.isfinite(value) else None
+
+
+def _values(given: Any) -> dict[str, float | None]:
+    """The metrics in a JSON object."""
+    known = given if isinstance(given, dict) else {}
+    return {name: _number(known.get(name)) for name in METRICS}
+
+
+def _number(value: Any) -> float | None:
+    """A finite number; None for all else."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return finite(number)
+
+
+def _whole(value: Any) -> int | None:
+    """A whole number that is not negative; None for all else."""
+    number = _number(value)
+    return int(number) if number is not None and number >= 0 and number == int(number) else None

@@ -1,0 +1,122 @@
+"""What was measured of a run: metrics of held-out panoramas, seams between blocks, poses and movers."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+from pydantic import Field, ValidationError
+
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.watch.views.palette import SEAM_GRADES, seam_grade
+from panolog.orchestrator.watch.views.preparation import version_of
+from panolog.orchestrator.watch.views.summary import Text, ViewModel
+from panolog.scene.errors import InputError
+from panolog.workers.seams.schema import Seam, parse_seams
+
+_FACES = 3  # between blocks with pictures: the worst
+_MOVERS = 6  # panoramas with pictures: those with the largest movers
+_SEAM_PICTURES = ("truth.jpg", "merged.jpg", "below.jpg", "above.jpg", "face.png")
+
+Metrics = dict[str, float | None]
+_Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_File = TypeVar("_File", bound=ViewModel)
+
+
+class PoseFit(ViewModel):
+    """Metrics of held-out panoramas at the poses that fit the model best, `pixels` away on average."""
+
+    mean: Metrics
+
+
+class HeldOutMetrics(ViewModel):
+    """The metrics of held-out panoramas, and their means; `lpips_reason`, why there is no LPIPS."""
+
+    mean: Metrics = Field(default_factory=dict)
+    views: dict[str, Metrics] = Field(default_factory=dict)
+    pose_fit: PoseFit | None = None
+    lpips_reason: Text | None = None
+
+
+class MovedCamera(ViewModel):
+    """A refined camera: how far it moved in world units, turned in degrees, and moved what it sees."""
+
+    name: Text
+    moved: _Share
+    turned: _Share
+    pixels: _Share
+    at_bound: bool
+
+
+class MoverShare(ViewModel):
+    """A training panorama, and what part of it is left out of the loss because it moves, 0 to 1."""
+
+    name: Text
+    share: _Share
+
+
+class Findings(ViewModel):
+    """GET …/findings: the worst first, `colors` of the seams; `pictures` are names for …/findings/{name}."""
+
+    metrics: HeldOutMetrics | None
+    seams: tuple[Seam, ...]
+    colors: tuple[str | None, ...]
+    moves: tuple[MovedCamera, ...]
+    movers: tuple[MoverShare, ...]
+    pictures: tuple[str, ...]
+
+
+class _PosesFile(ViewModel):
+    panoramas: tuple[MovedCamera, ...] = ()
+
+
+class _MoversFile(ViewModel):
+    panoramas: tuple[MoverShare, ...] = ()
+
+
+def findings_version(folder: RunFolder) -> str:
+    """A text that changes with the findings."""
+    files = (folder.metrics, folder.seams, folder.poses, folder.mover_shares)
+    return " ".join(version_of(path) or "-" for path in files)
+
+
+def read_findings(folder: RunFolder, read: Callable[[Path], bytes] = Path.read_bytes) -> Findings:
+    """The findings of a run; empty where there are none yet. Args: read, how its files are read.
+
+    Raises InputError if a file is damaged, and what `read` raises.
+    """
+
+    def parsed(kind: type[_File], path: Path) -> _File | None:
+        try:
+            return kind.model_validate_json(read(path)) if path.exists() else None
+        except ValidationError as error:
+            raise InputError(f"{path.name}: is damaged: {error.error_count()} values are wrong") from error
+
+    poses = parsed(_PosesFile, folder.poses) or _PosesFile()
+    shares = parsed(_MoversFile, folder.mover_shares) or _MoversFile()
+    seams = parse_seams(read(folder.seams)) if folder.seams.exists() else ()
+    found = Findings(
+        metrics=parsed(HeldOutMetrics, folder.metrics),
+        seams=seams,
+        colors=tuple(None if face.seam is None else SEAM_GRADES[seam_grade(face.seam)][1] for face in seams),
+        moves=tuple(sorted(poses.panoramas, key=lambda camera: -camera.pixels)),
+        movers=tuple(sorted(shares.panoramas, key=lambda mover: (-mover.share, mover.name))),
+        pictures=(),
+    )
+    return found.model_copy(update={"pictures": tuple(finding_pictures(folder, found))})
+
+
+def finding_pictures(folder: RunFolder, found: Findings) -> dict[str, Path]:
+    """The pictures of the worst faces and of the largest movers, by their names, of those that there are."""
+    paths = {}
+    for face in found.seams[:_FACES]:
+        below, above = face.blocks
+        for name in _SEAM_PICTURES:
+            paths[f"seam-{below}-{above}-{name}"] = folder.seam(below, above) / name
+    for number, mover in enumerate(found.movers[:_MOVERS]):
+        paths[f"mover-{number}.jpg"] = folder.mover_picture(mover.name)
+    own = [place.resolve() for place in (folder.movers, folder.seams.parent)]
+    return {
+        name: path
+        for name, path in paths.items()
+        if path.is_file() and any(path.resolve().is_relative_to(place) for place in own)
+    }

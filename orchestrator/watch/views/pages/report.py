@@ -1,0 +1,169 @@
+"""report.html: the page of a run with a snapshot of its data, as one self-contained file to read or to send.
+
+All of it comes from the run folder, so it can be made at any time, also of a copy.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.folder import RunFolder, command_line
+from panolog.orchestrator.runs.info import read_info
+from panolog.orchestrator.runs.records import Noticed, Part, Progressed, Record
+from panolog.orchestrator.runs.store import read_milestones
+from panolog.orchestrator.watch.views.exposures import exposure_curve
+from panolog.orchestrator.watch.views.figures import map_figure
+from panolog.orchestrator.watch.views.history import History
+from panolog.orchestrator.watch.views.pages.findings import (
+    Findings,
+    finding_pictures,
+    findings_version,
+    read_findings,
+)
+from panolog.orchestrator.watch.views.pages.shell import RUN, data_url, write_snapshot
+from panolog.orchestrator.watch.views.plan_map import read_points
+from panolog.orchestrator.watch.views.preparation import picture_path, version_of, view_preparation
+from panolog.orchestrator.watch.views.queries import Filter, events, series, spread
+from panolog.orchestrator.watch.views.run_view import RunView, view_run
+from panolog.orchestrator.watch.views.site.photographs import WIDE, small_copy
+from panolog.partition.plan import Plan, read_plan
+from panolog.partition.scores import read_scores
+from panolog.scene.errors import InputError, PanologError
+from panolog.scene.files import natural_key
+from panolog.workers.seams.schema import by_blocks
+from panolog.workers.tasks import COARSE, Stage, TaskId
+
+_ID = "report"  # what the page calls its run
+_PATH = f"runs/{_ID}"
+_LINES = 24  # blocks that have curves: the first ones
+_POINTS = 300  # of a curve
+_EVENTS = 1_000  # the latest
+_PICTURES = 12  # held-out panoramas that are shown, from the worst to the best
+_SCORES = 100_000  # of all cameras, up to which each camera and block has its own
+
+
+def write_report(folder: RunFolder, output: Path | None = None, *, running: bool | None = None) -> Path:
+    """Writes the report of a run in its present state, atomically; RUN/report.html without `output`.
+
+    Args: running, whether a driver works on the run; by default whether one holds its lock.
+    Raises InputError if the folder is no run or its files are damaged; OSError if it cannot be written.
+    """
+    path = output or folder.report
+    running = lock.held(folder.lock) if running is None else running
+    history = History.of(read_milestones(folder.database) if folder.database.exists() else ())
+    info = read_info(folder).model_dump(mode="json")
+    prepared = view_preparation(folder, history.state, running=running)
+    view = view_run(history, info, running=running, root=folder.root, preparation=prepared)
+    answers = dict(_answers(folder, view, read_findings(folder)))
+    write_snapshot(path, RUN, answers, {"run": _message(folder, view)})
+    return path
+
+
+def report_or_notice(folder: RunFolder) -> list[Record]:
+    """Writes the report of a run that has ended, while its driver still holds the lock.
+
+    A failure becomes a notice.
+    """
+    try:
+        write_report(folder, running=False)
+    except (OSError, PanologError) as error:
+        return [
+            Noticed(
+                Part.REPORT, f"not written: {error}; `{command_line('report', folder.root)}` tries it again"
+            )
+        ]
+    return []
+
+
+def _message(folder: RunFolder, view: RunView) -> dict[str, Any]:
+    """The message of the stream with all about the run: RunPage of the dashboard."""
+    root = folder.root.absolute()
+    return dict(view) | {
+        "id": _ID,
+        "name": root.name,
+        "path": str(root),
+        "actions": {"allowed": False, "why": None, "available": (), "failed": None},
+        "result": {
+            "model": False,
+            "report": False,
+            "exposure": version_of(folder.exposure),
+            "findings": findings_version(folder),
+        },
+    }
+
+
+def _answers(folder: RunFolder, view: RunView, found: Findings) -> Iterator[tuple[str, Any]]:
+    """What the page requests, by its paths below /api."""
+    yield f"{_PATH}/findings", found
+    for name, path in finding_pictures(folder, found).items():
+        yield f"{_PATH}/findings/{name}", _picture(path)
+    for picture in view.preparation.pictures if view.preparation else ():
+        if (made := picture_path(folder, picture.name)) is not None:
+            yield f"{_PATH}/preparation/{picture.name}?{picture.version}", _picture(made)
+    if folder.exposure.is_file():
+        yield f"{_PATH}/exposure", exposure_curve(folder, Path.read_bytes)
+    if folder.plan.exists():
+        plan = read_plan(folder.plan)
+        seams = by_blocks(found.seams)
+        yield f"{_PATH}/map", map_figure(plan, read_points(folder.model(COARSE)), seams)
+        yield from _cameras(folder, plan)
+    if folder.database.exists():
+        without = Filter(without=frozenset({Progressed.__name__}))
+        latest = events(folder.database, without, _EVENTS)
+        yield f"{_PATH}/events", latest | {"more": False, "next": None}
+        yield from _curves(folder, view)
+    yield from _held_out(folder, found)
+
+
+def _cameras(folder: RunFolder, plan: Plan) -> Iterator[tuple[str, Any]]:
+    """The cameras of a plan, and the blocks with theirs; nothing of a large one."""
+    if len(plan.rows) * plan.grid.count > _SCORES or not folder.scores.exists():
+        return
+    scores = read_scores(folder.scores, plan.rows, plan.grid.count).toarray().tolist()
+    blocks: dict[int, list[dict[str, Any]]] = {block: [] for block in range(plan.grid.count)}
+    for k in range(len(plan.rows)):
+        camera = plan.camera_json(k)
+        known = camera.model_dump(mode="json", exclude={"center"}) | {"scores": scores[k]}
+        yield f"{_PATH}/camera/{camera.row}", known | {"no_picture": "a report has none of the scene"}
+        for block, reason in camera.assigned.items():
+            blocks[block].append({"row": camera.row, "name": camera.name, "reason": reason})
+    for block, cameras in blocks.items():
+        yield f"{_PATH}/block/{block}", {"block": block, "cameras": cameras}
+
+
+def _curves(folder: RunFolder, view: RunView) -> Iterator[tuple[str, Any]]:
+    """The curves of Stage I and of the first tasks of other stages."""
+    tasks = [TaskId.parse(task.name) for task in view.summary.tasks]
+    for stage in Stage:
+        for task in [task for task in tasks if task.stage is stage and stage.trains][:_LINES]:
+            path = f"{_PATH}/series?task={quote(str(task), safe='')}"
+            yield path, series(folder.database, str(task), _POINTS)
+
+
+def _held_out(folder: RunFolder, found: Findings) -> Iterator[tuple[str, Any]]:
+    """Some held-out panoramas with their renders and metrics."""
+    metrics = found.metrics.views if found.metrics else {}
+    paths = {name: folder.picture(name).resolve() for name in metrics}
+    inside = folder.images.resolve()
+    there = [name for name, path in paths.items() if path.is_relative_to(inside) and path.is_file()]
+    ranked = sorted(there, key=lambda name: metrics[name].get("psnr") or 0.0)
+    pictures = {name: _picture(paths[name]) for name in sorted(spread(ranked, _PICTURES), key=natural_key)}
+    shown = [name for name, url in pictures.items() if url is not None]
+    views = [{"number": number, "name": name, "metrics": metrics[name]} for number, name in enumerate(shown)]
+    yield f"{_PATH}/views", {"views": views}
+    yield f"{_PATH}/previews", {"previews": []}
+    for number, name in enumerate(shown):
+        yield f"{_PATH}/views/{number}", pictures[name]
+
+
+def _picture(path: Path) -> str | None:
+    """A picture as a URL: a PNG as it is, others as a small JPEG; None if it is no picture."""
+    if path.suffix == ".png":
+        return data_url("image/png", path.read_bytes())
+    try:
+        with path.open("rb") as file:
+            return data_url("image/jpeg", small_copy(file, path.name, WIDE))
+    except InputError:
+        return None

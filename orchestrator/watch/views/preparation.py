@@ -1,0 +1,192 @@
+"""How far a run is that makes its scene, and what its steps have made: for status, dashboard and report."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.preparation import notes
+from panolog.orchestrator.runs.preparation.notes import Counts, StepProgress, StepResult, read_plain
+from panolog.orchestrator.runs.preparation.settings import Settings, Step, parse_settings, settings_path
+from panolog.orchestrator.runs.state import RunState
+from panolog.orchestrator.watch.views.summary import Text, ViewModel
+from panolog.scene.errors import InputError
+
+Read = Callable[[Path], bytes]  # the bytes of a file; raises OSError or InputError if there is none to read
+STEPS = {Step.MASKS: "masks", Step.SFM: "poses and points", Step.DEPTH: "depth", Step.CHECK: "check"}
+_LINES = 12  # of a step that are shown
+_BEFORE_MASKS = ("frames", "metadata")  # parts of finding poses
+_PARTS: dict[str, tuple[str, ...]] = {  # of steps, in order, as they name them in their progress
+    Step.MASKS: ("static regions", "masks"),
+    Step.SFM: (
+        *_BEFORE_MASKS,
+        *("features", "visual words", "look-alikes", "matches", "poses", "scene"),
+    ),
+}
+PICTURES = {"sfm": "Poses from above", "masks": "Masks, in red"}
+
+
+class StepView(ViewModel):
+    """A step; `done` of `total` of `what` while it runs, a `total` of 0 is not known."""
+
+    name: str
+    label: str
+    status: Literal["waiting", "running", "stopped", "done"]
+    what: Text
+    done: int
+    total: int
+    seconds: float | None
+    lines: tuple[Text, ...]
+
+
+class PictureView(ViewModel):
+    """A picture of what a step has made; `version` changes with it."""
+
+    name: str
+    label: str
+    version: str
+
+
+class PreparationView(ViewModel):
+    """The preparation of a run; the counts are None before there are poses."""
+
+    source: Text
+    video: bool
+    frames: int  # in the video by its header, or panoramas in the folder
+    panoramas: int | None  # chosen
+    registered: int | None  # that have a pose
+    points: int | None
+    weak_links: int | None
+    contradictions: int | None
+    latest: float | None  # when it last made progress, in seconds since the epoch
+    steps: tuple[StepView, ...]
+    pictures: tuple[PictureView, ...]
+
+
+def picture_path(folder: RunFolder, name: str) -> Path | None:
+    """Where a picture of PICTURES is; None for another name."""
+    paths = {"sfm": notes.sfm_picture(folder), "masks": notes.masks_picture(folder)}
+    return paths.get(name)
+
+
+def stamp_of(folder: RunFolder) -> tuple[object, ...]:
+    """A value that changes whenever the view may; empty for a run that was given a scene."""
+    if not folder.preparation.is_dir():
+        return ()
+    files = [settings_path(folder), notes.progress_path(folder)]
+    files += [notes.result_path(folder, step) for step in Step]
+    files += [path for name in PICTURES if (path := picture_path(folder, name)) is not None]
+    return tuple(_state(path) for path in files)
+
+
+def view_preparation(
+    folder: RunFolder, state: RunState, *, running: bool, read: Read = read_plain
+) -> PreparationView | None:
+    """The view of a run's preparation; None of a run that was given a scene, or if that cannot be read.
+
+    Args: running, whether a driver works on the run; read, how its files are read.
+    """
+    settings = _settings(folder, read)
+    if settings is None:
+        return None
+
+    def safely(path: Path) -> bytes:
+        try:
+            return read(path)
+        except InputError as error:
+            raise OSError(str(error)) from error
+
+    progress = notes.read_progress(folder, safely)
+    results = {step: notes.read_result(folder, step, safely) for step in settings.steps()}
+    active = running and state.preparing and not state.prepared
+    made = results.get(Step.SFM)
+    counts = made.counts if made else None
+    return PreparationView(
+        source=settings.source,
+        video=settings.video,
+        frames=settings.panoramas,
+        **{name: getattr(counts, name, None) for name in Counts.model_fields},
+        latest=progress.time or None if progress else None,
+        steps=tuple(_step(step, result, progress, active) for step, result in results.items()),
+        pictures=tuple(_pictures(folder)),
+    )
+
+
+def prepared_share(view: PreparationView) -> float:
+    """How much of a preparation is done, 0 to 1: each step counts as much as any other, as do its parts."""
+    begun = any(step.name == Step.MASKS and step.status != "waiting" for step in view.steps)
+    return sum(_share(step, begun) for step in view.steps) / len(view.steps) if view.steps else 0.0
+
+
+def _share(step: StepView, masks: bool) -> float:
+    """How much of a step is done, 0 to 1. Args: masks, whether these have begun: amid finding poses."""
+    if step.status == "done":
+        return 1.0
+    parts, within = _PARTS.get(step.name, ()), min(1.0, step.done / step.total) if step.total else 0.0
+    if not parts:
+        return within
+    done = parts.index(step.what) + within if step.what in parts else 0.0
+    return max(done, len(_BEFORE_MASKS) if masks and step.name == Step.SFM else 0) / len(parts)
+
+
+def with_step(state: RunState, view: PreparationView | None) -> RunState:
+    """The state of a live run with how far its preparation is, which the database does not have."""
+    active = [step for step in view.steps if step.status == "running"] if view else []
+    if not active:
+        return state
+    step = active[0]
+    return replace(
+        state, step=str(StepProgress(step=Step(step.name), what=step.what, done=step.done, total=step.total))
+    )
+
+
+def _settings(folder: RunFolder, read: Read) -> Settings | None:
+    try:
+        return parse_settings(read(settings_path(folder)))
+    except (OSError, InputError):
+        return None
+
+
+def _step(step: Step, result: StepResult | None, progress: StepProgress | None, active: bool) -> StepView:
+    """Args: active, whether a driver is at work on one of the steps."""
+    now = progress if result is None and progress is not None and progress.step is step else None
+    return StepView(
+        name=step,
+        label=STEPS[step],
+        status="done" if result else "waiting" if now is None else "running" if active else "stopped",
+        what=now.what if now else "",
+        done=now.done if now else 0,
+        total=now.total if now else 0,
+        seconds=result.seconds if result else None,
+        lines=_first(result.lines) if result else (),
+    )
+
+
+def _first(lines: Sequence[str]) -> tuple[str, ...]:
+    more = len(lines) - _LINES
+    return (*lines[:_LINES], *([f"… and {more:,} more"] if more > 0 else []))
+
+
+def _pictures(folder: RunFolder) -> list[PictureView]:
+    views = []
+    for name, label in PICTURES.items():
+        path = picture_path(folder, name)
+        if path is not None and (version := version_of(path)) is not None:
+            views.append(PictureView(name=name, label=label, version=version))
+    return views
+
+
+def version_of(path: Path) -> str | None:
+    """A text that changes with a file; None if there is none."""
+    state = _state(path)
+    return None if state is None else f"{state[0]:x}-{state[1]:x}"
+
+
+def _state(path: Path) -> tuple[int, int] | None:
+    """When a file was written, and its size; None if there is none."""
+    try:
+        status = path.lstat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size

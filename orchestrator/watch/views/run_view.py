@@ -1,0 +1,302 @@
+"""All that a page about a run shows, in one model, for the dashboard, the report and `status --json`."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+from pydantic import BaseModel
+
+from panolog.orchestrator.runs.config import RunConfig, flat, keys
+from panolog.orchestrator.runs.state import RunState, Status, TaskState, at_rest
+from panolog.orchestrator.watch.views.history import History, Span
+from panolog.orchestrator.watch.views.preparation import PreparationView, prepared_share
+from panolog.orchestrator.watch.views.summary import (
+    STAGES,
+    LeavingView,
+    QuarantineView,
+    Summary,
+    Text,
+    ViewModel,
+    summarize,
+)
+from panolog.orchestrator.watch.views.timing import progress_of, setting, share_of, tasks_of
+from panolog.workers.tasks import Stage
+from panolog.workers.training.recipes import RECIPES
+
+STOPPED: Literal["stopped"] = "stopped"  # of a stage whose driver has ended before it
+
+
+class StageView(ViewModel):
+    """A stage of a run; `began` and `ended` in epoch seconds, `seconds` those in which a driver was at work.
+
+    `tasks` and `done` count its tasks.
+    """
+
+    name: str
+    label: str
+    status: Status | Literal["stopped"]
+    began: float | None
+    ended: float | None
+    seconds: float | None
+    progress: float  # 0 to 1
+    tasks: int
+    done: int
+
+
+class GpuUsageView(ViewModel):
+    """What a GPU does; `utilization` 0 to 1."""
+
+    name: Text
+    utilization: float | None
+    memory_used: int | None
+    memory_total: int | None
+
+
+class UsageView(ViewModel):
+    """What a machine does, measured at `time` in epoch seconds: `cpu` 0 to 1, the disk that the run uses."""
+
+    time: float
+    cpu: float
+    memory_used: int
+    memory_total: int
+    disk_used: int
+    disk_total: int
+    gpus: tuple[GpuUsageView, ...]
+
+
+class NodeView(ViewModel):
+    """A machine that tasks have run on, and what runs there now."""
+
+    node: Text
+    tasks: tuple[Text, ...]  # running
+    gpus: tuple[Text, ...]  # kinds
+    device: Text
+    memory: int
+    rate: float
+    usage: UsageView | None
+    quarantine: QuarantineView | None = None
+    leaving: LeavingView | None = None
+
+
+class SettingView(ViewModel):
+    """A setting of a run next to its default."""
+
+    key: Text
+    value: Any
+    default: Any
+    changed: bool
+    unit_or_doc: str
+
+
+class LiveView(ViewModel):
+    """What changes while a run is running; `now` and `latest` in seconds since the epoch."""
+
+    now: float
+    latest: float | None  # the last record
+    progress: float  # of the whole run, 0 to 1
+    eta: float | None  # of the whole run
+    paused: tuple[int, ...]  # blocks
+    stages: tuple[StageView, ...]
+    nodes: tuple[NodeView, ...]
+    preparation: PreparationView | None = None  # of a run that makes its scene
+    store: Text = ""  # how far it has been copied to its object store; "" if it has none
+
+
+class RunView(LiveView):
+    """All about a run."""
+
+    info: dict[str, Any]  # run.json
+    summary: Summary
+    began: float | None
+    config: tuple[SettingView, ...]
+
+
+def view_run(
+    history: History,
+    info: dict[str, Any],
+    *,
+    running: bool,
+    root: Path | None = None,
+    usages: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+    waiting: str = "",
+    preparation: PreparationView | None = None,
+    store: str = "",
+) -> RunView:
+    """The view of a run.
+
+    Args: info, run.json; running, root, as `summarize`; usages, `queries.usages`; waiting, of `presence`;
+    preparation, `view_preparation`; store, `MirrorState.brief`.
+    """
+    state, now = history.state, time.time()
+    state = replace(state, waiting=state.waiting or waiting)
+    summary = summarize(state, running=running, now=now, root=root)
+    stages = _stages(history, info, running=running, now=now)
+    return RunView(
+        now=now,
+        latest=_later(state.latest, preparation.latest if preparation else None),
+        progress=progress_of(state, info, prepared_share(preparation) if preparation else None),
+        eta=summary.eta,
+        paused=summary.paused,
+        stages=tuple(_with_share(stage, preparation) for stage in stages),
+        nodes=_nodes(history, usages, summary, running=running),
+        preparation=preparation,
+        store=store,
+        info=info,
+        summary=summary,
+        began=state.began,
+        config=_settings(info),
+    )
+
+
+def _later(one: float | None, other: float | None) -> float | None:
+    return max(one, other) if one is not None and other is not None else one
+
+
+def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: float) -> Iterator[StageView]:
+    """The stages of a run in their order, also those to come. Args: now, epoch seconds."""
+    state = history.state if running else at_rest(history.state)
+    left_out = set[Stage]()
+    if not setting(info, "refine", default=True):
+        left_out |= {Stage.SCORE, Stage.PLAN, Stage.BLOCK}
+    planned = {task.stage for tasks in state.between for task in tasks}
+    left_out |= {Stage.UNION} | {Stage.ROUND, Stage.REPAIR} - planned  # unions take next to no time
+    if not state.measures:
+        left_out.add(Stage.MEASURE)
+    if not setting(info, "deliver", default=False):  # nor of older versions
+        left_out.add(Stage.DELIVER)
+    if setting(info, "districts", default=1) == 1:
+        left_out.add(Stage.DISTRICT)
+    if Stage.PREPARE not in history.spans:
+        left_out.add(Stage.PREPARE)
+    for name in map(Stage, STAGES):
+        span = history.spans.get(name)
+        older = Stage.PREPARE not in history.spans  # that have not recorded it
+        known = span is not None or name is not Stage.CALIBRATE or not older
+        if known and name not in left_out:
+            tasks = [task for task in tasks_of(state) if task.id.stage is name]
+            cut = history.cut(name)
+            at_end = state if cut is None else replace(state, ended=cut)
+            yield _stage(name, tasks, at_end, span, running=running and cut is None, now=now)
+
+
+def _with_share(stage: StageView, preparation: PreparationView | None) -> StageView:
+    """The stage; of the preparation how many of its steps are done."""
+    if stage.name != Stage.PREPARE or preparation is None or stage.status == Status.DONE:
+        return stage
+    return stage.model_copy(update={"progress": prepared_share(preparation)})
+
+
+def _stage(
+    name: Stage, tasks: Sequence[TaskState], state: RunState, span: Span | None, *, running: bool, now: float
+) -> StageView:
+    statuses = {task.status for task in tasks}
+    status = _stage_status(name, statuses, state, begun=span is not None, running=running)
+    over = status == Status.DONE or (status == Status.FAILED and statuses <= {Status.DONE, Status.FAILED})
+    ended = seconds = None
+    if span is not None and (over or status in (Status.FAILED, STOPPED)):
+        ended = span.ended if over else state.ended
+    if span is not None and (ended is not None or status == Status.RUNNING):
+        seconds = state.worked(span.began, now if ended is None else ended)
+    return StageView(
+        name=name,
+        label=STAGES[name],
+        status=status,
+        began=span.began if span else None,
+        ended=ended,
+        seconds=seconds,
+        progress=sum(map(share_of, tasks)) / len(tasks) if tasks else float(status == Status.DONE),
+        tasks=len(tasks),
+        done=sum(task.status == Status.DONE for task in tasks),
+    )
+
+
+def _stage_status(
+    name: Stage, statuses: Set[Status], state: RunState, *, begun: bool, running: bool
+) -> Status | Literal["stopped"]:
+    """How a stage stands. Args: statuses, those of its tasks; begun, whether it has ever been; running, as
+    `view_run`.
+    """
+    if name is (Stage.PREPARE if state.preparing else Stage.CALIBRATE) and not state.prepared:
+        return Status.RUNNING if running else STOPPED
+    if name is Stage.PREPARE:
+        return Status.DONE
+    if name is Stage.CALIBRATE and state.preparing and not state.prepared:
+        return Status.WAITING
+    kept = name is Stage.BLOCK and state.plan is not None and not statuses  # all keep their Stage I model
+    if statuses == {Status.DONE} or kept or name is Stage.CALIBRATE:
+        return Status.DONE
+    if Status.RUNNING in statuses:
+        return Status.RUNNING
+    if Status.FAILED in statuses and (not running or statuses <= {Status.DONE, Status.FAILED}):
+        return Status.FAILED
+    return STOPPED if statuses and begun and not running else Status.WAITING
+
+
+def _nodes(
+    history: History,
+    usages: Mapping[str, Mapping[str, Any]],
+    summary: Summary,
+    *,
+    running: bool,
+) -> tuple[NodeView, ...]:
+    """The machines that tasks have run on, by name, and those in quarantine or that leave."""
+    views = []
+    quarantined = {node.host: node for node in summary.quarantined}
+    leaving = {node.host: node for node in summary.leaving}
+    known = {start.node for start in history.starts.values()}
+    for node in sorted(known | quarantined.keys() | leaving.keys()):
+        starts = {
+            id: history.starts[id]
+            for id in sorted(history.starts, key=str)
+            if history.starts[id].node == node
+        }
+        tasks = [history.state.task(id) for id in starts] if running else []
+        active = [task for task in tasks if task.status == Status.RUNNING and task.node == node]
+        progress = [task.progress for task in active if task.progress]
+        views.append(
+            NodeView(
+                node=node,
+                tasks=tuple(str(task.id) for task in active),
+                gpus=tuple(dict.fromkeys(s.place for s in starts.values() if s.place not in ("", "cpu"))),
+                device=list(starts.values())[-1].device if starts else "",
+                memory=sum(p.memory or 0 for p in progress),
+                rate=sum(p.rate for p in progress),
+                usage=UsageView.model_validate(usages[node]) if running and node in usages else None,
+                quarantine=quarantined.get(node),
+                leaving=leaving.get(node),
+            )
+        )
+    return tuple(views)
+
+
+def _settings(info: Mapping[str, Any]) -> tuple[SettingView, ...]:
+    """All settings of a run, flat, next to their defaults, those of its recipe where it has one."""
+    given = dict(flat(info.get("config") or {}))
+    preset = RECIPES.get(given.get("recipe", "paper"), {})
+    fields = {key: (preset.get(key, default), text) for key, (default, text) in map(_field, keys())}
+    return tuple(
+        SettingView(
+            key=key,
+            value=given.get(key),
+            default=fields[key][0] if key in fields else None,
+            changed=key not in fields or (key in given and given[key] != fields[key][0]),
+            unit_or_doc=fields[key][1] if key in fields else "not a setting of this version",
+        )
+        for key in [*fields, *(key for key in given if key not in fields)]
+    )
+
+
+def _field(key: str) -> tuple[str, tuple[Any, str]]:
+    """A setting with its own default, as run.json would have it, and its description."""
+    model: type[BaseModel] = RunConfig
+    *groups, name = key.split(".")
+    for group in groups:
+        kind = model.model_fields[group].annotation
+        assert isinstance(kind, type)
+        model = kind
+    info = model.model_fields[name]
+    default = info.get_default(call_default_factory=True, validated_data={})
+    return key, (list(default) if isinstance(default, tuple) else default, info.description or "")

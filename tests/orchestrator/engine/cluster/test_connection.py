@@ -1,0 +1,85 @@
+"""A run of one machine leaves nothing of Ray behind, however its driver ends; what Ray raises is one line."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+from ray.exceptions import RaySystemError
+
+from panolog.orchestrator.engine.cluster.connection import connect
+from panolog.orchestrator.engine.cluster.failures import reported
+from panolog.scene.errors import ClusterLostError, ConfigError
+from tests.ray_head import wait_until
+
+pytestmark = pytest.mark.system
+
+DRIVER = """
+import os, signal, sys
+from pathlib import Path
+import ray
+from panolog.orchestrator.engine.cluster.connection import connect
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+
+def work(): return os.nice(0)
+
+with connect(None, Path(sys.argv[1]), nice=eval(sys.argv[2])):
+    nicer = ray.get(ray.remote(work).remote()) - os.nice(0)  # there is a worker too
+    store = ray.put(bytes(10**7))
+    print(nicer, ray._private.worker._global_node.get_temp_dir_path(), file=sys.__stdout__, flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize(
+    ("end", "nice", "nicer"),
+    [(signal.SIGKILL, None, 2), (signal.SIGINT, 3, 3)],  # SIGINT: as of a terminal
+)
+def test_nothing_is_left_and_workers_have_the_priority_that_is_wanted(
+    tmp_path: Path, end: signal.Signals, nice: int | None, nicer: int
+) -> None:
+    command = [sys.executable, "-c", DRIVER, str(tmp_path), repr(nice)]
+    ours, pipe = os.environ | {"RAY_worker_niceness": "2"}, subprocess.PIPE
+    driver = subprocess.Popen(command, env=ours, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
+    assert driver.stdout
+    said, folder = driver.stdout.readline().split()
+    assert int(said) == nicer
+    assert Path(folder).is_dir()
+    others = psutil.Process(driver.pid).children(recursive=True)
+    assert len(others) > 6  # Ray's own, its agents, a worker, and the cleaner
+    shared = {m.path for p in others for m in p.memory_maps() if m.path.startswith("/dev/shm/")}
+    assert shared  # the object store
+    if end == signal.SIGKILL:
+        driver.kill()
+    else:
+        os.killpg(driver.pid, end)
+    driver.communicate()
+    assert driver.returncode == -end
+    _, alive = psutil.wait_procs(others, timeout=120)
+    assert not alive
+    wait_until(lambda: not Path(folder).exists(), "the folder of Ray is removed")
+    assert not [path for path in shared if Path(path).exists()]
+
+
+def test_nice_is_refused_with_a_cluster(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--nice 5: only for runs on this machine"):
+        connect("auto", tmp_path, nice=5).__enter__()
+
+
+def test_a_priority_that_is_no_number_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_worker_niceness", "low")
+    with pytest.raises(ConfigError, match=r"^RAY_worker_niceness=low: give a number from 0 to 19"):
+        connect(None, tmp_path).__enter__()
+
+
+def test_a_failure_of_ray_is_a_lost_cluster() -> None:
+    @reported
+    def fails() -> None:
+        raise RaySystemError("Ray has not been started yet.")  # type: ignore[no-untyped-call]
+
+    with pytest.raises(ClusterLostError, match=r"^Ray: System error: Ray has not been started yet\.$"):
+        fails()

@@ -1,0 +1,130 @@
+"""Nodes of a real Ray cluster that announce that they leave: by their provider, and by draining."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import ray
+from ray.cluster_utils import Cluster
+
+from panolog.orchestrator.engine.cluster import agents
+from panolog.orchestrator.engine.cluster.leave import leave, raylets
+from panolog.orchestrator.engine.cluster.pool import RayPool
+from panolog.orchestrator.engine.scheduling.metadata import VARIABLE
+from panolog.orchestrator.engine.scheduling.pool import Ended, Hello, Message
+from panolog.orchestrator.runs.machines.nodes import Placement
+from panolog.orchestrator.runs.records import Leaving
+from panolog.scene.errors import ClusterError
+from panolog.workers.events import Checkpoint
+from tests.metadata_service import Metadata, metadata
+from tests.orchestrator.scripted import TASK, Works
+from tests.ray_head import wait_until
+
+pytestmark = pytest.mark.system
+
+
+@dataclass
+class Spot:
+    """A pool whose only node with cores is a spot machine."""
+
+    pool: RayPool
+    node: str  # Node.id
+    service: Metadata
+
+    def begin(self) -> None:
+        """Starts a task there that runs until it is requested to stop."""
+        self.pool.start(Placement(self.node, 1.0, 2**30), Works())
+        assert isinstance(self.message(), Hello)
+
+    def message(self) -> Message:
+        assert self.pool.ready(300) == [TASK]
+        return self.pool.take(TASK)
+
+    def end(self) -> None:
+        """Requests the task to stop, which saves a checkpoint first."""
+        self.pool.stop(TASK)
+        messages = [self.message()]
+        while not isinstance(messages[-1], Ended):
+            messages.append(self.message())
+        assert any(isinstance(message, Checkpoint) for message in messages)
+
+    def kind(self) -> Leaving | None:
+        self.pool.nodes()
+        notice = self.pool.notices().get(self.node)
+        return notice.kind if notice else None
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """A head without cores, which this process is connected to."""
+    head = {"num_cpus": 0, "include_dashboard": False}
+    found = Cluster(initialize_head=True, head_node_args=head)
+    try:
+        ray.init(address=found.address, log_to_driver=False)
+        yield found
+    finally:
+        ray.shutdown()
+        found.shutdown()  # type: ignore[no-untyped-call]
+    shutil.rmtree(Path(tempfile.gettempdir(), "ray"), ignore_errors=True)
+
+
+@pytest.fixture
+def spot(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spot]:
+    with metadata("amazon") as service:
+        monkeypatch.setenv(VARIABLE, service.url)
+        node = cluster.add_node(num_cpus=1)
+        monkeypatch.delenv(VARIABLE)
+        cluster.wait_for_nodes(timeout=120)
+        pool = RayPool(None, "test")
+        try:
+            yield Spot(pool, node.node_id, service)
+        finally:
+            pool.close()
+            cluster.remove_node(node)
+
+
+def test_a_provider_takes_a_node_away(spot: Spot) -> None:
+    spot.begin()
+    assert spot.kind() is None
+    (known,) = spot.pool._agents._known.values()
+    ray.kill(known.actor, no_restart=False)  # it comes back
+    spot.service.spot(7200)
+    wait_until(lambda: spot.kind() == Leaving.PREEMPTION, "the notice")
+    notice = spot.pool.notices()[spot.node]
+    assert notice.seconds == pytest.approx(7200, abs=1200)
+    spot.end()
+    assert spot.kind() == Leaving.PREEMPTION  # known as long as the node is there
+
+
+def test_a_node_drains_while_its_task_saves_and_then_ends(spot: Spot) -> None:
+    with pytest.raises(ClusterError, match=r"nodes of Ray: .*choose one with --node"):
+        leave(1)
+    spot.begin()
+    with ThreadPoolExecutor(1) as threads:
+        left = threads.submit(leave, 600, spot.node[:12])
+        wait_until(lambda: spot.kind() == Leaving.DRAIN, "the drain")
+        assert not left.done()
+        spot.end()  # Ray starts no task there any more: the agent stops this one
+        wait_until(lambda: spot.kind() is None, "its end")  # its agent has ended too, so the node has
+        assert left.result(300)
+    assert spot.node not in {raylet.node for raylet in raylets()}
+
+
+def test_an_agent_ends_where_nothing_runs_so_that_the_node_is_idle(
+    spot: Spot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(agents, "_UNUSED_S", 0.0)
+    spot.begin()
+    spot.end()
+    spot.kind()
+    assert leave(600, spot.node)  # nothing holds it
+
+
+def test_where_ray_does_not_run_there_is_no_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.orchestrator.engine.cluster.leave.raylets", list)
+    with pytest.raises(ClusterError, match="no node of Ray"):
+        leave(1)

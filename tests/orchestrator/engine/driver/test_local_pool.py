@@ -1,0 +1,108 @@
+"""Tasks in plain processes: how they end, and how they are stopped."""
+
+import os
+import signal
+from collections.abc import Iterator
+
+import psutil
+import pytest
+
+from panolog.orchestrator.engine.driver.local_pool import LocalPool, local_pool
+from panolog.orchestrator.engine.scheduling.pool import Ended, Failed, Hello, Message
+from panolog.orchestrator.runs.machines.machine import oom_kills
+from panolog.orchestrator.runs.machines.nodes import Placement
+from panolog.orchestrator.runs.records import Failure
+from panolog.workers.events import Checkpoint, Notice
+from panolog.workers.specs import TaskSpec
+from tests.orchestrator import scripted
+from tests.orchestrator.scripted import TASK, Fails, HangsAtExit, SendsMuch, Works
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture
+def pool() -> Iterator[LocalPool]:
+    with local_pool() as pool:
+        yield pool
+
+
+def messages(pool: LocalPool, spec: TaskSpec) -> Iterator[Message]:
+    """The messages of a task on this machine."""
+    return scripted.messages(pool, spec, Placement(pool.nodes()[0].id, cpus=1.0, memory=2**30))
+
+
+def begun(pool: LocalPool, spec: TaskSpec) -> tuple[int, Iterator[Message]]:
+    """The process of a task that has said Hello, and its other messages."""
+    running = messages(pool, spec)
+    hello = next(running)
+    assert isinstance(hello, Hello)
+    return hello.pid, running
+
+
+@pytest.mark.parametrize(
+    ("how", "kind", "reason"),
+    [
+        ("wrong", Failure.INPUT, "a.jpg is truncated"),
+        ("bug", Failure.ERROR, "ValueError: no"),
+        ("read", Failure.ERROR, "/nowhere/a.jpg: cannot be read (No such file or directory)"),
+        ("device", Failure.ERROR, "there is no GPU"),
+        ("gpu", Failure.MEMORY, "out of memory: CUDA out of memory. Tried to allocate 2.00 GiB"),
+    ],
+)
+def test_a_failure_says_of_which_kind_it_is(pool: LocalPool, how: str, kind: Failure, reason: str) -> None:
+    _, (notice, failed) = begun(pool, Fails(how=how))
+    assert notice == Notice(TASK, how)
+    assert isinstance(failed, Failed)
+    assert (failed.kind, failed.reason) == (kind, reason)
+    assert bool(failed.detail) == (how in ("bug", "gpu"))
+
+
+@pytest.mark.parametrize(("kills", "kind"), [(0, Failure.LOST), (10**6, Failure.MEMORY)])
+def test_a_killed_worker_is_lost_or_had_no_memory(
+    pool: LocalPool, monkeypatch: pytest.MonkeyPatch, kills: int, kind: Failure
+) -> None:
+    counted = oom_kills() + kills
+    monkeypatch.setattr("panolog.orchestrator.engine.driver.local_pool.oom_kills", lambda: counted)
+    pid, running = begun(pool, Works())
+    os.kill(pid, signal.SIGKILL)
+    *_, failed = running
+    assert isinstance(failed, Failed)
+    assert failed.kind == kind
+
+
+def test_a_task_that_is_stopped_yields_a_checkpoint_and_ends(pool: LocalPool) -> None:
+    received = []
+    for message in messages(pool, Works()):
+        received.append(message)
+        if len(received) == 5:
+            pool.stop(TASK)
+    assert [type(message) for message in received[-2:]] == [Checkpoint, Ended]
+    assert len(received) > 5
+
+
+def test_a_worker_that_hangs_is_cancelled(pool: LocalPool) -> None:
+    pid, _ = begun(pool, Works())
+    os.kill(pid, signal.SIGSTOP)
+    pool.cancel(TASK)
+    assert not psutil.pid_exists(pid)
+    assert pool.ready(0.1) == []
+    assert begun(pool, Works())
+
+
+def test_a_worker_that_stops_within_a_message_is_lost(
+    pool: LocalPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("panolog.orchestrator.engine.driver.local_pool._STALL_S", 1)
+    monkeypatch.setattr("panolog.orchestrator.engine.driver.local_pool._EXIT_S", 1.0)
+    pid, running = begun(pool, SendsMuch())
+    assert pool.ready(60) == [TASK]  # its beginning: nothing reads the rest yet
+    os.kill(pid, signal.SIGSTOP)
+    assert next(running) == Failed("the worker stopped within a message for 1 s", Failure.LOST)
+    assert pool.ready(0.1) == []
+
+
+def test_a_process_that_does_not_end_is_killed(pool: LocalPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.orchestrator.engine.driver.local_pool._EXIT_S", 1.0)
+    pid, (_, ended) = begun(pool, HangsAtExit())
+    assert isinstance(ended, Ended)
+    assert not psutil.pid_exists(pid)

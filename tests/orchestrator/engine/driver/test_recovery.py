@@ -1,0 +1,234 @@
+"""Where tasks start, and what a run does about lack of memory, deaths and Ctrl-C, without Ray."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+
+from panolog.orchestrator.engine.driver import driver as driver_module
+from panolog.orchestrator.engine.driver import saving, writers
+from panolog.orchestrator.engine.scheduling.pool import Failed
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.machines.nodes import Gpu, Node
+from panolog.orchestrator.runs.records import (
+    Failure,
+    Outcome,
+    Record,
+    RunEnded,
+    StopRequested,
+    TaskFailed,
+    TaskStarted,
+)
+from panolog.orchestrator.runs.state import Status
+from panolog.orchestrator.watch.views.terminal import table
+from panolog.scene.errors import RunError
+from panolog.scene.ply import ply_header
+from panolog.workers.events import Calibration, Checkpoint, Event, Progress, Trained
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
+from panolog.workers.training.checkpoint import CheckpointFile
+from panolog.workers.training.task_config import CacheConfig
+from tests.orchestrator.fakes import LOST_NODE, CrashError, Harness, Script, SetClock, begins, fails, well
+
+GIB = 2**30
+NO_MEMORY = Failed("out of memory: CUDA out of memory. Tried to allocate 2.00 GiB", Failure.MEMORY)
+
+
+def with_gpu(name: str, gib: int, count: int = 1) -> Node:
+    """A node with GPUs; 0 GiB means that their memory is unknown, and no tasks share them."""
+    return Node(
+        name, f"host-{name}", cpus=4, memory=2**40, gpus=(Gpu(f"{gib} GiB", gib * GIB, name),) * count
+    )
+
+
+# Where and when tasks start
+
+
+def test_a_task_starts_only_where_there_is_a_place_and_none_waits_beside_a_free_one(tmp_path: Path) -> None:
+    harness = Harness(tmp_path, [with_gpu("a", 0, count=2)], device="cuda", blocks="2x2x2")
+    assert harness.drive().outcome == "done"
+    blocks = [place for place, spec in harness.pool.started if spec.task.stage is Stage.BLOCK]
+    assert len(blocks) > 4
+    assert {(place.gpus, place.gpu) for place in blocks} == {(1.0, 0), (1.0, 1)}
+    assert harness.pool.most == 2
+
+
+def test_the_order_of_blocks_follows_what_was_measured(tmp_path: Path) -> None:
+    """The fewer Gaussians a block has, the longer it takes here: after a few of them the driver knows."""
+    harness = Harness(tmp_path, [with_gpu("a", 0)], device="cuda", blocks="2x2x2")
+    blocks: dict[TaskId, int] = {}
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        blocks.update({TaskId.block(b.block): b.gaussians for b in harness.state.plan or ()})
+        for event in well(spec):
+            if isinstance(event, Trained) and spec.task in blocks:
+                event = replace(event, seconds=math.exp(40 - blocks[spec.task]))  # noqa: PLW2901
+            yield event
+
+    assert harness.drive(script).outcome == "done"
+    order = [blocks[task] for task in harness.tasks if task in blocks]
+    assert order[0] == max(order)
+    assert order[4:] == sorted(order[4:])
+
+
+def test_a_machine_that_joins_is_used(tmp_path: Path) -> None:
+    harness = Harness(tmp_path, [with_gpu("a", 24)], device="cuda")
+    joins = begins(TaskId.shard(0), lambda: harness.pool.join(with_gpu("b", 24)))
+    assert harness.drive(joins).outcome == "done"
+    blocks = [place for place, spec in harness.pool.started if spec.task.stage is Stage.BLOCK]
+    assert {place.node for place in blocks} == {"a", "b"}
+
+
+# Deaths
+
+
+def test_the_death_of_a_machine_does_not_use_up_retries(tmp_path: Path) -> None:
+    nodes = [with_gpu("a", 24), with_gpu("b", 24)]
+    harness = Harness(tmp_path, nodes, device="cuda", retries=0)
+    saved = Checkpoint(COARSE, 1, {"iteration": torch.tensor(1)})
+    lost = begins(COARSE, saved, lambda: harness.pool.lose(harness.pool.placement(COARSE).node))
+    assert harness.drive(lost).outcome == "done"
+    assert [place.node for place, _ in harness.attempts(COARSE)] == ["a", "b"]
+    first, second = harness.trainings(COARSE)
+    assert (first.checkpoint, second.checkpoint) == (None, CheckpointFile(harness.folder.checkpoint(COARSE)))
+    assert [(s.attempt, s.iteration) for s in harness.records(TaskStarted)][:2] == [(1, 0), (2, 1)]
+    task = harness.state.task(COARSE)
+    assert (task.retries, task.reasons, task.losses) == (1, (LOST_NODE.reason,), 1)  # not pre-empted
+
+
+# Memory
+
+
+def test_a_block_that_runs_out_of_memory_gets_less_cache_then_a_larger_gpu(tmp_path: Path) -> None:
+    nodes = [with_gpu("a", 8), with_gpu("b", 24)]
+    harness = Harness(tmp_path, nodes, device="cuda")
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == TaskId.block(0) and (
+            len(harness.attempts(spec.task)) == 1 or harness.pool.placement(spec.task).node == "a"
+        ):
+            raise CrashError(NO_MEMORY)
+        yield from well(spec)
+
+    assert harness.drive(script).outcome == "done"
+    attempts = harness.attempts(TaskId.block(0))
+    caches = [spec.config.cache.memory for spec in harness.trainings(TaskId.block(0))]
+    assert caches[0] > CacheConfig().memory  # as its machine allows
+    assert caches[1:] == [CacheConfig().memory / 4] * (len(attempts) - 1)
+    assert [place.gpus for place, _ in attempts[1:]] == [1.0] * (len(attempts) - 1)
+    assert attempts[-1][0].node == "b"
+    assert [s.cache for s in harness.records(TaskStarted) if s.task == TaskId.block(0)] == caches
+    why = "tried again with a smaller image cache and nothing else on its device"
+    assert harness.state.task(TaskId.block(0)).reasons[0] == f"{NO_MEMORY.reason}; {why}"
+
+
+def test_a_block_for_which_no_gpu_is_large_enough_is_reported_and_the_rest_merged(tmp_path: Path) -> None:
+    harness = Harness(tmp_path, [with_gpu("a", 8), with_gpu("b", 24)], device="cuda", retries=9)
+    with pytest.raises(RunError, match="block 0 failed and keeps its Stage I Gaussians"):
+        harness.drive(fails(TaskId.block(0), NO_MEMORY, 99))
+    last = harness.attempts(TaskId.block(0))[-1][0]
+    assert (last.node, len(harness.attempts(TaskId.block(0))) <= 3) == ("b", True)
+    task = harness.state.task(TaskId.block(0))
+    assert "no device has more memory" in task.reasons[-1]
+    with (console := Console(width=200)).capture() as shown:
+        console.print(table(harness.state, root=harness.folder.root, info={}, running=False, wide=True))
+    assert f"block 0: {task.reasons[-1]}" in shown.get()
+    assert (task.status, harness.state.status(TaskId.block(1))) == (Status.FAILED, Status.DONE)
+    assert ply_header(harness.folder.point_cloud) == (202, 2)
+    assert [f.kind for f in harness.records(TaskFailed)] == [Failure.MEMORY] * len(
+        harness.attempts(TaskId.block(0))
+    )
+
+
+def test_on_the_cpu_too_the_second_attempt_has_the_machine_to_itself(harness: Harness) -> None:
+    harness.drive(fails(TaskId.block(0), NO_MEMORY, 1))
+    first, second = (place for place, _ in harness.attempts(TaskId.block(0)))
+    assert (first.threads, second.threads) == (1, 2)
+    assert second.memory > first.memory
+
+
+# Ctrl-C
+
+
+def stops_in(task: TaskId, harness: Harness, *, obeys: bool = True) -> Script:
+    """Ctrl-C while a task trains; tasks that are requested to stop yield a checkpoint and end."""
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task.stage is not task.stage:
+            yield from well(spec)
+            return
+        for iteration in range(2, 100):
+            yield Progress(spec.task, iteration, 100, 1.0, gaussians=1000)
+            if spec.task == task and iteration == 5:
+                harness.stop.signal()
+            if obeys and spec.task in harness.pool.stopped:
+                yield Checkpoint(spec.task, iteration, {"iteration": torch.tensor(iteration)})
+                return
+
+    return script
+
+
+def test_ctrl_c_waits_for_fresh_checkpoints(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For as long as they take at the rate that was measured before, not for a fixed time."""
+    harness.clock = clock = SetClock()
+    monkeypatch.setattr(writers, "GRACE_S", 0.0)
+
+    def slow(folder: RunFolder, event: Event, *rest: Any) -> Record:
+        clock.sleep(1.0)
+        return saving.save(folder, event, *rest)
+
+    monkeypatch.setattr(driver_module, "save", slow)
+    with pytest.raises(KeyboardInterrupt):
+        harness.drive(stops_in(TaskId.block(0), harness))
+    assert harness.pool.stopped == {TaskId.block(0), TaskId.block(1)}
+    assert harness.records(StopRequested) == [StopRequested(2)]
+    assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]
+    assert not harness.records(TaskFailed)
+    state = harness.state
+    fresh = {task: state.task(task).checkpoint for task in harness.pool.stopped}
+    assert fresh == {task: state.task(task).progress.iteration for task in fresh}  # type: ignore[union-attr]
+    assert harness.drive(resumed=True).outcome == "done"
+    began = {s.task: s.iteration for s in harness.records(TaskStarted)[-3:]}
+    assert began == fresh | {EVAL: 0}
+
+
+@pytest.mark.parametrize("again", [True, False], ids=["second Ctrl-C", "its time is over"])
+def test_who_does_not_obey_is_not_waited_for(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch, again: bool
+) -> None:
+    if not again:
+        monkeypatch.setattr(writers, "GRACE_S", 0.0)
+
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        for event in stops_in(COARSE, harness, obeys=False)(spec):
+            yield event
+            if again and harness.pool.stopped:
+                harness.stop.signal()
+
+    with pytest.raises(KeyboardInterrupt):
+        harness.drive(script)
+    assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]
+    assert harness.state.task(COARSE).checkpoint is None
+
+
+def test_ctrl_c_where_nothing_trains_ends_at_once(harness: Harness) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        harness.drive(begins(EVAL, lambda: harness.stop.signal()))  # noqa: PLW0108  # drive makes a new one
+    assert harness.records(StopRequested) == [StopRequested(0)]
+    assert harness.pool.stopped == set()
+
+
+def test_a_merge_is_interrupted_at_once(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
+    merge = "panolog.orchestrator.engine.driver.results.merge_run"
+    monkeypatch.setattr(merge, lambda *_: harness.stop.signal())
+    with pytest.raises(KeyboardInterrupt):
+        harness.drive()
+    assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]
+    monkeypatch.undo()
+    assert harness.drive(resumed=True).outcome == "done"
+    assert harness.tasks == [EVAL]

@@ -1,0 +1,89 @@
+"""The account of a run, from records at times that the test sets. A machine costs one unit per second."""
+
+import pytest
+
+from panolog.orchestrator.runs.money.losses import settled
+from panolog.orchestrator.runs.money.records import NodeReserved, NodeReturned, WorkLost
+from panolog.orchestrator.runs.money.spending import Spending
+from panolog.orchestrator.runs.records import (
+    Outcome,
+    Record,
+    RunBegan,
+    RunEnded,
+    ScoresSaved,
+    Stored,
+    TaskFailed,
+    TaskYielded,
+)
+from panolog.orchestrator.runs.state import RunState, replay
+from panolog.workers.tasks import COARSE, TaskId
+from tests.orchestrator.history import BEGAN, started
+
+A, B = (NodeReserved(name, name, "kind", 3600.0) for name in ("node", "b"))
+ONE, TWO = TaskId.block(1), TaskId.block(2)
+
+
+def after(*records: tuple[float, Record]) -> RunState:
+    return replay(Stored(i, time, record) for i, (time, record) in enumerate(records, 1))
+
+
+def parts(money: Spending) -> tuple[float, float, float]:
+    return money.used.cost, money.idle.cost, money.lost.cost
+
+
+def test_a_machine_costs_from_when_it_comes_until_it_goes() -> None:
+    state = after((0, BEGAN), (0, A), (5, B), (9, NodeReturned("b")), (20, RunEnded(Outcome.DONE)))
+    assert parts(state.money) == pytest.approx((24, 24, 0))
+    assert parts(state.money.until(100)) == pytest.approx((24, 24, 0))
+    assert state.money.ahead(10) == 0
+
+
+def test_what_follows_costs_all_machines_or_one_of_them_once_the_others_are_gone() -> None:
+    money = after((0, BEGAN), (0, A), (0, B)).money
+    each, other = (money.machines[name].priced(1.0).cost for name in ("node", "b"))
+    assert money.ahead(100) == pytest.approx(100 * (each + other))
+    assert money.ahead(100, idle=30) == pytest.approx(30 * (each + other) + 70 * max(each, other))
+    assert money.ahead(20, idle=30) == pytest.approx(20 * (each + other))
+
+
+def test_it_is_idle_while_no_task_runs_there() -> None:
+    score = TaskId.shard(0)
+    state = after(
+        (0, BEGAN), (0, A), (3, started(score)), (7, ScoresSaved(score, "", 1)), (7, started(COARSE))
+    )
+    assert parts(state.money.until(12)) == pytest.approx((12, 3, 0))
+
+
+def test_tasks_that_share_a_machine_bear_equal_parts_of_what_is_lost() -> None:
+    lost = [(10.0, WorkLost(task, 10.0, 10.0)) for task in (ONE, TWO)]
+    failed = [(10.0, TaskFailed(task, 1, "gone", final=False)) for task in (ONE, TWO)]
+    records = [pair for both in zip(lost, failed, strict=True) for pair in both]
+    state = after((0, BEGAN), (0, A), (0, started(ONE)), (0, started(TWO)), *records)
+    assert parts(state.money.until(15)) == pytest.approx((15, 5, 10))
+
+
+def test_what_a_task_has_saved_is_not_lost() -> None:
+    state = after(
+        (0, BEGAN), (0, A), (0, started(ONE)), (9, TaskYielded(ONE)), (9, RunEnded(Outcome.INTERRUPTED))
+    )
+    assert parts(settled(state, 50, running=False)) == pytest.approx((9, 0, 0))
+
+
+def test_a_killed_driver_pays_until_its_last_record_and_loses_what_ran() -> None:
+    state = after((0, BEGAN), (0, A), (2, started(ONE)), (8, started(TWO)))
+    assert parts(settled(state, 50, running=False)) == pytest.approx((8, 2, 6))
+    again = RunBegan("host", 2, resumed=True, previous=8.0)
+    before: list[tuple[float, Record]] = [(0, BEGAN), (0, A), (2, started(ONE)), (8, started(TWO))]
+    later = after(*before, (50, WorkLost(ONE, 6, 8)), (50, again))
+    assert parts(later.money.until(60)) == pytest.approx((8, 2, 6))
+
+
+def test_without_a_price_the_seconds_count() -> None:
+    state = after((0, BEGAN), (0, NodeReserved("node", "node", "2 cores", None)), (4, started(COARSE)))
+    money = state.money.until(10)
+    assert (money.used.seconds, money.idle.seconds, money.used.cost, money.priced) == (10, 4, 0, False)
+
+
+def test_runs_of_older_versions_have_no_account() -> None:
+    state = after((0, BEGAN), (1, started(COARSE)), (2, TaskFailed(COARSE, 1, "no", final=False)))
+    assert not state.money.machines

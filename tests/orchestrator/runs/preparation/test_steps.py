@@ -1,0 +1,190 @@
+"""A run of panoramas makes its scene first: step by step, whatever stops it."""
+
+import os
+import signal
+import threading
+from pathlib import Path
+from shutil import copytree
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from panolog.orchestrator.runs import control
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import PENDING, read_info
+from panolog.orchestrator.runs.preparation import notes
+from panolog.orchestrator.runs.preparation.settings import Step, read_settings
+from panolog.orchestrator.runs.records import Noticed, Preparing
+from panolog.orchestrator.runs.state import ignore
+from panolog.orchestrator.runs.store import read_records
+from panolog.prepare.sfm.pipeline import workspace_folder
+from panolog.scene.errors import InputError
+from panolog.scene.read import read_scene
+from tests.orchestrator.cli.program import call, shown
+from tests.orchestrator.runs.preparation.fake_sfm import FakeSfm, Killed, resume, start
+from tests.prepare.networks.networks import given, red_depth
+
+pytestmark = pytest.mark.system
+
+
+def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> None:
+    assert calm.point_cloud.exists()
+    info = read_info(calm)
+    assert info.scene.path == str(calm.scene.resolve())
+    assert info.scene.fingerprint != PENDING
+    settings = read_settings(calm)
+    assert settings is not None
+    assert settings.steps() == (Step.MASKS, Step.SFM, Step.CHECK)
+    assert (settings.nadir, settings.static, settings.panoramas, settings.width) == (10, True, 9, 64)
+    assert len(list((calm.scene / "masks").iterdir())) == 9
+    assert notes.masks_picture(calm).read_bytes().startswith(b"\xff\xd8\xff")
+    records = [stored.record for stored in read_records(calm.database)]
+    steps = [str(it.task) for it in records if isinstance(it, Preparing)]
+    assert steps == ["prepare"] * 3 + ["calibrate"] * 3
+    noticed = [it.message for it in records if isinstance(it, Noticed) and str(it.task) == "prepare"]
+    assert noticed[0] == "9 of 10 panoramas have a pose"
+    assert noticed[1].startswith("without a pose: 1, contradictions: 1; ")
+    done = shown("status", calm.root)
+    assert [step["status"] for step in done["preparation"]["steps"]] == ["done"] * 3
+    assert done["preparation"]["registered"] == 9
+
+
+@pytest.mark.parametrize("moment", ["features", "poses", "report", "masks", "check"])
+def test_a_run_killed_in_a_step_ends_with_the_same_bytes(
+    moment: str, calm: RunFolder, raw: Path, sfm: FakeSfm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is on the disk at that moment is copied, and resumed in the copy."""
+    root, killed = tmp_path / "run", tmp_path / "killed"
+
+    def strike(at: str) -> None:
+        if at == moment:
+            copytree(root, killed)
+            raise Killed
+
+    sfm.at = strike
+    write = notes.write_note
+
+    def written(path: Path, note: Any) -> None:
+        strike(path.stem)
+        write(path, note)
+
+    monkeypatch.setattr(notes, "write_note", written)
+    with pytest.raises(Killed):
+        start(raw, root)
+    assert RunFolder(killed).info.exists()
+    status = shown("status", killed)
+    assert (status["status"], status["stage"]) == ("stopped", "prepare")
+    monkeypatch.setattr(notes, "write_note", write)
+    sfm.at, sfm.done = ignore, []
+    resume(killed)
+    assert ("features" in sfm.done) == (moment in ("features", "masks"))
+    assert all(masks == sfm.masks[0] for masks in sfm.masks)  # else features would be found again
+    same = RunFolder(killed)
+    assert same.point_cloud.read_bytes() == calm.point_cloud.read_bytes()
+    for mask in (calm.scene / "masks").iterdir():
+        assert (same.scene / "masks" / mask.name).read_bytes() == mask.read_bytes()
+    assert not list(killed.rglob("*.part"))
+    assert not workspace_folder(same.scene.resolve()).exists()
+
+
+def test_ctrl_c_in_the_preparation_is_resumed(
+    calm: RunFolder, raw: Path, sfm: FakeSfm, tmp_path: Path
+) -> None:
+    def interrupt(at: str) -> None:
+        if at == "poses":
+            os.kill(os.getpid(), signal.SIGINT)
+
+    sfm.at = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        start(raw, tmp_path / "run")
+    status = shown("status", tmp_path / "run")
+    assert (status["status"], status["stage"]) == ("interrupted", "prepare")
+    sfm.at = ignore
+    resume(tmp_path / "run")
+    assert sfm.done == ["features", "poses"]
+    assert RunFolder(tmp_path / "run").point_cloud.read_bytes() == calm.point_cloud.read_bytes()
+
+
+def test_a_request_to_stop_is_taken_in_the_preparation(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    root, waited = tmp_path / "run", threading.Event()
+
+    def stop(at: str) -> None:
+        if at == "poses":
+            control.send(RunFolder(root), "stop")
+            waited.wait(300)  # a signal ends it
+
+    sfm.at = stop
+    with pytest.raises(KeyboardInterrupt):
+        start(raw, root)
+    assert list(RunFolder(root).control.iterdir()) == []
+
+
+def test_status_shows_how_far_the_preparation_is_and_no_other_process_joins(
+    raw: Path, sfm: FakeSfm, tmp_path: Path
+) -> None:
+    root, seen = tmp_path / "run", list[Any]()
+
+    def look(at: str) -> None:
+        if at == "poses":
+            seen.append((call("status", root).stdout, shown("status", root)))
+            with pytest.raises(InputError, match="another driver is at work on it"):
+                start(raw, root)
+            with pytest.raises(InputError, match="another driver is at work on it"):
+                resume(root)
+
+    sfm.at = look
+    start(raw, root)
+    ((text, status),) = seen
+    assert text.startswith("preparing: poses 0 of 10 · 6%")
+    assert "masks: " in text
+    assert (status["status"], status["label"], status["stage"]) == ("running", "preparing", "prepare")
+    (masks, step, check) = status["preparation"]["steps"]
+    assert (step["status"], step["what"], step["done"], step["total"]) == ("running", "poses", 0, 10)
+    assert (masks["status"], check["status"]) == ("done", "waiting")
+    assert call("pause", root, 0).exit_code == 2
+
+
+def with_masks(town: Path, source: Path, count: int) -> Path:
+    """Panoramas of the town, the first ones with masks of a strip on the left."""
+    copytree(town / "images", source / "images")
+    (source / "masks").mkdir()
+    mask = np.full((32, 64), 255, np.uint8)
+    mask[:, :8] = 0
+    for image in sorted((source / "images").iterdir())[:count]:
+        cv2.imwrite(str(source / "masks" / f"{image.stem}.png"), mask)
+    return source
+
+
+def test_masks_of_the_source_are_kept_as_they_are(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    start(with_masks(town, tmp_path / "source", 9), tmp_path / "run")
+    settings = read_settings(RunFolder(tmp_path / "run"))
+    assert settings is not None
+    assert settings.steps() == (Step.SFM, Step.CHECK)
+
+
+def test_masks_of_the_source_are_joined_with_what_is_wanted(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    start(with_masks(town, tmp_path / "source", 1), tmp_path / "run", nadir=45)
+    made = tmp_path / "run" / "scene" / "masks"
+    assert len(list(made.iterdir())) == 9
+    joined, other = (cv2.imread(str(it), cv2.IMREAD_GRAYSCALE) for it in sorted(made.iterdir())[:2])
+    assert joined is not None
+    assert other is not None
+    assert joined[0, :8].max() == 0
+    assert joined[-1].max() == other[-1].max() == 0
+    assert joined[0, 8:].min() == other[0].min() == 255
+    assert {it.name for it in (tmp_path / "run" / "prepare").iterdir() if it.is_dir()} == set()
+
+
+def test_depth_is_estimated_if_a_network_is_given(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    head = {"output": "depth", "kind": "inverse", "distance": "radial"}
+    model = red_depth(tmp_path, {"task": "depth", "input": given(), "depth": head})
+    start(raw, tmp_path / "run", depth_model=str(model))
+    folder = RunFolder(tmp_path / "run")
+    result = notes.read_result(folder, Step.DEPTH)
+    assert result is not None
+    assert result.settings == {"model": str(model)}
+    assert len(list((folder.scene / "depths").iterdir())) == 9
+    assert all(panorama.depth is not None for panorama in read_scene(folder.scene).panoramas)
+    assert folder.point_cloud.exists()

@@ -1,0 +1,99 @@
+import json
+import os
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+import pytest
+
+from panolog.orchestrator.runs import info, lock
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import SceneRef, check_output, make_info, read_info, write_info
+from panolog.scene.errors import InputError
+
+SCENE = SceneRef(path="/scene", fingerprint="f")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    folder = RunFolder(tmp_path / "run")
+    folder.root.mkdir()
+    write_info(folder, make_info(SCENE, RunConfig(width=64, seed=3)))
+    return folder
+
+
+def test_run_json_holds_the_resolved_settings(folder: RunFolder) -> None:
+    found = read_info(folder)
+    assert (found.scene, found.config, found.seed) == (SCENE, RunConfig(width=64, seed=3), 3)
+    assert {"panolog", "python", "torch", "ray"} <= set(found.versions)
+    assert json.loads(folder.info.read_text())["config"]["sky"]["count"] == 100_000
+
+
+def test_a_run_needs_no_version_of_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a pool of local processes it works without."""
+
+    def version(name: str) -> str:
+        if name == "ray":
+            raise PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(info, "version", version)
+    versions = make_info(SCENE, RunConfig()).versions
+    assert versions["torch"] == "1.0" and "ray" not in versions
+
+
+def test_a_new_or_empty_folder_will_do(tmp_path: Path) -> None:
+    check_output(tmp_path / "a" / "b", "f")
+    check_output(tmp_path, "f")
+    assert not (tmp_path / "a").exists()
+    (tmp_path / "lock").touch()  # a driver was killed before run.json
+    check_output(tmp_path, "f")
+
+
+def test_an_occupied_folder_is_refused_and_untouched(folder: RunFolder, tmp_path: Path) -> None:
+    before = folder.info.read_bytes()
+    with pytest.raises(InputError, match="use `panolog resume"):
+        check_output(folder.root, "f")
+    with pytest.raises(InputError, match="another scene"):
+        check_output(folder.root, "g")
+    assert folder.info.read_bytes() == before
+    (tmp_path / "other").mkdir()
+    for foreign in ("thesis.txt", "run.db"):
+        (tmp_path / "other" / foreign).touch()
+        with pytest.raises(InputError, match="not empty"):
+            check_output(tmp_path / "other", "f")
+        (tmp_path / "other" / foreign).unlink()
+    with pytest.raises(InputError, match="is a file"):
+        check_output(folder.info, "f")
+    with pytest.raises(InputError, match="cannot be written"):
+        check_output(folder.info / "below", "f")
+
+
+def test_an_unwritable_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"cannot be written, because .*file is not a folder"):
+        check_output(tmp_path / "file" / "run", "f")
+    monkeypatch.setattr(os, "access", lambda *_: False)  # as for users other than root
+    with pytest.raises(InputError, match="cannot be written"):
+        check_output(tmp_path / "run", "f")
+
+
+@pytest.mark.parametrize("content", ["{", '{"format": 2}', "[]"])
+def test_a_damaged_run_json_is_one_clear_line(folder: RunFolder, content: str) -> None:
+    folder.info.write_text(content)
+    with pytest.raises(InputError) as caught:
+        read_info(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_only_one_holds_the_lock_and_looking_does_not_take_it(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    assert not lock.held(path)
+    with lock.hold(path):
+        assert lock.held(path)
+        with pytest.raises(InputError, match="another driver"), lock.hold(path):
+            pass
+        assert lock.held(path)
+    assert not lock.held(path)
+    with lock.hold(path):
+        pass

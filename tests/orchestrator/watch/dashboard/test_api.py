@@ -1,0 +1,225 @@
+"""The JSON of a run for the pages."""
+
+import base64
+import gzip
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from panolog.orchestrator.runs.folder import write_json
+from panolog.orchestrator.runs.records import Noticed, Outcome, RunBegan, RunEnded
+from panolog.orchestrator.watch.views import queries
+from panolog.workers.tasks import COARSE
+from tests.orchestrator.watch.dashboard import api_types
+from tests.orchestrator.watch.dashboard.served import (
+    Served,
+    progressed,
+    serving,
+    started,
+    write_run,
+    write_whole_run,
+)
+
+
+def test_the_declaration_for_the_pages_is_up_to_date() -> None:
+    assert api_types.FILE.read_text() == api_types.declaration(), "run `make types`"
+
+
+def test_the_list_has_a_row_for_each_run(tmp_path: Path) -> None:
+    write_whole_run(tmp_path / "a" / "b")
+    write_run(tmp_path / "new")
+    write_run(tmp_path / "done", [RunBegan("h", 1, resumed=False), RunEnded(Outcome.DONE)])
+    (tmp_path / "empty").mkdir()
+    with serving(tmp_path) as served:
+        rows = {row["name"]: row for row in served.get("/api/runs")["runs"]}
+    assert set(rows) == {"a/b", "new", "done"}
+    assert rows["a/b"]["status"] == "stopped"
+    assert rows["a/b"]["scene"] == "town"
+    assert rows["a/b"]["gaussians"] == 500
+    assert 0 < rows["a/b"]["progress"] < 1
+    assert rows["done"]["progress"] == 1
+    assert all(row["error"] is None for row in rows.values())
+
+
+def test_the_page_of_a_run_has_its_results_and_settings(served: Served) -> None:
+    run = served.get(f"/api/runs/{served.id('run')}")
+    assert run["result"].pop("findings") == "- - - -"
+    assert run["result"] == {"model": True, "report": True, "exposure": None}
+    settings = {setting["key"]: setting for setting in run["config"]}
+    assert settings["iterations"]["changed"]
+    assert not settings["sky.kappa"]["changed"]
+    assert not settings["partition.cuts"]["changed"]  # a list in run.json
+    relocates = settings["densify.method"]
+    assert (relocates["value"], relocates["changed"]) == ("relocate", False)  # that is its recipe's
+    assert "eq. 3" in settings["sky.kappa"]["unit_or_doc"]
+
+
+def test_a_run_whose_scene_is_gone_allows_no_action(served: Served) -> None:
+    id = served.id("run")
+    assert served.get(f"/api/runs/{id}")["actions"]["available"] == ["resume"]
+    answer = served.act(id, "resume")
+    assert answer.status_code == 409
+    assert "/scenes/town does not exist" in answer.json()["error"]
+    assert served.act(id, "stop").json() == {"error": "stop: no driver is at work on the run"}
+    assert served.act(id, "pause", -1).status_code == 409
+
+
+def test_cameras_and_blocks(served: Served) -> None:
+    id = served.id("run")
+    assert served.get(f"/api/runs/{id}/camera/1") == {
+        "row": 1,
+        "name": "1.jpg",
+        "block": 0,
+        "scores": [1.0, 0.9],
+        "assigned": {"0": "both", "1": "gradient"},
+        "no_picture": "the scene /scenes/town is not on this machine",
+    }
+    cameras = served.get(f"/api/runs/{id}/block/1")["cameras"]
+    assert [camera["reason"] for camera in cameras] == ["gradient", "both", "both"]
+    for path in ("camera/9", "camera/9/panorama", "block/2", "views/999999"):
+        assert served.errors(f"/api/runs/{id}/{path}", 404)
+
+
+def test_curves_are_thinned(served: Served) -> None:
+    id = served.id("run")
+    whole = served.get(f"/api/runs/{id}/series", task="block/000")
+    assert whole["loss"]["iteration"] == list(range(1, 41))
+    thin = served.get(f"/api/runs/{id}/series", task="block/000", points=4)
+    assert thin["rate/means"]["iteration"] == [10, 20, 30, 40]
+    assert served.get(f"/api/runs/{id}/series", task="block/001") == {}
+
+
+def test_a_curve_forgets_what_was_done_again(tmp_path: Path) -> None:
+    first = [progressed(COARSE, iteration, gaussians=1) for iteration in range(1, 31)]
+    again = [progressed(COARSE, iteration, gaussians=2) for iteration in range(21, 26)]
+    write_run(tmp_path / "run", [started(COARSE), *first, started(COARSE, 20), *again])
+    with serving(tmp_path) as served:
+        curve = served.get(f"/api/runs/{served.id('run')}/series", task="coarse")["gaussians"]
+    assert curve["iteration"] == list(range(1, 26))
+    assert curve["value"] == [1.0] * 20 + [2.0] * 5
+
+
+def pages(served: Served, path: str, **wanted: object) -> Iterator[dict[str, Any]]:
+    """All pages of events, as the log requests them."""
+    page = served.get(path, **wanted)
+    while page["more"]:
+        yield page
+        page = served.get(path, before=page["next"], **wanted)
+    yield page
+
+
+def test_events_come_page_by_page(served: Served) -> None:
+    path = f"/api/runs/{served.id('run')}/events"
+    found = [event["id"] for page in pages(served, path, limit=7) for event in page["events"]]
+    assert found == list(range(len(found), 0, -1))
+    assert [event["id"] for event in served.get(path, after=len(found) - 2)["events"]] == found[:2]
+
+
+def test_events_are_filtered(served: Served) -> None:
+    path = f"/api/runs/{served.id('run')}/events"
+
+    def types(**wanted: object) -> set[str]:
+        return {event["type"] for event in served.get(path, **wanted)["events"]}
+
+    assert types(type="Noticed") == {"Noticed"}
+    assert types(type=["Noticed", "TaskStarted"]) == {"Noticed", "TaskStarted"}
+    assert "Progressed" not in types(type="-Progressed")
+    assert {event["task"] for event in served.get(path, task="coarse")["events"]} == {"coarse"}
+    assert types(task="coarse", type="Progressed") == {"Progressed"}
+    assert served.get(path, task="block/000", type="CheckpointSaved")["events"][0]["iteration"] == 40
+    assert served.get(path, text="IS STRANGE")["events"][0]["message"] == "an image is strange"
+    assert served.get(path, text="' OR 1=1 --")["events"] == []
+
+
+def test_a_search_continues_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert queries.SEARCHED > 10
+    monkeypatch.setattr(queries, "SEARCHED", 10)
+    write_run(tmp_path, [Noticed(None, "needle"), *(progressed(COARSE, i) for i in range(1, 21))])
+    with serving(tmp_path) as served:
+        found = [page["events"] for page in pages(served, f"/api/runs/{served.id()}/events", text="needle")]
+    assert len(found) > 1
+    assert [[event["message"] for event in events] for events in found if events] == [["needle"]]
+
+
+def test_pictures(served: Served) -> None:
+    path = f"/api/runs/{served.id('run')}"
+    (preview,) = served.get(f"{path}/previews")["previews"]
+    assert served.get(f"{path}/previews", task="block/000") == {"previews": []}
+    (view,) = served.get(f"{path}/views")["views"]
+    assert (preview["task"], view["metrics"]) == ("coarse", {"psnr": 20.0})
+    for picture in (f"previews/{preview['event']}", f"views/{view['number']}"):
+        answer = served.client.get(f"{path}/{picture}")
+        assert answer.headers["content-type"] == "image/jpeg"
+        assert answer.content.startswith(b"\xff\xd8")
+    assert served.errors(f"{path}/previews/{view['number']}", 404)
+
+
+def test_downloads(served: Served) -> None:
+    path = f"/api/runs/{served.id('run')}"
+    model = served.client.get(f"{path}/point_cloud.ply")
+    assert model.content == b"ply\n"
+    assert model.headers["content-disposition"] == 'attachment; filename="run.ply"'
+    part = served.client.get(f"{path}/point_cloud.ply", headers={"Range": "bytes=1-2"})
+    assert (part.status_code, part.content) == (206, b"ly")
+    report = served.client.get(f"{path}/report.html")
+    assert report.headers["content-security-policy"].startswith("sandbox allow-scripts ")
+    assert "allow-same-origin" not in report.headers["content-security-policy"]
+    assert served.client.get(f"{path}/report.html?save=1").headers["content-disposition"].startswith("attach")
+
+
+def test_pages_and_scripts(served: Served) -> None:
+    for path in ("/", f"/runs/{served.id('run')}", "/runs/nonsense"):
+        answer = served.client.get(path)
+        assert answer.headers["content-type"] == "text/html; charset=utf-8"
+        inline = re.findall(r"<script(?![^>]* src=)[^>]*>(.*?)</script>", answer.text, re.DOTALL)
+        (digest,) = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in inline)
+        assert f"script-src 'self' 'sha256-{digest}';" in answer.headers["content-security-policy"]
+    charts = served.client.get("/static/plotly.min.js")
+    assert b"plotly.js" in charts.content[:1000]
+    again = served.client.get("/static/plotly.min.js", headers={"If-None-Match": charts.headers["etag"]})
+    assert again.status_code == 304
+    plain = served.client.get("/static/plotly.min.js", headers={"Accept-Encoding": "identity"})
+    assert plain.content == charts.content
+
+
+def test_large_answers_are_packed(served: Served) -> None:
+    url = f"/api/runs/{served.id('run')}"
+    with served.client.stream("GET", url, headers={"Accept-Encoding": "gzip"}) as answer:
+        assert gzip.decompress(b"".join(answer.iter_raw())) == served.client.get(url).content
+
+
+def test_what_was_measured_and_its_pictures_are_of_the_run_alone(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    with serving(tmp_path) as server:
+        path = f"/api/runs/{server.id('run')}/findings"
+        empty: dict[str, Any] = {
+            "metrics": None,
+            "seams": [],
+            "colors": [],
+            "moves": [],
+            "movers": [],
+            "pictures": [],
+        }
+        assert server.get(path) == empty
+        write_json(
+            folder.metrics, {"mean": {"psnr": 20.0}, "views": {"a.jpg": {"psnr": 20.0, "lpips": None}}}
+        )
+        write_json(folder.mover_shares, {"panoramas": [{"name": f"{i}.jpg", "share": 0.1} for i in range(2)]})
+        folder.mover_picture("0.jpg").parent.mkdir(parents=True)
+        cv2.imwrite(str(folder.mover_picture("0.jpg")), np.zeros((8, 16, 3), np.uint8))
+        (tmp_path / "secret.jpg").write_bytes(folder.mover_picture("0.jpg").read_bytes())
+        folder.mover_picture("1.jpg").symlink_to(tmp_path / "secret.jpg")
+        found = server.get(path)
+        assert found["metrics"]["views"] == {"a.jpg": {"psnr": 20.0, "lpips": None}}
+        assert found["pictures"] == ["mover-0.jpg"]
+        assert server.client.get(f"{path}/mover-0.jpg").headers["content-type"] == "image/jpeg"
+        for name in ("mover-1.jpg", "mover-7.jpg", "..%2Frun.json"):
+            assert server.client.get(f"{path}/{name}").status_code == 404
+        folder.metrics.write_bytes(b'{"mean": 3}')
+        assert "metrics.json: is damaged" in server.errors(path, 404)

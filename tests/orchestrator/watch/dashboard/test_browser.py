@@ -1,0 +1,286 @@
+"""The pages in a real browser: what they show, to everybody, on a phone and on a desk."""
+
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+from scipy.sparse import csr_array
+
+from panolog.orchestrator.engine.stages.partitioning import plan_records, write_plan
+from panolog.orchestrator.runs.records import Noticed, PreviewSaved, RunBegan, TaskFailed
+from panolog.partition.cells import Grid
+from panolog.partition.plan import PartitionConfig, make_plan
+from panolog.workers.tasks import COARSE, TaskId
+from tests.orchestrator.watch.dashboard.browser import DESK, PATIENCE_MS, PHONE, SMALL, opened, unreachable
+from tests.orchestrator.watch.dashboard.served import (
+    EVIL,
+    Served,
+    append,
+    progressed,
+    serving,
+    started,
+    write_run,
+    write_whole_run,
+)
+
+pytestmark = pytest.mark.system
+
+# Where a camera of the map is on the screen.
+PLACE = """(at) => {
+  const plot = document.getElementById("map-plot"), box = plot.getBoundingClientRect();
+  const cameras = plot._fullData.find((trace) => trace.name === "cameras");
+  const {xaxis, yaxis} = plot._fullLayout;
+  return [
+    box.x + xaxis._offset + xaxis.d2p(cameras.x[at]), box.y + yaxis._offset + yaxis.d2p(cameras.y[at]),
+  ];
+}"""
+# Widths of the drawn map, of its card inside, and by how much the page is wider than the window.
+WIDTHS = """() => [
+  document.querySelector("#map-plot .main-svg").getBoundingClientRect().width,
+  document.getElementById("map").clientWidth,
+  document.documentElement.scrollWidth - innerWidth,
+]"""
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A run with everything, whose renders differ from the ground truth, and one with hostile names."""
+    folder = tmp_path_factory.mktemp("folder")
+    whole = write_whole_run(folder / "town")
+    picture = np.zeros((256, 256, 3), np.uint8)
+    picture[:128, :, 2] = np.linspace(0, 255, 256)  # the render: red, more to the right
+    picture[128:, :, 0] = 255  # the ground truth: blue
+    for name in ("000050.jpg", "000100.jpg"):
+        cv2.imwrite(str(whole.root / "coarse" / "previews" / name), picture)
+    append(whole, PreviewSaved(COARSE, 100, "1.jpg", "coarse/previews/000100.jpg"))
+    append(whole, TaskFailed(TaskId.block(1), 1, "out of memory", final=False), started(TaskId.block(1)))
+    evil = write_run(folder / "<img src=x onerror=alert(1)>", scene=f"/scenes/{EVIL}")
+    append(evil, RunBegan(EVIL, 1, resumed=False), Noticed(COARSE, EVIL), started(COARSE))
+    append(evil, TaskFailed(COARSE, 1, EVIL, final=True, detail=EVIL))
+    with serving(folder) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def town(browser: Browser, shown: Served) -> Iterator[Page]:
+    """The page of a run, for tests that each use a part of their own and leave the rest as it is."""
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
+        settled(page)
+        yield page
+
+
+def settled(page: Page) -> None:
+    """Waits until the parts that are loaded later are there."""
+    expect(page.locator("#map-plot .heatmaplayer image").first).to_be_attached()
+    expect(page.locator("#charts .scatterlayer .trace").first).to_be_attached()
+    expect(page.locator("#events li").first).to_be_visible()
+
+
+def fills_its_card(page: Page) -> None:
+    """Waits until the map is as wide as its card; the page must not scroll sideways meanwhile."""
+    expect(page.locator("#map-plot .main-svg").first).to_be_visible()
+    last = time.monotonic() + PATIENCE_MS / 1000
+    while True:
+        map_width, card, more = page.evaluate(WIDTHS)
+        assert more <= 0
+        if abs(map_width - card) <= 1:
+            return
+        assert time.monotonic() < last, f"the map has {map_width} pixels of {card}"
+        page.wait_for_timeout(100)
+
+
+def test_the_map_fills_its_card_and_all_is_reached_by_keyboard(browser: Browser, shown: Served) -> None:
+    """On a fresh load and after resizing; the focus is seen."""
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}", width=PHONE) as page:
+        settled(page)
+        fills_its_card(page)
+        assert page.evaluate(SMALL) == []
+        assert unreachable(page) == []
+        for other in (PHONE - 20, 800, DESK):
+            page.set_viewport_size({"width": other, "height": 850})
+            fills_its_card(page)
+        assert unreachable(page) == []
+
+
+# How many rows the entries of the legends have.
+ROWS = """() => new Set([...document.querySelectorAll("#charts .legendtext")].map((node) =>
+  node.getBoundingClientRect().bottom)).size"""
+
+
+def test_the_legend_has_room_in_a_window_that_was_made_narrow(browser: Browser, tmp_path: Path) -> None:
+    rates = dict.fromkeys(("means", "scales", "quats", "opacities", "sh0", "shN"), 1e-3)
+    made = (replace(progressed(COARSE, iteration), rates=rates) for iteration in (10, 20))
+    write_run(tmp_path / "run", [started(COARSE), *made])
+    with (
+        serving(tmp_path) as served,
+        opened(browser, f"{served.url}/runs/{served.id('run')}", width=DESK) as page,
+    ):
+        expect(page.locator("#charts .legendtext")).to_have_count(len(rates))
+        assert page.evaluate(ROWS) == 2
+        page.set_viewport_size({"width": PHONE, "height": 850})
+        page.wait_for_function(f"() => ({ROWS})() === 3", timeout=PATIENCE_MS)
+
+
+def test_runs_are_found_and_sorted_in_a_theme_that_stays(browser: Browser, shown: Served) -> None:
+    background = "getComputedStyle(document.body).backgroundColor"
+    with opened(browser, shown.url) as page:
+        names = page.locator("#runs .run-name")
+        expect(names).to_have_count(2)
+        page.locator("#runs").get_by_role("button", name="Run").click()
+        first = names.first.text_content()
+        page.locator("#runs").get_by_role("button", name="Run").click()
+        expect(names.last).to_have_text(str(first))
+        page.get_by_label("Search runs").fill("TOWN")
+        expect(names).to_have_text(["town"])
+        page.get_by_label("Search runs").fill("nothing like it")
+        expect(page.locator("#empty")).to_have_text("No run matches the search.")
+        light = page.evaluate(background)
+        page.get_by_role("button", name="Switch to dark").click()
+        dark = page.evaluate(background)
+        assert light != dark
+        page.reload()
+        assert page.evaluate(background) == dark
+        page.get_by_role("button", name="Switch to light").click()
+        assert page.evaluate(background) == light
+
+
+def test_the_map_says_why_a_camera_trains_its_blocks(town: Page) -> None:
+    town.locator("#map-plot .scatterlayer .trace path.point").last.wait_for()
+    town.locator("#map-plot").scroll_into_view_if_needed()
+    middle = town.evaluate(PLACE, 1)
+    town.mouse.move(*middle)
+    town.mouse.click(*middle)
+    panel = town.locator("#selected")
+    expect(panel.locator("h3")).to_have_text("1.jpg")
+    expect(panel.locator(".scores li")).to_have_count(2)
+    expect(panel.locator(".serves")).to_have_count(2)
+    expect(panel).to_contain_text("its gradients here are close to its strongest")
+    panel.get_by_role("button", name="block 0").click()
+    expect(panel.locator("h3")).to_have_text("block 0")
+    expect(town.locator("#block-table tr[aria-current='true']")).to_have_attribute("data-block", "0")
+    across, down = town.evaluate(PLACE, 3)
+    town.mouse.move(across, down + 60)  # nothing but the cell
+    expect(town.locator("#pointed")).to_contain_text("block 1: waiting")
+    town.mouse.click(across, down + 60)
+    expect(panel.locator("h3")).to_have_text("block 1")
+    town.get_by_label("Camera").fill("3.jpg")  # the same without a mouse
+    town.get_by_label("Camera").press("Enter")
+    expect(panel.locator("h3")).to_have_text("3.jpg")
+    town.locator("#block-table tr[data-block='0'] button").click()
+    pause = panel.get_by_role("button", name="Pause")
+    expect(pause).to_have_attribute("aria-disabled", "true")
+    expect(panel).to_contain_text("Not possible now: no driver is at work")
+    pause.click(force=True)
+    expect(town.locator("#confirm")).to_be_hidden()
+
+
+def test_blocks_are_filtered_and_sorted(town: Page) -> None:
+    rows = town.locator("#block-table tbody tr[data-block]")
+    expect(rows).to_have_count(3)
+    town.get_by_label("Filter blocks").fill("memory")
+    expect(rows).to_have_count(1)
+    expect(rows).to_contain_text("out of memory")
+    town.get_by_label("Filter blocks").fill("")
+    heads = town.locator("#block-table thead")
+    heads.get_by_role("button", name="Block").click()
+    expect(rows.first).to_have_attribute("data-block", "1")
+    heads.get_by_role("button", name="Retries").click()
+    expect(rows.last).to_have_attribute("data-block", "1")
+
+
+def test_pictures_are_compared_and_looked_around_in(town: Page) -> None:
+    town.locator("#view-source").select_option(label="Stage I")
+    box = town.locator(".compare")
+    expect(box).to_be_visible()
+    split = town.locator(".split")
+    split.fill("80")
+    assert box.evaluate("node => node.style.getPropertyValue('--split')") == "80%"
+    expect(town.locator(".frames")).to_contain_text("iteration 100")
+    town.get_by_label("Iteration", exact=True).fill("0")
+    expect(town.locator(".frames")).to_contain_text("iteration 50")
+    town.get_by_role("button", name="360°").click()
+    canvas = town.locator(".compare canvas")
+    expect(canvas).to_be_focused()
+    pixel = """(node, [x, y]) => {
+      const gl = node.getContext("webgl"), out = new Uint8Array(4);
+      gl.readPixels(x * node.width, y * node.height, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, out);
+      return [...out];
+    }"""
+    expect(canvas).to_have_attribute("data-angles", "0.000 0.000 0.800")
+    ahead, truth = canvas.evaluate(pixel, [0.5, 0.5]), canvas.evaluate(pixel, [0.95, 0.5])
+    assert 110 < ahead[0] < 145  # the middle of the panorama
+    assert truth[2] > 200  # beyond the split
+    for _ in range(6):
+        town.keyboard.press("ArrowRight")
+    expect(canvas).to_have_attribute("data-angles", "0.785 0.000 0.800")
+    assert canvas.evaluate(pixel, [0.5, 0.5])[0] > ahead[0] + 20  # an eighth to the right
+    town.keyboard.press("+")
+    expect(canvas).to_have_attribute("data-angles", "0.785 0.000 0.960")
+    place = canvas.bounding_box()
+    assert place is not None
+    town.mouse.move(place["x"] + 200, place["y"] + 100)
+    town.mouse.down()
+    town.mouse.move(place["x"] + 100, place["y"] + 160, steps=3)
+    town.mouse.up()
+    yaw, pitch, _ = map(float, str(canvas.get_attribute("data-angles")).split())
+    assert yaw > 0.785
+    assert pitch > 0
+
+
+def test_the_log_is_filtered(town: Page) -> None:
+    events = town.locator("#events li")
+    expect(events.first).to_be_visible()
+    expect(events.filter(has_text="it/s")).to_have_count(0)
+    town.get_by_label("Type").select_option(label="Progress")
+    expect(events.filter(has_text="it/s")).to_have_count(41)
+    town.get_by_label("Task").select_option(label="Stage I")
+    expect(events).to_have_count(1)
+    town.get_by_label("Type").select_option(label="all")
+    town.get_by_label("Search the log").fill("strange")
+    expect(events).to_have_count(1)
+    expect(events).to_contain_text("an image is strange")
+
+
+def test_settings_that_differ_are_marked(town: Page) -> None:
+    town.get_by_label("only changed").check()
+    expect(town.locator("#setting-table code")).to_have_text(["iterations", "width"])
+    expect(town.locator("#setting-table .changed")).to_have_count(2)
+
+
+def test_what_a_scene_says_stays_text(browser: Browser, shown: Served) -> None:
+    def frozen(_: object) -> None:
+        raise AssertionError("a script of the scene has run")
+
+    with opened(browser, shown.url) as page:
+        page.on("dialog", frozen)
+        page.get_by_role("link", name="<img src=x onerror=alert(1)>").click()
+        expect(page.locator("h1")).to_have_text("<img src=x onerror=alert(1)>")
+        expect(page.locator("#block-table")).to_contain_text(EVIL)
+        expect(page.locator("#notices")).to_contain_text(EVIL)
+        expect(page.locator("#events")).to_contain_text(EVIL)
+        assert page.evaluate("document.querySelectorAll('main script, main img:not([alt])').length") == 0
+
+
+def test_a_thousand_blocks_cost_no_more_rows_than_are_seen(browser: Browser, tmp_path: Path) -> None:
+    random, count = np.random.default_rng(0), 1000
+    centers, means = random.normal(size=(400, 3)) * [50, 40, 1], random.normal(size=(5000, 3)) * 50
+    scores, names = csr_array(random.random((400, count)) ** 40), [f"{k}.jpg" for k in range(400)]
+    grid = Grid((40, 25, 1))
+    plan = make_plan(centers, means, scores, grid, PartitionConfig(), rows=range(400), names=names)
+    folder = write_run(tmp_path / "city")
+    write_plan(folder, plan, scores)
+    append(folder, RunBegan(socket.gethostname(), 1, resumed=False), *plan_records(folder, plan, scores))
+    with serving(tmp_path) as server, opened(browser, f"{server.url}/runs/{server.id('city')}") as page:
+        expect(page.locator("#tally")).to_contain_text("waiting")
+        assert page.locator("#block-table tbody tr").count() < 60
+        expect(page.locator("#map-plot .heatmaplayer image").first).to_be_attached()
+        page.get_by_label("Filter blocks").fill("block 999")
+        expect(page.locator("#block-table tr[data-block]")).to_have_count(1)
+        append(folder, started(TaskId.block(999)), progressed(TaskId.block(999), 40))
+        expect(page.locator("#block-table tr[data-block]")).to_contain_text("40 / 100")

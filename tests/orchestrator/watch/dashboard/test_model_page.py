@@ -1,0 +1,186 @@
+"""The 3D view of a run in a real browser: it draws, and what it runs can do nothing to the dashboard."""
+
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+
+from panolog.orchestrator.engine.stages.partitioning import write_plan
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.watch.dashboard.model_pages import page_policy
+from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.ply import write_ply
+from panolog.workers.tasks import COARSE
+from tests.orchestrator.watch.dashboard.browser import opened
+from tests.orchestrator.watch.dashboard.served import POST, SCORES, Served, plan, raw, serving, write_run
+from tests.orchestrator.watch.views.models import some
+from tests.orchestrator.watch.views.pictures import layers, psnr, ready, rendered, shown, until
+from tests.orchestrator.watch.views.sites import SIZE, viewpoints_of
+from tests.scenes import write_scene
+
+TOKEN = "t" * 43
+FETCH = "fetch('/api/runs').then(() => 'answered', () => 'refused')"
+
+
+def request_page(
+    served: Served, task: str | None = None, camera: str | None = None, run: str = "run"
+) -> httpx.Response:
+    body = {"task": task, "camera": camera}
+    return served.client.post(f"/api/runs/{served.id(run)}/viewer", json=body, headers=POST)
+
+
+def url_of(served: Served, task: str | None = None, camera: str | None = None) -> str:
+    answer = request_page(served, task, camera)
+    assert answer.status_code == 200, answer.text
+    return str(answer.json()["url"])
+
+
+def url_of_both(served: Served) -> str:
+    """The address of a page that two clients have requested at once."""
+    with ThreadPoolExecutor(2) as clients:
+        first, second = clients.map(url_of, [served, served])
+    assert first == second
+    return first
+
+
+def refused(served: Served, task: str | None = None, camera: str | None = None, run: str = "run") -> str:
+    """The line of a request that gets no page."""
+    answer = request_page(served, task, camera, run)
+    assert answer.status_code == 409
+    assert "\n" not in answer.json()["error"]
+    return str(answer.json()["error"])
+
+
+def save_model(folder: RunFolder, model: Gaussians) -> None:
+    folder.of(COARSE).mkdir(exist_ok=True)
+    write_ply(folder.model(COARSE), model)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run whose model is of opaque balls in front of one of its cameras."""
+    folder = write_run(tmp_path_factory.mktemp("folder") / "run")
+    write_plan(folder, plan(), SCORES)
+    save_model(folder, layers(viewpoints_of(folder, "1.jpg")))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def served(folder: RunFolder) -> Iterator[Served]:
+    """A server that requires a token, and a client that has it."""
+    with serving(folder.root.parent, token=TOKEN) as served:
+        served.client.headers["Authorization"] = f"Bearer {TOKEN}"
+        yield served
+
+
+@pytest.mark.system
+def test_the_picture_of_a_page_that_can_reach_nothing_is_that_of_our_renderer(
+    browser: Browser, served: Served, folder: RunFolder
+) -> None:
+    def policy(text: str) -> bool:
+        return "Content Security Policy" in text
+
+    viewpoints, url = viewpoints_of(folder, "1.jpg"), f"{served.url}{url_of_both(served)}#camera=1.jpg"
+    with opened(browser, url, width=SIZE[0], height=SIZE[1], tolerate=policy) as page:
+        picture = shown(page)
+        assert page.title() == "model of run"
+        assert page.evaluate("self.origin") == "null"
+        assert page.evaluate(FETCH) == "refused"
+    expected = rendered(layers(viewpoints), viewpoints, SIZE, background=picture[0, 0])
+    assert psnr(picture, expected) >= 25
+
+
+@pytest.mark.system
+def test_only_the_page_itself_is_granted_and_only_to_origins_of_their_own(served: Served) -> None:
+    url = url_of(served)
+    key = url.strip("/").split("/")[1]
+    with httpx.Client(base_url=served.url) as anyone:
+        for name in ("", "scene.json", "viewer.js", "engine.js", "model.sog"):
+            answer = anyone.get(url + name)
+            assert answer.status_code == 200
+            assert answer.headers["access-control-allow-origin"] == "null"
+            policy = page_policy(answer.request.url.netloc.decode(), key)
+            assert answer.headers["content-security-policy"] == policy
+        other = f"{key[:-1]}{(int(key[-1], 16) + 1) % 16:x}"
+        for path in ("/", "/api/runs", f"/models/{other}/", f"/models/{key}A/", f"/models/{key}", "/models/"):
+            assert anyone.get(path).status_code == 403, path
+        assert anyone.post(url, headers=POST, content="{}").status_code in (403, 405)
+    host = served.url.removeprefix("http://").encode()
+    outside = ("..", "../..", "%2e%2e/%2e%2e", "../../api/runs", "/etc/passwd", "%00", "x/../../x", ".hidden")
+    for path in outside:
+        request = f"GET {url}{path} HTTP/1.1\r\nHost: ".encode() + host + b"\r\nConnection: close\r\n\r\n"
+        assert raw(served.url, request).split(b" ")[1] in (b"403", b"404"), path
+
+
+@pytest.mark.system
+def test_a_page_is_made_once_for_all_cameras_and_clients(served: Served) -> None:
+    assert url_of(served, camera="0.jpg") == f"{url_of_both(served)}#camera=0.jpg"
+    for name in ("none.jpg", "../0.jpg", ""):
+        assert refused(served, camera=name) == "the plan of this run has no such panorama"
+
+
+def test_the_policy_names_the_pages_own_address_alone() -> None:
+    own = page_policy("box.example:8360", "k" * 48)
+    assert f"connect-src box.example:8360/models/{'k' * 48}/ data: blob:;" in own
+    assert "'unsafe" not in own
+    assert "sandbox allow-scripts allow-downloads;" in own
+    for host in ("[::1]:8360", "x; script-src *", "", "a b", "x,y"):
+        policy = page_policy(host, "k")
+        assert host not in policy or not host
+        assert "connect-src 'self' data: blob:;" in policy
+
+
+@pytest.mark.system
+def test_a_model_that_is_not_there_or_not_the_runs_own_is_a_line(tmp_path: Path) -> None:
+    write_run(tmp_path / "folder" / "run")
+    write_ply(tmp_path / "secret.ply", some(3))
+    write_run(tmp_path / "folder" / "linked").point_cloud.symlink_to(tmp_path / "secret.ply")
+    damaged = write_run(tmp_path / "folder" / "damaged")
+    damaged.of(COARSE).mkdir()
+    damaged.model(COARSE).write_bytes(b"nonsense")
+    with serving(tmp_path / "folder") as served:
+        for task in (None, "block/001", "../../etc"):
+            assert refused(served, task)
+        assert refused(served, camera="0.jpg")  # without a plan
+        assert "not a plain file of the run" in refused(served, run="linked")
+        line = refused(served, run="damaged")
+        assert "model.ply: is not a model" in line and "/proc" not in line
+        assert "was removed" in served.errors("/models/none/", 404)
+
+
+@pytest.mark.system
+def test_what_a_run_has_written_is_shown_with_the_scenes_photographs(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [f"{number}.jpg" for number in range(4)]
+    write_scene(tmp_path / "scene", names=names)
+    blue = bytes(cv2.imencode(".jpg", np.full((512, 1024, 3), (250, 20, 10), np.uint8))[1])
+    (tmp_path / "scene" / "images" / "2.jpg").write_bytes(blue)
+    folder = write_run(tmp_path / "run", scene=str(tmp_path / "scene"))
+    write_plan(folder, plan(), SCORES)
+    save_model(folder, some(400, sky=100))
+    write_folder(site_of_run(folder, Wanted()), folder.web)
+    (folder.web / "secret.txt").symlink_to(tmp_path / "scene" / "images" / "2.jpg")
+    (program := tmp_path / "program").write_text("#!/bin/sh\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("sys.executable", str(program))  # nothing can be converted
+    with serving(tmp_path) as served:
+        url = url_of(served)
+        served.errors(f"{url}secret.txt", 404)
+        served.errors(f"{url}photos/000004.jpg", 404)
+        with opened(browser, served.url + url, width=SIZE[0], height=SIZE[1]) as page:
+            ready(page)
+            page.evaluate("panolog.walk.go(panolog.walk.cameras[2])")
+            until(page, "panolog.walk._picture.opacity === 1")
+            assert np.allclose(shown(page)[SIZE[1] // 2, SIZE[0] // 2], (250, 20, 10), atol=8)
+        later = time.time() + 100
+        os.utime(folder.model(COARSE), (later, later))  # a newer model needs another page
+        assert refused(served) == "the 3D view could not be made"

@@ -1,0 +1,100 @@
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go  # type: ignore[import-untyped]
+import pytest
+from numpy.typing import NDArray
+
+from panolog.orchestrator.watch.views import figures, plan_map
+from panolog.orchestrator.watch.views.palette import SEAM_GRADES
+from panolog.partition.cells import Grid
+from panolog.partition.contraction import contract
+from panolog.partition.plan import PartitionConfig, Plan, make_plan
+from panolog.scene.ply import write_ply
+from tests.scene.test_ply import gaussians
+
+GRID = Grid((3, 2, 2))
+
+
+@pytest.fixture
+def plan() -> Plan:
+    """Cameras spread least along z, so it is seen from there; most stand in the upper layer."""
+    random = np.random.default_rng(0)
+    centers = random.uniform(-1, 1, (20, 3)) * [9, 6, 0.5] + [0, 0, 0.1]
+    scores, names = random.random((20, GRID.count)), [f"<b>{k}</b>.jpg" for k in range(20)]
+    means = random.normal(size=(300, 3)) * 9
+    return make_plan(centers, means, scores, GRID, PartitionConfig(), rows=range(10, 30), names=names)
+
+
+POINTS = np.random.default_rng(1).normal(size=(400, 3)) * 5
+
+
+def unpacked(packed: dict[str, str]) -> NDArray[Any]:
+    flat = np.frombuffer(base64.b64decode(packed["bdata"]), packed["dtype"])
+    return flat.reshape([int(n) for n in packed["shape"].split(",")])
+
+
+def trace(figure: figures.Figure, name: str) -> dict[str, Any]:
+    return next(item for item in figure["data"] if item["name"] == name)
+
+
+def test_plotly_takes_the_figure_and_json_too(plan: Plan) -> None:
+    figure = figures.map_figure(plan, POINTS)
+    go.Figure({"data": figure["data"], "layout": figure["layout"]})  # checks every name and value
+    json.dumps(figure, allow_nan=False)
+
+
+def test_each_pixel_has_the_block_of_its_place(plan: Plan) -> None:
+    figure = figures.map_figure(plan, POINTS)
+    cells, blocks = trace(figure, "blocks"), figure["blocks"]
+    ids = unpacked(cells["z"]) + blocks["layer"] * blocks["stride"]
+    assert (blocks["layers"], blocks["stride"], blocks["count"]) == (2, 6, 12)
+    rows, columns = np.random.default_rng(2).integers(0, ids.shape, (200, 2)).T
+    height = plan.aabb.center[2] + (0.1 if blocks["layer"] else -0.1) * plan.aabb.half[2]
+    places = np.column_stack(
+        [cells["x0"] + cells["dx"] * columns, cells["y0"] + cells["dy"] * rows, np.full(200, height)]
+    )
+    expected = [next(b for b in range(12) if plan.cell(b).contains(place[None])[0]) for place in places]
+    assert (ids[rows, columns] == expected).mean() > 0.98  # but for pixels that a face crosses
+
+
+def test_cameras_have_a_ring_for_each_further_block_and_names_that_stay_text(plan: Plan) -> None:
+    figure = figures.map_figure(plan, POINTS)
+    served = plan.assignment.assigned.sum(axis=1)
+    for ring in (1, 2):
+        assert len(trace(figure, f"cameras, ring {ring}")["x"]) == (served > ring).sum()
+    assert trace(figure, "cameras")["text"][0].startswith("&lt;b&gt;0&lt;/b&gt;.jpg<br>trains block")
+
+
+def test_points_of_a_model_are_thinned_and_without_sky(tmp_path: Path) -> None:
+    model = gaussians(50, sky=10)
+    write_ply(tmp_path / "model.ply", model)
+    means = model.means.numpy()
+    np.testing.assert_array_equal(plan_map.read_points(tmp_path / "model.ply"), means[:40])
+    np.testing.assert_array_equal(plan_map.read_points(tmp_path / "model.ply", most=10), means[:40:4])
+
+
+def test_faces_have_the_colour_of_their_seam_the_worst_above(plan: Plan) -> None:
+    """Blocks 0 and 1 meet along x; 0 and 6 lie on top of each other: no line is seen of their face."""
+    seams = {(0, 1): 9.0, (1, 2): 1.0, (0, 6): 5.0, (0, 99): 5.0}
+    figure = figures.map_figure(plan, POINTS, seams=seams)
+    lines = [item for item in figure["data"] if item["name"] == "seams"]
+    assert [line["line"]["color"] for line in lines] == [
+        SEAM_GRADES["hardly"][1],
+        SEAM_GRADES["clear"][1],
+    ]
+    assert "blocks 0 and 1: 9.00" in lines[-1]["text"]
+    assert figure["blocks"]["grades"] == [
+        ["seam below 1.5", SEAM_GRADES["hardly"][1]],
+        ["seam 3 and more", SEAM_GRADES["clear"][1]],
+    ]
+    go.Figure({"data": figure["data"], "layout": figure["layout"]})
+    x, y = (np.array(lines[-1][axis]) for axis in "xy")
+    inside = np.abs(y - plan.aabb.center[1]) < 0.9 * plan.aabb.half[1]
+    places = np.column_stack([x, y, np.full(len(x), plan.aabb.center[2] - 0.1)])[inside]
+    for side, block in ((-1e-3, 0), (1e-3, 1)):
+        moved = contract(places + np.array([side, 0, 0]), plan.aabb)
+        assert (plan.grid.block_of(moved) == block).all()

@@ -1,0 +1,150 @@
+"""What the terminal shows of a run, at the usual widths."""
+
+import re
+import time
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from panolog.orchestrator.runs.machines.history import why_leaving
+from panolog.orchestrator.runs.records import (
+    Leaving,
+    NodeLeaving,
+    NodeLeft,
+    NodeStaying,
+    PauseRequested,
+    Progressed,
+    Record,
+    RunContinued,
+    RunWaiting,
+    Stored,
+    TaskYielded,
+)
+from panolog.orchestrator.runs.state import RunState
+from panolog.orchestrator.watch.views.terminal import WIDE, page, progress
+from tests.orchestrator.watch.views.test_timing import (
+    INFO,
+    MEASURED,
+    MERGED,
+    ONE,
+    SHARDED,
+    STAGE_ONE,
+    STAGE_TWO,
+    TRAINED,
+    ZERO,
+    Timed,
+    state,
+)
+
+LARGE: list[Timed] = [
+    *STAGE_TWO,
+    (20_000, Progressed(ZERO, 12_345, 30_000, 12.3, 0.0812, 27.31, 1_739_000, 6 * 2**30)),
+    (20_000, Progressed(ONE, 2_345, 30_000, 2.1, 0.0812, 27.31, 2_000_000, 6 * 2**30)),
+]
+
+
+def shown(records: list[Timed], width: int, *, running: bool) -> str:
+    console = Console(file=StringIO(), width=width)
+    root = Path("runs/my street")
+    content = page(state(records), root=root, info=INFO, running=running, wide=width >= WIDE)
+    console.print(content, crop=False)
+    assert isinstance(console.file, StringIO)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_a_run_fits_the_terminal_and_says_how_far_it_is(width: int) -> None:
+    text = shown(LARGE, width, running=True)
+    first, gaussians, *rows = text.splitlines()
+    assert first.startswith("running · Stage II · ")
+    assert "% · " in first
+    assert " elapsed · about " in first
+    assert gaussians.strip() == "3,739,000 Gaussians in training, 10 kept"
+    assert [row.split("  ")[0] for row in rows] == [
+        "task",
+        "Stage I",
+        "scoring",
+        "partition",
+        "block 0",
+        "block 1",
+    ]
+    assert all(len(line.rstrip()) <= width for line in text.splitlines())
+    assert "1,739,000" in rows[4]
+
+
+def test_shards_of_the_evaluation_are_one_row() -> None:
+    text = shown([*TRAINED, *SHARDED, (206, MERGED), *MEASURED], 160, running=True)
+    (row,) = [row for row in text.splitlines() if row.startswith("measurement")]
+    assert row.rstrip().endswith("1/3 shards")
+
+
+def test_a_preflight_says_what_it_does() -> None:
+    assert shown(STAGE_ONE[:2], 80, running=True).startswith("running · preflight: starting Ray · 0% · ")
+
+
+def test_a_run_that_waits_for_its_disk_says_so_and_what_to_do() -> None:
+    reason = "disk full, waiting: free 2.0 GiB on the disk of /runs/a or stop the run"
+    waiting: list[Timed] = [*LARGE, (20_001, RunWaiting(reason))]
+    first, second, *_ = shown(waiting, 120, running=True).splitlines()
+    assert first.startswith("waiting · Stage II · ")
+    assert second.strip() == reason
+    continued = shown([*waiting, (20_900, RunContinued(899.0))], 120, running=True)
+    assert continued.startswith("running · Stage II · ")
+    assert reason not in continued + shown(waiting, 120, running=False)
+
+
+LEAVES = NodeLeaving("3f2a81c4d5e6", "gpu-07", Leaving.PREEMPTION, 120.0)
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_machines_that_leave_are_shown_with_the_time_left_until_they_have_left(width: int) -> None:
+    now = time.time()
+    recent: list[Timed] = [*LARGE, (now, LEAVES), (now + 1, TaskYielded(ONE, "gpu-07"))]
+    text = " ".join(shown(recent, width, running=True).split())
+    assert re.search(
+        r"gpu-07 \(3f2a81c4\): leaves in (2:00|1:5\d): its provider takes it away; tasks there", text
+    )
+    assert "1 moved from machines that left" in text
+    later = shown([*recent, (now + 2, NodeLeft("3f2a81c4d5e6", "gpu-07"))], width, running=True)
+    assert "gpu-07" not in later
+    assert "gpu-07" not in shown(recent, width, running=False).splitlines()[1]
+
+
+def test_plain_lines_say_what_leaves_and_what_moves() -> None:
+    console = Console(file=StringIO(), width=80)
+    records: list[Record] = [
+        LEAVES,
+        TaskYielded(ONE, "gpu-07"),
+        NodeLeft("3f2a81c4d5e6", "gpu-07"),
+        NodeStaying("7f2a81c4d5e6", "gpu-08"),
+    ]
+    with progress(console, Path("run")) as show:
+        show(RunState(), [Stored(number, 0.0, record) for number, record in enumerate(records, 1)])
+    assert isinstance(console.file, StringIO)
+    assert console.file.getvalue().splitlines() == [
+        f"gpu-07 (3f2a81c4) leaves in 2:00: {why_leaving(Leaving.PREEMPTION)}",
+        "block 1: has stopped with a checkpoint, and moves: gpu-07 leaves",
+        "gpu-07 (3f2a81c4): has left",
+        "gpu-08 (7f2a81c4): stays after all, and is used again",
+    ]
+
+
+def test_plain_lines_say_it_also_where_no_record_can_be_stored() -> None:
+    console = Console(file=StringIO(), width=80)
+    with progress(console, Path("run")) as show:
+        for text in ("", "disk full", "disk full", ""):
+            show(replace(RunState(), waiting=text), ())
+    assert isinstance(console.file, StringIO)
+    lines = console.file.getvalue().splitlines()
+    assert lines == ["disk full", "the run continues"]
+
+
+def test_commands_have_the_path_of_the_run() -> None:
+    killed = shown(LARGE, 80, running=False)
+    assert killed.startswith("driver lost · Stage II · ")
+    assert "`panolog resume 'runs/my street'` resumes it" in killed
+    paused = shown([*LARGE, (20_001, PauseRequested(ONE)), (20_002, TaskYielded(ONE))], 160, running=True)
+    assert "1 paused: `panolog unpause 'runs/my street' 1` resumes block 1" in paused

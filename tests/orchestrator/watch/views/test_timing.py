@@ -1,0 +1,265 @@
+"""Times and statuses that a run shows: true while it runs, and at rest without a driver."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+
+from panolog.orchestrator.runs.money.records import BudgetReached, BudgetSet
+from panolog.orchestrator.runs.records import (
+    BlockPlan,
+    EvaluationSaved,
+    MeasuresSaved,
+    Merged,
+    ModelSaved,
+    Outcome,
+    PlanSaved,
+    PreflightSaved,
+    Preparing,
+    Progressed,
+    Record,
+    RunBegan,
+    RunEnded,
+    ScoresSaved,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+    TaskYielded,
+)
+from panolog.orchestrator.runs.state import RunState, replay
+from panolog.orchestrator.watch.views.history import History
+from panolog.orchestrator.watch.views.run_view import RunView, StageView, view_run
+from panolog.orchestrator.watch.views.summary import summarize
+from panolog.orchestrator.watch.views.timing import run_eta
+from panolog.workers.tasks import COARSE, EVAL, TaskId
+
+INFO = {"config": {"blocks": "2x1x1", "refine": True}}
+ZERO, ONE, SHARD = TaskId.block(0), TaskId.block(1), TaskId.shard(0)
+ESTIMATE = PreflightSaved(
+    "preflight.json", {"coarse": 100.0, "score": 10.0, "block": 200.0, "merge": 4.0, "eval": 6.0}
+)
+PLANNED = PlanSaved("partition/plan.json", (BlockPlan(0, 3, 5, train=True), BlockPlan(1, 3, 5, train=True)))
+Timed = tuple[float, Record]
+
+
+def began(previous: float | None = None) -> RunBegan:
+    return RunBegan("host", 7, resumed=previous is not None, previous=previous)
+
+
+def started(task: TaskId, iteration: int = 0) -> TaskStarted:
+    return TaskStarted(task, 1, iteration, "host", 8, "cpu", 1)
+
+
+def model(task: TaskId, seconds: float) -> ModelSaved:
+    return ModelSaved(task, "model.ply", 10, 100, 100, seconds)
+
+
+def at(task: TaskId, iteration: int, rate: float = 1.0) -> Progressed:
+    return Progressed(task, iteration, 100, rate)
+
+
+def stored(records: Sequence[Timed]) -> list[Stored]:
+    return [Stored(number, time, record) for number, (time, record) in enumerate(records, 1)]
+
+
+def state(records: Sequence[Timed]) -> RunState:
+    return replay(stored(records))
+
+
+def view(records: Sequence[Timed], *, running: bool) -> RunView:
+    return view_run(History.of(stored(records)), INFO, running=running)
+
+
+def stage(shown: RunView, name: str) -> StageView:
+    return next(stage for stage in shown.stages if stage.name == name)
+
+
+STAGE_ONE: list[Timed] = [
+    (0, began()),
+    (1, Preparing("starting Ray")),
+    (5, Preparing("calibrating")),
+    (10, ESTIMATE),
+    (12, started(COARSE)),
+    (60, at(COARSE, 50)),
+    (112, model(COARSE, 100.0)),
+]
+STAGE_TWO: list[Timed] = [
+    *STAGE_ONE,
+    (113, started(SHARD)),
+    (120, ScoresSaved(SHARD, "scores", 3)),
+    (121, PLANNED),
+    (125, started(ZERO)),
+    (125, started(ONE)),
+    (145, at(ZERO, 20)),
+    (150, at(ONE, 25)),
+]
+
+
+TRAINED: list[Timed] = [*STAGE_TWO, (205, model(ONE, 75)), (205, model(ZERO, 80))]
+MERGED = Merged("point_cloud.ply", 10, 2, 100, 0.1)
+SHARDED: list[Timed] = [  # an evaluation in three parts
+    (205, replace(ESTIMATE, seconds=ESTIMATE.seconds | {"measure": 12.0})),
+    (205, replace(PLANNED, measures=3)),
+]
+PART = TaskId.measure(0)
+MEASURED: list[Timed] = [
+    (206, started(PART)),
+    (208, at(PART, 50, rate=10.0)),
+    (210, MeasuresSaved(PART, "000.json", 3, 0)),
+]
+
+
+def test_the_stages_of_a_killed_run_have_ended_with_its_last_record() -> None:
+    shown = view(STAGE_TWO, running=False)
+    block = stage(shown, "block")
+    assert (block.status, block.began, block.ended, block.seconds) == ("stopped", 125, 150, 25)
+    assert [stage.status for stage in shown.stages] == ["done"] * 4 + ["stopped"] + ["waiting"] * 2
+    preflight = stage(shown, "calibrate")
+    assert (preflight.label, preflight.began, preflight.ended) == ("preflight", 1, 10)
+    summary = shown.summary
+    assert (summary.status, summary.label, summary.seconds, summary.eta) == (
+        "stopped",
+        "driver lost",
+        150,
+        None,
+    )
+    assert summary.reason == "the driver, process 7 on host, was killed or has crashed"
+    task = summary.task("block/000")
+    assert task is not None
+    assert (task.status, task.seconds) == ("waiting", 25)
+
+
+def test_a_run_that_failed_is_at_rest() -> None:
+    failed = TaskFailed(ZERO, 3, "no memory", final=True)
+    records = [*STAGE_TWO, (160, failed), (170, model(ONE, 40.0)), (171, RunEnded(Outcome.FAILED, "block 0"))]
+    block = stage(view(records, running=False), "block")
+    assert (block.status, block.ended, block.seconds, block.done) == ("failed", 170, 45, 1)
+    coarse_failed = [*STAGE_ONE[:-1], (70, TaskFailed(COARSE, 3, "NaN", final=True))]
+    coarse = stage(view([*coarse_failed, (71, RunEnded(Outcome.FAILED, "NaN"))], running=False), "coarse")
+    assert (coarse.status, coarse.ended, coarse.seconds) == ("failed", 70, 58)
+
+
+def test_a_stage_that_a_limit_ended_has_ended_at_that_moment() -> None:
+    """The times of all stages add up: none is in two of them."""
+    cut = [*STAGE_TWO, (152, model(ONE, 27.0)), (155, TaskYielded(ZERO)), (156, BudgetReached("max_cost"))]
+    block = stage(view(cut, running=True), "block")
+    assert (block.status, block.ended, block.seconds, block.done) == ("stopped", 156, 31, 1)
+    rest: list[Timed] = [(160, MERGED), (161, started(EVAL)), (170, EvaluationSaved("eval/metrics.json", {}))]
+    over = [*cut, *rest, (171, RunEnded(Outcome.LIMITED, "max_cost"))]
+    shown = view(over, running=False)
+    assert stage(shown, "block") == block
+    spans = [(stage.began, stage.ended) for stage in shown.stages[-3:]]
+    assert spans == [(125, 156), (156, 160), (161, 170)]
+    reached: list[Timed] = [(80, TaskYielded(COARSE)), (80, BudgetReached("deadline")), (84, MERGED)]
+    early = view([*STAGE_ONE[:-1], *reached], running=True)
+    assert [(stage(early, name).began, stage(early, name).ended) for name in ("coarse", "merge")] == [
+        (12, 80),
+        (80, 84),
+    ]
+
+
+def test_after_a_higher_limit_what_follows_begins_anew() -> None:
+    cut = [*STAGE_TWO, (156, BudgetReached("max_cost")), (160, MERGED), (161, started(EVAL))]
+    again = [*cut, (162, RunEnded(Outcome.LIMITED, "max_cost")), (300, began(162)), (300, BudgetSet())]
+    resumed = [*again, (305, started(ZERO, 20)), (306, started(ONE, 25))]
+    block, merge = (stage(view(resumed, running=True), name) for name in ("block", "merge"))
+    assert (block.status, block.began, block.ended) == ("running", 125, None)
+    assert (merge.began, merge.ended) == (None, None)
+    done = [*resumed, (350, model(ZERO, 80)), (352, model(ONE, 75)), (356, MERGED)]
+    block, merge = (stage(view(done, running=True), name) for name in ("block", "merge"))
+    assert (block.began, block.ended, merge.began, merge.ended) == (125, 352, 352, 356)
+
+
+def test_an_interrupted_preflight_is_stopped() -> None:
+    shown = view(STAGE_ONE[:3], running=False)
+    assert [(s.name, s.status, s.ended) for s in shown.stages][:2] == [
+        ("calibrate", "stopped", 5),
+        ("coarse", "waiting", None),
+    ]
+    live = view(STAGE_ONE[:3], running=True)
+    assert (live.stages[0].status, live.summary.step) == ("running", "calibrating")
+
+
+def test_elapsed_leaves_out_the_time_without_a_driver() -> None:
+    killed = [*STAGE_TWO, (1000, began(previous=150)), (1010, started(ZERO, 20))]
+    shown = summarize(state(killed), running=True, now=1020.0)
+    assert shown.seconds == 150 + 20
+    stopped = [*STAGE_TWO, (155, RunEnded(Outcome.INTERRUPTED)), (1000, RunBegan("host", 9, resumed=True))]
+    assert (
+        summarize(state(stopped), running=True, now=1020.0).seconds == 155 + 20
+    )  # an older version's record
+    assert stage(view([*killed, (1030, at(ZERO, 30))], running=False), "block").seconds == 25 + 30
+
+
+def test_the_seconds_of_a_task_are_of_all_its_attempts() -> None:
+    records: list[Timed] = [
+        *STAGE_TWO,
+        (155, TaskYielded(ONE)),
+        (1000, began(previous=160)),
+        (1005, started(ZERO, 20)),
+        (1005, started(ONE, 25)),
+        (1025, TaskFailed(ONE, 1, "worker died", final=False)),
+        (1030, started(ONE, 25)),
+    ]
+    ended = [*records, (1050, model(ZERO, 40.0))]
+    shown = summarize(state(ended), running=True, now=1060.0)
+    seconds = {task.name: task.seconds for task in shown.tasks}
+    assert seconds == {
+        "coarse": 100,
+        "score/000": 7,
+        "plan": None,
+        "block/000": 35 + 40,
+        "block/001": 30 + 20 + 30,
+    }
+
+
+@pytest.mark.parametrize(
+    ("records", "now", "eta"),
+    [
+        (STAGE_ONE[:4], 11, 320),  # before the first worker: as estimated
+        (STAGE_ONE[:5], 22, 310),  # without a rate: less what has passed
+        (STAGE_ONE[:6], 60, 50 + 220),  # at the present rate, and what is to come
+        (STAGE_ONE, 112, 220),  # between two stages
+        (STAGE_TWO[:8], 115, 8 + 210),  # scoring
+        (STAGE_TWO[:10], 121, 210),  # after the plan
+        (STAGE_TWO, 150, 80 + 10),  # the later of two blocks
+        (TRAINED, 205, 10),
+        ([*TRAINED, (206, MERGED), (206, started(EVAL))], 208, 4),
+        ([*TRAINED, *SHARDED, (206, MERGED)], 206, 12 + 6),
+        ([*TRAINED, *SHARDED, (206, MERGED), *MEASURED[:2]], 209, 12 - 3 + 6),
+        ([*TRAINED, *SHARDED, (206, MERGED), *MEASURED], 212, 12 * 2 / 3 + 6),
+    ],
+)
+def test_the_time_left_is_that_of_the_whole_run(records: list[Timed], now: float, eta: float) -> None:
+    assert summarize(state(records), running=True, now=now).eta == pytest.approx(eta)
+
+
+def test_an_evaluation_in_shards_is_as_much_of_a_run_as_one_task() -> None:
+    parts = [*TRAINED, *SHARDED, (206, MERGED)]
+    one = view([*TRAINED, (206, MERGED), (206, started(EVAL)), (208, at(EVAL, 50))], running=True).progress
+    assert view([*parts, (206, started(PART)), (208, at(PART, 50))], running=True).progress < one
+    begun = view([*parts, *MEASURED[:2]], running=True)
+    assert view(parts, running=True).progress < begun.progress
+    measuring = stage(begun, "measure")
+    assert (measuring.label, measuring.status, measuring.tasks, measuring.done) == (
+        "measurement",
+        "running",
+        3,
+        0,
+    )
+    assert measuring.progress == pytest.approx(0.5 / 3)
+    assert not [each for each in view(TRAINED, running=True).stages if each.name == "measure"]
+    every = [(211, MeasuresSaved(TaskId.measure(part), "", 3, 0)) for part in (1, 2)]
+    ended = view([*parts, *MEASURED, *every], running=True)
+    assert stage(ended, "measure").status == "done" and ended.summary.stage == "measure"
+
+
+def test_there_is_no_time_left_where_it_is_not_known() -> None:
+    unknown: list[Timed] = [(0, began()), (1, started(COARSE)), (2, at(COARSE, 50))]
+    assert run_eta(state(unknown), 2) is None  # an older run: Stage II has no estimate
+    end: list[Timed] = [
+        (210, MERGED),
+        (211, EvaluationSaved("eval/metrics.json", {})),
+        (212, RunEnded(Outcome.DONE)),
+    ]
+    assert run_eta(state([*STAGE_TWO, *end]), 213) is None
