@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from panolog.orchestrator.engine.cluster.telemetry import COUNTERS, GAUGES, TAGS
+from panolog.orchestrator.engine.cluster.run_metrics import COUNTERS, GAUGES, TAGS
 from tests.deploy.files import DEPLOY
 
 DASHBOARD = json.loads((DEPLOY / "grafana.json").read_text())

@@ -11,7 +11,7 @@ from threading import Thread
 
 from panolog.orchestrator.runs.machines.children import send_line, start_companion
 from panolog.orchestrator.watch.follower.follower import END, LAST_S
-from panolog.orchestrator.watch.follower.plan import Plan, to_json
+from panolog.orchestrator.watch.follower.plan import FollowerPlan, to_json
 
 _TIMEOUT_S = 8.0  # for the process to send its pages the last state of the run, and to end
 _FOLLOWER_S = LAST_S + 5.0  # for the follower to end
@@ -55,7 +55,7 @@ def companion_dashboard(run: Path, say: Callable[[str], None]) -> Iterator[Threa
 
 
 @contextmanager
-def companion_follower(run: Path, plan: Plan, say: Callable[[str], None]) -> Iterator[None]:
+def companion_follower(run: Path, plan: FollowerPlan, say: Callable[[str], None]) -> Iterator[None]:
     """Follows a run while the context lasts, and then until the last news are delivered, for a bounded time.
 
     Its failure does not affect the run. If it was killed, another one delivers what is left at the end.

@@ -339,12 +339,12 @@ def _workers(address: str | None, root: Path, pool: Pool | None, nice: int | Non
 
 def _exported(root: Path, on_change: OnChange) -> OnChange:
     """`on_change`, which also exports the state as metrics of Ray."""
-    from panolog.orchestrator.engine.cluster.telemetry import Telemetry
+    from panolog.orchestrator.engine.cluster.run_metrics import RunMetrics
 
-    telemetry = Telemetry(root)
+    metrics = RunMetrics(root)
 
     def both(state: RunState, news: Sequence[Stored]) -> None:
-        telemetry.show(state, news)
+        metrics.show(state, news)
         on_change(state, news)
 
     return both

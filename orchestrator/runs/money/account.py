@@ -6,7 +6,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict
 
 from panolog.orchestrator.runs.money.losses import settled
-from panolog.orchestrator.runs.money.spending import Machine, Spending, Used
+from panolog.orchestrator.runs.money.spending import PaidMachine, Spending, Used
 from panolog.orchestrator.runs.state import RunState
 
 
@@ -91,14 +91,14 @@ def hours(seconds: float) -> str:
 
 
 def _kinds(money: Spending) -> tuple[MachineKindView, ...]:
-    kinds = defaultdict[tuple[str, float | None], list[Machine]](list)
+    kinds = defaultdict[tuple[str, float | None], list[PaidMachine]](list)
     for machine in money.machines.values():
         kinds[machine.reserved_as.kind, machine.reserved_as.price].append(machine)
     views = [_kind(kind, price, machines) for (kind, price), machines in kinds.items()]
     return tuple(sorted(views, key=lambda view: (-view.used.seconds, view.kind)))
 
 
-def _kind(kind: str, price: float | None, machines: list[Machine]) -> MachineKindView:
+def _kind(kind: str, price: float | None, machines: list[PaidMachine]) -> MachineKindView:
     def total(name: Literal["used", "idle", "lost"]) -> UsedView:
         return _used(sum((getattr(machine, name) for machine in machines), Used()), priced=price is not None)
 

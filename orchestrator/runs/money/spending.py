@@ -51,7 +51,7 @@ class Used:
 
 
 @dataclass(frozen=True)
-class Machine:
+class PaidMachine:
     """One machine, as `NodeReserved` has described it last."""
 
     reserved_as: NodeReserved
@@ -63,7 +63,7 @@ class Machine:
     tasks: int = 0  # that run there
     shared: float = 0.0  # seconds with tasks, each divided by how many there were
 
-    def until(self, time: float) -> "Machine":
+    def until(self, time: float) -> "PaidMachine":
         """The same, counted up to a time. An earlier one than before changes nothing."""
         seconds = time - self.at
         if not self.open or seconds <= 0:
@@ -95,7 +95,7 @@ class _Share:
 class Spending:
     """All machines of a run by Node.id, and the limits of what it may cost."""
 
-    machines: Mapping[str, Machine] = field(default_factory=dict)
+    machines: Mapping[str, PaidMachine] = field(default_factory=dict)
     running: Mapping[TaskId, _Share] = field(default_factory=dict)
     budget: BudgetSet | None = None  # the latest
     since: float | None = None  # seconds since the epoch at which that was set
@@ -160,7 +160,7 @@ def spend(spending: Spending, stored: Stored) -> Spending:
     match record:
         case NodeReserved():
             known = spending.machines.get(record.node)
-            new = Machine(record, time)
+            new = PaidMachine(record, time)
             if known is not None:
                 new = replace(known.until(time), reserved_as=record, at=max(time, known.at), open=True)
             return _with(spending, record.node, new)
@@ -192,11 +192,11 @@ def _sum(parts: Iterable[Used]) -> Used:
     return sum(parts, Used())
 
 
-def _with(spending: Spending, node: str, machine: Machine) -> Spending:
+def _with(spending: Spending, node: str, machine: PaidMachine) -> Spending:
     return replace(spending, machines={**spending.machines, node: machine})
 
 
-def _closed(machine: Machine, time: float) -> Machine:
+def _closed(machine: PaidMachine, time: float) -> PaidMachine:
     return replace(machine.until(time), open=False)
 
 

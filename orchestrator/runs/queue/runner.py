@@ -29,7 +29,7 @@ from panolog.orchestrator.runs.folder import RunFolder, command_line
 from panolog.orchestrator.runs.machines.children import bound_to_parent, signals_blocked
 from panolog.orchestrator.runs.queue.entries import Entry, Share, State
 from panolog.orchestrator.runs.queue.processes import Processes
-from panolog.orchestrator.runs.queue.shares import Machine, NeverFitsError, environment
+from panolog.orchestrator.runs.queue.shares import Capacity, NeverFitsError, environment
 from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.runs.records import Outcome
 from panolog.orchestrator.runs.state import RunState, replay
@@ -56,7 +56,7 @@ class Limits:
     forever: bool = False  # wait for new entries when none is left
     program: tuple[str, ...] = PROGRAM  # that takes the words of an entry
     processes: Processes = field(default_factory=Processes)
-    machine: Machine = field(default_factory=Machine.own)
+    machine: Capacity = field(default_factory=Capacity.own)
 
 
 @contextmanager

@@ -26,7 +26,7 @@ class NeverFitsError(Exception):
 
 
 @dataclass(frozen=True)
-class Machine:
+class Capacity:
     """All that there is to share."""
 
     gpus: tuple[str, ...]  # as CUDA_VISIBLE_DEVICES calls them; () if none are known
@@ -34,10 +34,10 @@ class Machine:
     memory: int  # bytes
 
     @staticmethod
-    def own() -> "Machine":
+    def own() -> "Capacity":
         """What this process may use. Raises ConfigError if PANOLOG_MEMORY is no number."""
         cores = sorted(os.sched_getaffinity(0))[: machine.cores()]
-        return Machine(gpus_to_share(), tuple(cores), machine.memory_total())
+        return Capacity(gpus_to_share(), tuple(cores), machine.memory_total())
 
     def wanted(self, entry: Entry, at_once: int) -> Needs | None:
         """What an entry is to get: as stated, else an even part, but memory for the largest task that its
@@ -83,7 +83,7 @@ class Machine:
         )
 
 
-def environment(share: Share | None, whole: Machine) -> dict[str, str]:
+def environment(share: Share | None, whole: Capacity) -> dict[str, str]:
     """The variables that limit a run to its share, and say what it pays.
 
     Its cores are the affinity of its process.

@@ -16,7 +16,7 @@ from panolog.orchestrator.runs.storage.fetch import bring
 from panolog.orchestrator.runs.storage.layout import Manifest, current
 from panolog.orchestrator.runs.storage.lease import Lease, take
 from panolog.orchestrator.runs.storage.mirror import Mirror
-from panolog.orchestrator.runs.storage.plan import Plan, plan_from_json
+from panolog.orchestrator.runs.storage.plan import MirrorPlan, plan_from_json
 from panolog.orchestrator.runs.units import gib
 from panolog.scene.errors import (
     InputError,
@@ -57,7 +57,7 @@ def main() -> None:
     _follow(plan, Mirror(RunFolder(plan.root), store, lease, manifest), lease, ended, stop)
 
 
-def _begun(plan: Plan) -> tuple[Store, Lease, Manifest | None]:
+def _begun(plan: MirrorPlan) -> tuple[Store, Lease, Manifest | None]:
     """Takes the lease, and brings the run if it is to be resumed. Raises PanologError."""
     folder, store = RunFolder(plan.root), open_store(plan.url, _PATIENCE_S)
     lease = take(store, plan.root, force=plan.force, again=plan.again)
@@ -76,7 +76,9 @@ def _begun(plan: Plan) -> tuple[Store, Lease, Manifest | None]:
     return store, lease, manifest
 
 
-def _follow(plan: Plan, mirror: Mirror, lease: Lease, ended: threading.Event, stop: threading.Event) -> None:
+def _follow(
+    plan: MirrorPlan, mirror: Mirror, lease: Lease, ended: threading.Event, stop: threading.Event
+) -> None:
     """Mirrors the run, and says what is left."""
     folder = RunFolder(plan.root)
     mirror.follow(ended, stop, plan.period, plan.patience)

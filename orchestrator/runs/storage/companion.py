@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from panolog.orchestrator.runs.machines.children import ENDS, Companion, start_companion
-from panolog.orchestrator.runs.storage.plan import Plan, to_json
+from panolog.orchestrator.runs.storage.plan import MirrorPlan, to_json
 from panolog.scene.errors import RunError, StoreError
 
 _AGAIN_S, _LONGEST_S = 10.0, 600.0  # before a mirror that was killed is started again: first, at most
@@ -20,7 +20,7 @@ Say = Callable[[str], None]
 
 
 @contextmanager
-def mirrored(plan: Plan | None, say: Say) -> Iterator[None]:
+def mirrored(plan: MirrorPlan | None, say: Say) -> Iterator[None]:
     """Mirrors a run while the context lasts, then until the store has all of it. The run never waits for it.
 
     The context begins when the run is this command's, and on this machine if it is to be resumed. A mirror
@@ -46,7 +46,7 @@ def mirrored(plan: Plan | None, say: Say) -> Iterator[None]:
 class _Keeper:
     """Keeps the process of a mirror alive."""
 
-    def __init__(self, plan: Plan, say: Say) -> None:
+    def __init__(self, plan: MirrorPlan, say: Say) -> None:
         self._plan, self._say = plan, say
         self._left = ""
         self._ended = threading.Event()
@@ -130,7 +130,7 @@ class _Keeper:
                 yield json.loads(line)
 
 
-def _started(plan: Plan, *, again: bool = False) -> Companion:
+def _started(plan: MirrorPlan, *, again: bool = False) -> Companion:
     """The process of a mirror. Args: again, in place of one that was killed."""
     if again:
         plan = replace(plan, again=True, force=False)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.storage.layout import INFO, Entry, Manifest, current, digest_of
+from panolog.orchestrator.runs.storage.layout import INFO, Manifest, StoredFile, current, digest_of
 from panolog.orchestrator.runs.storage.lease import holder
 from panolog.orchestrator.runs.storage.state import MirrorState, read_state, write_state
 from panolog.scene.errors import RunFolderError, StoreError
@@ -63,7 +63,7 @@ def bring(store: Store, folder: RunFolder, manifest: Manifest | None, say: Say) 
     fetch_files(store, folder.root, {INFO: manifest.files[INFO]})
 
 
-def fetch_files(store: Store, root: Path, files: dict[str, Entry]) -> None:
+def fetch_files(store: Store, root: Path, files: dict[str, StoredFile]) -> None:
     """Writes files of a run, each atomically and checked. Raises StoreError if one is damaged or gone."""
     with ThreadPoolExecutor(_THREADS, "fetch") as threads:
         for work in [threads.submit(_fetch_one, store, root / name, it) for name, it in files.items()]:
@@ -117,7 +117,7 @@ def for_export(name: str) -> bool:
     )
 
 
-def _fetch_one(store: Store, path: Path, entry: Entry) -> None:
+def _fetch_one(store: Store, path: Path, entry: StoredFile) -> None:
     if path.is_file() and path.stat().st_size == entry.size and digest_of(path) == entry.sha256:
         return
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -40,7 +40,7 @@ _WORK = (*_MADE, "prepare", "follower", DATABASE)  # what a run needs only to be
 
 
 @dataclass(frozen=True)
-class Entry:
+class StoredFile:
     """One file of a run."""
 
     key: str  # of its object, below the URL
@@ -54,7 +54,7 @@ class Manifest:
     """A run at one moment."""
 
     name: str  # of the manifest's own object
-    files: Mapping[str, Entry]  # by their names in the run folder
+    files: Mapping[str, StoredFile]  # by their names in the run folder
 
     @property
     def time(self) -> float:
@@ -153,7 +153,7 @@ def _unpacked(store: Store, name: str, packed: bytes) -> Manifest:
     unpack = zlib.decompressobj()
     try:
         content = _parsed(store, name, unpack.decompress(packed, _MOST))
-        files = {str(file): Entry(**fields) for file, fields in content["files"].items()}
+        files = {str(file): StoredFile(**fields) for file, fields in content["files"].items()}
     except (zlib.error, KeyError, TypeError, AttributeError) as error:
         raise StoreError(f"{store.url}/{name}: is no manifest of this PanoLOG ({error!r})") from error
     for file in files:

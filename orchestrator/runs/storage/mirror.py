@@ -28,8 +28,8 @@ from panolog.orchestrator.runs.storage.layout import (
     MANIFESTS,
     OBJECTS,
     POINTERS,
-    Entry,
     Manifest,
+    StoredFile,
     digest_of,
     is_result,
     is_work,
@@ -56,8 +56,8 @@ class Mirror:
 
     def __init__(self, folder: RunFolder, store: Store, lease: Lease, known: Manifest | None) -> None:
         self._folder, self._store, self._lease = folder, store, lease
-        self._files: dict[str, Entry] = dict(known.files) if known else {}  # that the pointer names
-        self._stored: dict[str, tuple[Stamp, Entry]] = {}  # what is in the store of the files as they are now
+        self._files: dict[str, StoredFile] = dict(known.files) if known else {}  # that the pointer names
+        self._stored: dict[str, tuple[Stamp, StoredFile]] = {}  # as they are now
         self._state = MirrorState(str(store.url), published=known.name if known else "")
         self._lock = threading.Lock()  # of `_state`
         self._pause = 0.0  # seconds before the next round, at least
@@ -160,7 +160,7 @@ class Mirror:
             found[INFO] = info
         return found
 
-    def _send(self, present: dict[str, Stamp]) -> dict[str, Entry]:
+    def _send(self, present: dict[str, Stamp]) -> dict[str, StoredFile]:
         """Stores those of the files that have changed. Returns what is in the store of all of them.
 
         Raises the first error after what could be stored is.
@@ -209,11 +209,11 @@ class Mirror:
             shutil.copy2(path, held)
         return True
 
-    def _put(self, path: Path, name: str, known: Entry | None) -> Entry:
+    def _put(self, path: Path, name: str, known: StoredFile | None) -> StoredFile:
         """Stores a file that does not change as a new object, unless a known one has the same bytes."""
         status = path.stat()
         key = f"{OBJECTS}/{name}/{time.time_ns():x}-{secrets.token_hex(4)}"
-        entry = Entry(key, status.st_size, digest_of(path), status.st_mtime_ns)
+        entry = StoredFile(key, status.st_size, digest_of(path), status.st_mtime_ns)
         if known is not None and (known.size, known.sha256) == (entry.size, entry.sha256):
             return known
         self._note(key)
@@ -228,7 +228,7 @@ class Mirror:
             source.backup(target)
         return copy
 
-    def _publish(self, files: dict[str, Entry], moment: float) -> None:
+    def _publish(self, files: dict[str, StoredFile], moment: float) -> None:
         """Makes these files the run, for all who read the store."""
         if files == self._files:
             return
@@ -243,7 +243,7 @@ class Mirror:
         self._files = files
         self._say(published=manifest.name, since=moment)
 
-    def _copy_results(self, files: dict[str, Entry]) -> None:
+    def _copy_results(self, files: dict[str, StoredFile]) -> None:
         """Copies the results of a run that has a model to their own names in the store, for people."""
         for name, entry in files.items():
             if is_result(name) and entry.key != name:  # as an earlier version has stored it

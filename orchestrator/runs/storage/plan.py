@@ -21,7 +21,7 @@ _NUMBER = "a number above 0"
 
 
 @dataclass(frozen=True)
-class Plan:
+class MirrorPlan:
     """What a mirror is to do."""
 
     root: Path  # the local folder
@@ -37,7 +37,7 @@ class Plan:
 
 def plan_of(
     run: str, local: Path | None, environment: Mapping[str, str], *, resumes: bool, force: bool = False
-) -> Plan | None:
+) -> MirrorPlan | None:
     """The plan for a run that the command line names; None if it is a folder that is in no store.
 
     Args: run, a URL, or a folder whose mirror has noted its URL; local, the folder that `--local` names.
@@ -60,7 +60,7 @@ def plan_of(
     require_package(url)
     period = positive(PERIOD, environment, _PERIOD_S, _NUMBER)
     patience = 60 * positive(PATIENCE, environment, _PATIENCE_MIN, _NUMBER)
-    return Plan(root, str(url), resumes, force, period=period, patience=patience)
+    return MirrorPlan(root, str(url), resumes, force, period=period, patience=patience)
 
 
 def local_folder(url: str, environment: Mapping[str, str]) -> Path:
@@ -69,15 +69,15 @@ def local_folder(url: str, environment: Mapping[str, str]) -> Path:
     return cache_folder(environment).with_name("runs") / name
 
 
-def to_json(plan: Plan) -> str:
+def to_json(plan: MirrorPlan) -> str:
     """A plan in one line."""
     return json.dumps({**vars(plan), "root": str(plan.root)})
 
 
-def plan_from_json(text: str) -> Plan:
+def plan_from_json(text: str) -> MirrorPlan:
     """The plan of a line of `to_json`."""
     content = json.loads(text)
-    return Plan(**content | {"root": Path(content["root"])})
+    return MirrorPlan(**content | {"root": Path(content["root"])})
 
 
 def shown(root: Path) -> str:

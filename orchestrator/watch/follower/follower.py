@@ -12,7 +12,7 @@ from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.watch.follower.board import Board
 from panolog.orchestrator.watch.follower.couriers import Courier
 from panolog.orchestrator.watch.follower.loggers import Logger
-from panolog.orchestrator.watch.follower.plan import Plan, SinkChoice
+from panolog.orchestrator.watch.follower.plan import FollowerPlan, SinkChoice
 from panolog.orchestrator.watch.follower.sinks.interface import Sink
 from panolog.orchestrator.watch.follower.watcher import Watcher
 
@@ -25,7 +25,7 @@ _ORPHAN_S = 60.0  # that a driver without its supervisor gets to write its last 
 class Follower:
     """Follows one run. Args: parent, the process whose end is the end of the run's command."""
 
-    def __init__(self, root: Path, parent: int, plan: Plan) -> None:
+    def __init__(self, root: Path, parent: int, plan: FollowerPlan) -> None:
         self._folder, self._parent = RunFolder(root), parent
         self._watcher = Watcher(self._folder, plan.stalled)
         self._board = Board()

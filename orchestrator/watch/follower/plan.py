@@ -31,7 +31,7 @@ class SinkChoice:
 
 
 @dataclass(frozen=True)
-class Plan:
+class FollowerPlan:
     """Whom a follower serves."""
 
     targets: tuple[Target, ...] = ()
@@ -45,7 +45,7 @@ class Plan:
 
 def read_plan(
     notify: Sequence[str], log: Sequence[str], environment: Mapping[str, str]
-) -> tuple[Plan, set[str]]:
+) -> tuple[FollowerPlan, set[str]]:
     """The plan of a command line, and the variables that held secrets: no other process should get these.
 
     Args: notify, log, values of the options. Raises ConfigError for what is wrong with them.
@@ -53,7 +53,7 @@ def read_plan(
     references = References(environment)
     targets = read_targets(notify, references)
     choices = _once([_sink(text, environment) for text in log])
-    return Plan(targets, choices, _stalled(environment)), references.used
+    return FollowerPlan(targets, choices, _stalled(environment)), references.used
 
 
 def words_elsewhere(notify: Sequence[str], log: Sequence[str]) -> list[str]:
@@ -75,18 +75,18 @@ def words_elsewhere(notify: Sequence[str], log: Sequence[str]) -> list[str]:
     ]
 
 
-def to_json(plan: Plan, root: Path) -> str:
+def to_json(plan: FollowerPlan, root: Path) -> str:
     """A plan for the follower of the run at `root`, in one line."""
     return json.dumps({"root": str(root.absolute()), "parent": os.getpid(), "plan": asdict(plan)})
 
 
-def from_json(text: str) -> tuple[Path, int, Plan]:
+def from_json(text: str) -> tuple[Path, int, FollowerPlan]:
     """The run folder, the process that it belongs to, and the plan."""
     content = json.loads(text)
     plan = content["plan"]
     targets = tuple(Target(**fields) for fields in plan["targets"])
     sinks = tuple(SinkChoice(**fields) for fields in plan["sinks"])
-    return Path(content["root"]), content["parent"], Plan(targets, sinks, plan["stalled"])
+    return Path(content["root"]), content["parent"], FollowerPlan(targets, sinks, plan["stalled"])
 
 
 def _once(choices: Sequence[SinkChoice]) -> tuple[SinkChoice, ...]:

@@ -12,7 +12,7 @@ import pytest
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines.machine import memory, memory_total, memory_usage
 from panolog.orchestrator.runs.queue.entries import Command, Entry, Needs, Share, State
-from panolog.orchestrator.runs.queue.shares import Machine, NeverFitsError, describe, environment
+from panolog.orchestrator.runs.queue.shares import Capacity, NeverFitsError, describe, environment
 from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.runs.queue.view import view_queue
 from panolog.scene.errors import ConfigError
@@ -22,8 +22,8 @@ from tests.orchestrator.runs.queue.test_runner import ended
 from tests.ray_head import wait_until
 
 GIB = 2**30
-FOUR = Machine(("GPU-a", "GPU-b", "GPU-c", "GPU-d"), tuple(range(16)), 100 * GIB)
-BARE = Machine((), (0, 1), 20 * GIB)
+FOUR = Capacity(("GPU-a", "GPU-b", "GPU-c", "GPU-d"), tuple(range(16)), 100 * GIB)
+BARE = Capacity((), (0, 1), 20 * GIB)
 
 
 def entry(needs: Needs | None = ANY, run: Path = Path("/run")) -> Entry:
@@ -45,7 +45,7 @@ def entry(needs: Needs | None = ANY, run: Path = Path("/run")) -> Entry:
     ],
 )
 def test_what_is_not_stated_is_an_even_part(
-    machine: Machine, needs: Needs | None, at_once: int, wanted: Needs | None
+    machine: Capacity, needs: Needs | None, at_once: int, wanted: Needs | None
 ) -> None:
     assert machine.wanted(entry(needs), at_once) == wanted
 
@@ -68,7 +68,7 @@ def test_memory_that_a_preflight_has_foreseen_counts(tmp_path: Path) -> None:
         (FOUR, Needs(memory=101 * GIB), "needs 101.0 GiB of memory; this machine has 100.0 GiB"),
     ],
 )
-def test_more_than_the_machine_has_never_fits(machine: Machine, needs: Needs, line: str) -> None:
+def test_more_than_the_machine_has_never_fits(machine: Capacity, needs: Needs, line: str) -> None:
     for at_once in (1, 2):
         with pytest.raises(NeverFitsError, match=line):
             machine.wanted(entry(needs), at_once)

@@ -12,7 +12,7 @@ from panolog.orchestrator.runs.machines.children import Companion
 from panolog.orchestrator.runs.storage import companion
 from panolog.orchestrator.runs.storage.companion import mirrored
 from panolog.orchestrator.runs.storage.lease import take
-from panolog.orchestrator.runs.storage.plan import Plan
+from panolog.orchestrator.runs.storage.plan import MirrorPlan
 from panolog.scene.errors import RunError
 from panolog.scene.stores.store import open_store
 from tests.orchestrator.runs.storage.stored_runs import Driver, fetched
@@ -21,8 +21,10 @@ from tests.ray_head import living, wait_until
 pytestmark = pytest.mark.system
 
 
-def plan_of(tmp_path: Path) -> Plan:
-    return Plan(tmp_path / "run", f"file://{tmp_path}/store", resumes=False, period=0.05, patience=300.0)
+def plan_of(tmp_path: Path) -> MirrorPlan:
+    return MirrorPlan(
+        tmp_path / "run", f"file://{tmp_path}/store", resumes=False, period=0.05, patience=300.0
+    )
 
 
 def blocked(path: Path) -> set[int]:

@@ -19,8 +19,8 @@ from panolog.orchestrator.runs.storage.layout import (
     MANIFESTS,
     OBJECTS,
     POINTERS,
-    Entry,
     Manifest,
+    StoredFile,
     current,
     mirrored,
     put_pointer,
@@ -258,7 +258,7 @@ def test_a_damaged_store_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["../x", "/x", "control/stop", "lock"])
 def test_a_manifest_that_names_what_is_no_file_of_a_run_is_refused(tmp_path: Path, name: str) -> None:
     store = open_store(f"file://{tmp_path}/store")
-    manifest = Manifest(f"{MANIFESTS}/x", {name: Entry("k", 1, "0", 0)})
+    manifest = Manifest(f"{MANIFESTS}/x", {name: StoredFile("k", 1, "0", 0)})
     store.write(manifest.name, manifest.pack())
     put_pointer(store, 1, manifest, manifest.pack())
     with pytest.raises(StoreError, match="no file of a run"):

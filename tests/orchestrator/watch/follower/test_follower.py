@@ -14,7 +14,7 @@ import pytest
 from panolog.orchestrator.cli.session.companion import companion_follower
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.watch.follower.follower import Follower
-from panolog.orchestrator.watch.follower.plan import Plan, SinkChoice
+from panolog.orchestrator.watch.follower.plan import FollowerPlan, SinkChoice
 from panolog.orchestrator.watch.follower.targets import Target
 from panolog.orchestrator.watch.follower.watcher import Watcher
 from tests.orchestrator.watch.follower import histories
@@ -54,8 +54,8 @@ with lock.hold(root / "lock"):
 """
 
 
-def plan_of(server: Receiver, *more: Target) -> Plan:
-    return Plan((Target("webhook", "hook", f"{server.url}/x", secret="s"), *more))
+def plan_of(server: Receiver, *more: Target) -> FollowerPlan:
+    return FollowerPlan((Target("webhook", "hook", f"{server.url}/x", secret="s"), *more))
 
 
 def follower_of(parent: int) -> psutil.Process:
@@ -181,7 +181,7 @@ def test_a_target_that_hangs_neither_holds_up_the_others_nor_the_run_for_ever(
     folder, ended = histories.write(tmp_path / "run"), threading.Event()
     ended.set()
     with receiver(hangs=True) as hung:
-        plan = Plan((Target("webhook", "hung", hung.url),))
+        plan = FollowerPlan((Target("webhook", "hung", hung.url),))
         Follower(folder.root, os.getppid(), plan).follow(ended)
         assert not hung.hang.is_set()  # its end was not waited for
         hung.hang.set()
@@ -232,7 +232,7 @@ def test_an_error_that_nothing_foresees_ends_one_thread_alone(
     folder, ended = histories.write(tmp_path / "run"), threading.Event()
     ended.set()
     with receiver() as server:
-        plan = Plan(plan_of(server).targets, (SinkChoice("tensorboard"),))
+        plan = FollowerPlan(plan_of(server).targets, (SinkChoice("tensorboard"),))
         problems = Follower(folder.root, os.getppid(), plan).follow(ended)
     assert problems == ["log tensorboard: internal error: ValueError"]
     assert server.texts == ["run.done"]

@@ -82,7 +82,7 @@ def counts(state: RunState, record: Record) -> Iterator[MetricSample]:
             yield MetricSample(metric, str(record.task), state.task(record.task).node, value)
 
 
-class Telemetry:
+class RunMetrics:
     """Exports the metrics of one run. Needs Ray to be initialised."""
 
     def __init__(self, run: Path) -> None:

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.engine.cluster import telemetry
-from panolog.orchestrator.engine.cluster.telemetry import COUNTERS, GAUGES, TAGS, Telemetry, counts, gauges
+from panolog.orchestrator.engine.cluster import run_metrics
+from panolog.orchestrator.engine.cluster.run_metrics import COUNTERS, GAUGES, TAGS, RunMetrics, counts, gauges
 from panolog.orchestrator.runs.records import (
     ModelSaved,
     Noticed,
@@ -85,11 +85,11 @@ def test_gauges_are_told_again_and_counters_once(monkeypatch: pytest.MonkeyPatch
     def make(name: str, description: str, tag_keys: tuple[str, ...]) -> Fake:
         return made.setdefault(name, Fake(name, description, tag_keys))
 
-    monkeypatch.setattr(telemetry, "Gauge", make)
-    monkeypatch.setattr(telemetry, "Counter", make)
+    monkeypatch.setattr(run_metrics, "Gauge", make)
+    monkeypatch.setattr(run_metrics, "Counter", make)
     clock = iter((0.0, 1.0, 5.0, 6.0, 20.0))
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
-    exporter = Telemetry(Path("/runs/日"))
+    exporter = RunMetrics(Path("/runs/日"))
     assert set(made) == set(GAUGES) | set(COUNTERS)
     state, news = after(STARTED, PROGRESS, Transferred(BLOCK, 2, 3))
     exporter.show(state, news)
