@@ -1,49 +1,15 @@
 """pytest and compute-sanitizer as steps: what they did is known whatever ends them."""
 
-import sys
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 
-from benchmarks.first_hour import sanitizer, suites, supervise
-from benchmarks.first_hour.outcome import ROOT, Context, Outcome
+from benchmarks.first_hour import sanitizer, suites
+from benchmarks.first_hour.outcome import Context, Outcome
 
-CRASHES = """
-import os, pytest
-def test(): pass
-def test_crash(): os.abort()
-def test_crash_not(): pass
-@pytest.mark.parametrize("name", ["with a space"])
-def test_after(name): pass
-"""
 LOG = """
 some_tests.py::test_before PASSED [ 33%]
 some_tests.py::test_without_a_card SKIPPED (no card) [ 66%]
 some_tests.py::test_hangs """
 CARD, REHEARSAL = (Context("tests", "", device, 60) for device in ("cuda", "cpu"))
-
-
-def test_a_test_that_ends_the_process_is_named_and_the_others_run(
-    tmp_path: Path, fake: Callable[[str], None]
-) -> None:
-    (tmp_path / "some_tests.py").write_text(CRASHES)
-    (tmp_path / "more_tests.py").write_text("import a_package_that_is_missing")
-    options = ["-vv", "-o", "junit_family=xunit1", "-p", "no:cacheprovider", "some_tests.py", "more_tests.py"]
-    fake(
-        "from benchmarks.first_hour import outcome, suites\n"
-        f"outcome.ROOT = {str(tmp_path)!r}\n"
-        f"os.environ['PYTHONPATH'] += {f':{ROOT}'!r}\n"
-        f"suites.PYTEST = {[sys.executable, '-m', 'pytest', *options]}\n"
-        "context.save(suites.tests(context))"
-    )
-    outcome = supervise.run(Context("tests", str(tmp_path), "cuda", 600), lambda *_: None).outcome
-    assert (outcome.ending, outcome.figure) == ("failed", "3 passed, 1 failed")
-    assert outcome.reason == "1 fail; 1 files were not collected, without a_package_that_is_missing"
-    assert outcome.content["failed"] == {
-        "some_tests.py::test_crash": "the process ended or was stopped in it"
-    }
-    assert "some_tests.py::test_after[with a space]" in outcome.content["passed"]
 
 
 def test_a_test_that_hangs_is_named() -> None:

@@ -6,9 +6,8 @@ import numpy as np
 import torch
 
 import panolog
-from benchmarks.paper.crops import best_windows
 from benchmarks.paper.measure import Gallery, haze
-from benchmarks.paper.snapshots import State, _assembled, _even, kept, look
+from benchmarks.paper.snapshots import State, _assembled
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.partition.cells import Grid
 from panolog.scene.gaussians import Gaussians, concatenate
@@ -16,8 +15,8 @@ from panolog.scene.ply import write_ply
 from panolog.scene.read import read_scene
 from panolog.workers.events import Checkpoint
 from panolog.workers.merge import retained
-from panolog.workers.tasks import COARSE, TaskId
-from panolog.workers.training.checkpoint import name_of, save
+from panolog.workers.tasks import TaskId
+from panolog.workers.training.checkpoint import save
 from panolog.workers.training.initialise import isotropic, near_distance
 from panolog.workers.training.optimizer import ModelState
 from tests.partition.test_plan import CENTERS, planned
@@ -34,21 +33,6 @@ def gaussians(count: int, sky: int, opacity: float = 0.5, seed: int = 0) -> Gaus
 
 def checkpoint(path: Path, task: TaskId, iteration: int, model: Gaussians) -> None:
     save(path, Checkpoint(task, iteration, ModelState.start(model).tensors()))
-
-
-def test_each_checkpoint_is_kept_once_and_not_copied(tmp_path: Path) -> None:
-    root, folder = tmp_path / "run", tmp_path / "states"
-    path = root / "coarse" / "checkpoint.safetensors"
-    path.parent.mkdir(parents=True)
-    with kept(root, folder):
-        checkpoint(path, COARSE, 10, gaussians(5, 0))
-        look(root, folder)
-        inode = path.stat().st_ino
-        look(root, folder)
-        checkpoint(path, COARSE, 20, gaussians(6, 0))
-    path.unlink()
-    assert sorted(name_of(file)[1] for file in folder.iterdir()) == [10, 20]
-    assert inode in [file.stat().st_ino for file in folder.iterdir()]
 
 
 def test_a_state_is_what_a_merge_would_give(tmp_path: Path) -> None:
@@ -70,12 +54,6 @@ def test_a_state_is_what_a_merge_would_give(tmp_path: Path) -> None:
     assert torch.equal(both.means[180:], coarse.means[180:])
 
 
-def test_states_are_chosen_evenly_with_the_last() -> None:
-    assert _even(3) == [0, 1, 2]
-    chosen = _even(100)
-    assert (len(chosen), chosen[-1]) == (16, 99)
-
-
 def test_haze_is_the_share_that_hardly_shows() -> None:
     clear, veil = gaussians(30, 0), gaussians(10, 0, opacity=0.01)
     assert haze(concatenate(clear, veil)) == 0.25
@@ -87,12 +65,3 @@ def test_states_are_measured_as_the_whole_run_is(tmp_path: Path) -> None:
     found = Gallery(scene, 64, near_distance(scene, RunConfig())).quality(model)
     whole = panolog.evaluate(model, scene, width=64)["mean"]
     assert all(found[name] == whole[name] for name in ("psnr", "ssim", "ws_psnr", "ws_ssim"))
-
-
-def test_crops_show_where_variants_differ() -> None:
-    errors = np.zeros((2, 32, 64), np.float32)
-    errors[0, 8:16, 40:48] = 50
-    errors[1, 20:28, 4:12] = 80
-    errors[:, 0:8, 0:8] = 200  # bad for both: no difference
-    found = [window for window in best_windows(errors, 8, 3) if window[0] > 1]
-    assert [(top, left) for _, top, left in found] == [(20, 4), (8, 40)]
