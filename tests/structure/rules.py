@@ -156,6 +156,15 @@ def durations() -> Iterator[str]:
             yield f"{path}: has tests of a system, and no entry in tests/durations.json"
 
 
+def mutants() -> Iterator[str]:
+    """Entries of tests/mutants.json whose text is not once in their file, or whose tests are nowhere."""
+    for mutant in json.loads(text(Path("tests/mutants.json"))):
+        for file in [it for it in (mutant["file"], *mutant["tests"]) if not (ROOT / it).exists()]:
+            yield f"tests/mutants.json: {mutant['why']}: there is no {file}"
+        if (ROOT / mutant["file"]).exists() and text(Path(mutant["file"])).count(mutant["old"]) != 1:
+            yield f"tests/mutants.json: {mutant['why']}: {mutant['file']} has not once {mutant['old']!r}"
+
+
 def _marks(file: Path) -> Iterator[set[str]]:
     """The markers of each test of a file; those of a parameter alone do not count."""
     tree = ast.parse(text(file))
@@ -196,5 +205,6 @@ RULES: tuple[Callable[[], Iterator[str]], ...] = (
     import_circles,
     tests_of_benchmarks,
     durations,
+    mutants,
     dialect,
 )
