@@ -57,8 +57,8 @@ def test_a_position_that_is_not_finite_stops_the_cut() -> None:
 
 
 def test_merge_has_each_gaussian_once_and_sky_last(tmp_path: Path) -> None:
-    whole = replace(model(300, 40), exact=True)
-    coarse = saved(tmp_path / "coarse.ply", whole)
+    whole, coarse = replace(model(300, 40), exact=True), tmp_path / "coarse.ply"
+    write_ply(coarse, whole, offset=(1.0, 2.0, 3.5))
     assert merge(files(tmp_path, whole), coarse, tmp_path / "all.ply") == 300
     merged = read_ply(tmp_path / "all.ply")
     assert merged.sky == 40 and merged.exact
@@ -67,7 +67,7 @@ def test_merge_has_each_gaussian_once_and_sky_last(tmp_path: Path) -> None:
     together = np.concatenate([part.means.numpy() for part in parts])
     assert len(together) == 260 == len(np.unique(together, axis=0))
     parts.append(whole.select(torch.arange(300) >= 260))
-    write_ply_parts(tmp_path / "expected.ply", parts, count=300, sky=40, exact=True)
+    write_ply_parts(tmp_path / "expected.ply", parts, count=300, sky=40, exact=True, offset=(1.0, 2.0, 3.5))
     assert (tmp_path / "all.ply").read_bytes() == (tmp_path / "expected.ply").read_bytes()
 
 
