@@ -118,12 +118,7 @@ def test_poses_of_a_file_are_in_the_coordinates_of_the_model(
         center = near.panoramas[0].center + place
         poses.write_text("0 " + " ".join(map(repr, center.tolist())) + " 0 0 0 1\n")
         (path,) = render_views(
-            tmp_path / f"{name}.ply",
-            tmp_path / name,
-            ViewSpec(WIDTH),
-            poses=poses,
-            frames=None,
-            device="cpu",
+            tmp_path / f"{name}.ply", tmp_path / name, ViewSpec(WIDTH), poses=poses, frames=None, device="cpu"
         )
         found[name] = decode_panorama(path)
     assert found["near"].std() > 1

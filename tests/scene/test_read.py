@@ -219,10 +219,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "one to train": (lambda r: (r / "train.txt").write_text("pano_3"), "train split has 1 panoramas"),
     "split not UTF-8": (lambda r: (r / "train.txt").write_bytes(b"pano_\xff"), "train.txt: is not UTF-8"),
     "8 bit depth": (lambda r: add(r, "depths", "pano_1.png", GREY), "8 bits .* with 16 bits"),
-    "colour depth": (
-        lambda r: add(r, "depths", "pano_1.png", np.zeros((8, 16, 3), np.uint16)),
-        "3 channels",
-    ),
+    "colour depth": (lambda r: add(r, "depths", "pano_1.png", np.zeros((8, 16, 3), np.uint16)), "3 channels"),
     "16 bit mask": (
         lambda r: add(r, "masks", "pano_1.png", GREY.astype(np.uint16)),
         "16 bits .* with 8 bits",
