@@ -1,6 +1,5 @@
 """The image: hadolint checks its file, and the build context has all sources of the wheel."""
 
-import shutil
 import subprocess
 from fnmatch import fnmatch
 
@@ -35,16 +34,3 @@ def test_the_build_context_has_the_sources_of_the_wheel() -> None:
     assert copied
     for name in copied:
         assert any(fnmatch(name, pattern) or name.startswith(f"{pattern}/") for pattern in kept), name
-
-
-@pytest.mark.nightly  # most machines have no docker that builds
-def test_docker_itself_accepts_it() -> None:
-    if shutil.which("docker") is None:
-        pytest.skip("there is no docker on this machine")
-    if subprocess.run(
-        ["docker", "buildx", "inspect"], check=False, capture_output=True, timeout=60
-    ).returncode:
-        pytest.skip("docker cannot build on this machine: no daemon, or no buildx")
-    command = ["docker", "build", "--check", "--file", "deploy/Dockerfile", "."]
-    ended = subprocess.run(command, check=False, cwd=ROOT, capture_output=True, text=True)
-    assert ended.returncode == 0, ended.stderr
