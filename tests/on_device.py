@@ -12,10 +12,7 @@ from torch import Tensor
 
 from panolog.scene.images import Staged, Upload, View
 
-ON_A_CARD = (
-    pytest.mark.cuda,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA: no card"),
-)
+ON_A_CARD = (pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA: no card"))
 on_all_devices = pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=ON_A_CARD)])
 Test = TypeVar("Test", bound=Callable[..., None])
 

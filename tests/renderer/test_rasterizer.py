@@ -15,15 +15,7 @@ from panolog.renderer.motion import MOTION_SUMS
 from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians
 from tests.on_device import needs_a_card, on_all_devices
-from tests.renderer.agreement import (
-    IMAGES,
-    NEAR,
-    Truth,
-    certain,
-    check_definition,
-    random_weights,
-    truth_of,
-)
+from tests.renderer.agreement import IMAGES, NEAR, Truth, certain, check_definition, random_weights, truth_of
 from tests.renderer.hard_scenes import as_leaves, camera, cloud, placed, scenes, wide
 from tests.renderer.reference import render_reference, rows_of
 from tests.renderer.reference_rays import pixel_rays

@@ -75,12 +75,7 @@ def surrounded(scene: Gaussians, at: Camera, own: Tensor) -> tuple[Gaussians, Ba
 
 
 def check_against_cpu(
-    machine: Machine,
-    scene: Gaussians,
-    at: Camera,
-    degree: int,
-    keep: Tensor,
-    exterior: Baked | None = None,
+    machine: Machine, scene: Gaussians, at: Camera, degree: int, keep: Tensor, exterior: Baked | None = None
 ) -> None:
     given = arguments(scene, at, degree, exterior)
     truth, ours = ops.rasterize(**given), machine.run(launches.rasterize, **given)

@@ -93,9 +93,10 @@ OWN = {  # rows of those that train, of all rows by their distance
 }
 
 
-@pytest.mark.parametrize("own", OWN)
+@pytest.mark.parametrize(
+    ("width", "own"), [(64, "in the cell"), (64, "any"), (202, "in front of the cell"), (202, "any")]
+)
 @pytest.mark.parametrize(("name", "exact"), SCENES, ids=NAMES)
-@pytest.mark.parametrize("width", [64, 202])
 def test_an_exterior(name: str, exact: bool, width: int, own: str, machine: Machine) -> None:
     at = camera(width)
     scene = scenes(at, exact)[name]
