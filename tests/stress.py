@@ -1,11 +1,10 @@
 """`make stress`: the suite under load, in random order and on one core, and what has failed at least once.
 
-    python -m tests.stress [--variants load,random,core] [--rounds N] [--log FILE] [FILE ...]
+    python -m tests.stress [--variants load,random,core] [--rounds N] [FILE ...]
 
 A variant is `idle`, `load` (busy processes, memory that is written and files that are flushed), `random`
-(another order in each round) or `core` (all processes on one core), or several of them with `+`. Each line of
-the log has the start, the end, the variant, the load average at the end and the result. The exit code is 1 if
-anything has failed.
+(another order in each round) or `core` (all processes on one core), or several of them with `+`. The exit
+code is 1 if anything has failed.
 """
 
 import argparse
@@ -15,12 +14,10 @@ import subprocess
 import sys
 import tempfile
 import time
-import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from multiprocessing import get_context
-from pathlib import Path
 
 PARTS = ("idle", "load", "random", "core")
 _LONGEST_S = 3 * 3600  # after which load ends whatever happens
@@ -61,42 +58,27 @@ def load() -> Iterator[None]:
             process.join()
 
 
-def run(variant: str, seed: int, arguments: Sequence[str]) -> tuple[list[str], str]:
-    """Runs the tests once. Returns the names of those that failed, and a summary."""
-    parts = variant.split("+")
+def run(variant: str, seed: int, arguments: Sequence[str]) -> list[str]:
+    """Runs the tests once. Returns the names of those that failed, also in a fixture."""
+    parts, failed = variant.split("+"), list[str]()
     workers = os.environ.get("WORKERS", "3")
     command = [sys.executable, "-m", "pytest", "-m", "not nightly", f"--numprocesses={workers}"]
     command += ["--dist=loadfile", "--no-loadscope-reorder", *arguments]
     if "random" in parts:
         command.append(f"--shuffle={seed}")
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="stress-")))
         if "load" in parts:
             stack.enter_context(load())
         if "core" in parts:
             cores = os.sched_getaffinity(0)
             os.sched_setaffinity(0, {min(cores)})
             stack.callback(os.sched_setaffinity, 0, cores)
-        command.append(f"--junitxml={folder / 'results.xml'}")
-        ended = subprocess.run(command, check=False)
-        failed, summary = read(folder / "results.xml")
-    if ended.returncode and not failed:
-        failed = [f"pytest itself: exit code {ended.returncode}"]
-    return failed, summary
-
-
-def read(results: Path) -> tuple[list[str], str]:
-    """The names of the tests in a file of JUnit's format that failed, also in a fixture, and a summary."""
-    if not results.exists():
-        return [], "no results"
-    cases = [
-        (f"{it.get('classname')}::{it.get('name')}", {child.tag for child in it})
-        for it in ET.parse(results).iter("testcase")
-    ]
-    failed = sorted({name for name, tags in cases if tags & {"failure", "error"}})
-    skipped = sum("skipped" in tags for _, tags in cases)
-    passed = len({name for name, _ in cases}) - len(failed) - skipped
-    return failed, f"{len(failed)} failed, {passed} passed, {skipped} skipped"
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            for line in process.stdout or ():
+                print(line, end="", flush=True)
+                if line.startswith(("FAILED ", "ERROR ")):
+                    failed.append(line.split(" - ")[0].strip())
+    return failed or [f"pytest itself: exit code {process.returncode}"] * bool(process.returncode)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -104,7 +86,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser("tests.stress", description=__doc__.split("\n\n")[0])
     parser.add_argument("--variants", default="load,random,core", help=f"of {', '.join(PARTS)}; + combines")
     parser.add_argument("--rounds", type=int, default=1, help="runs of each variant")
-    parser.add_argument("--log", type=Path, help="append a line of a table in Markdown for each run")
     parser.add_argument("files", nargs="*", help="by default the whole suite")
     options = parser.parse_args(arguments)
     variants = options.variants.split(",")
@@ -112,17 +93,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--variants: {', '.join(sorted(unknown))}: must be of {', '.join(PARTS)}")
     found: dict[str, list[str]] = defaultdict(list)
     for seed, variant in itertools.product(range(options.rounds), variants):
-        began = time.strftime("%H:%M:%S")
-        failed, summary = run(variant, seed, options.files)
-        for test in failed:
+        for test in run(variant, seed, options.files):
             found[test].append(variant)
-        row = (began, time.strftime("%H:%M:%S"), variant, f"{os.getloadavg()[2]:.1f}", summary)
-        print(line := f"| {' | '.join(row)} |", flush=True)
-        if options.log is not None:
-            with options.log.open("a") as log:
-                log.write(line + "\n")
     for test, where in sorted(found.items()):
-        print(f"failed in {', '.join(where)}: {test}")
+        print(f"in {', '.join(where)}: {test}")
     return 1 if found else 0
 
 
