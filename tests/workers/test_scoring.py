@@ -57,8 +57,8 @@ def by_definition(spec: ScoreSpec, row: int) -> list[float]:
 
 
 @pytest.mark.parametrize("sphere", [False, True])
-def test_scores_are_those_of_the_definition(tmp_path: Path, sphere: bool) -> None:
-    spec = spec_of(small_scene(tmp_path))
+def test_scores_are_those_of_the_definition(scene: Scene, sphere: bool) -> None:
+    spec = spec_of(scene)
     spec = replace(spec, config=TrainConfig.model_validate({"loss": {"sphere": sphere}}))
     means = spec.model.load().means
     before = means.clone()
@@ -75,8 +75,8 @@ def test_scores_are_those_of_the_definition(tmp_path: Path, sphere: bool) -> Non
     assert (progress[-1].iteration, progress[-1].iterations) == (3, 3)
 
 
-def test_of_merged_gaussians_the_number_that_they_stand_for_counts(tmp_path: Path) -> None:
-    spec = spec_of(small_scene(tmp_path))
+def test_of_merged_gaussians_the_number_that_they_stand_for_counts(scene: Scene) -> None:
+    spec = spec_of(scene)
     held = np.bincount(spec.labels.load(), minlength=3)
     *_, alone = score(spec)
     *_, merged = score(replace(spec, sizes=(2 * int(held[0]), 0, 4 * int(held[2]))))
@@ -84,8 +84,8 @@ def test_of_merged_gaussians_the_number_that_they_stand_for_counts(tmp_path: Pat
     torch.testing.assert_close(merged.scores * torch.tensor([2.0, 1.0, 4.0]), alone.scores)
 
 
-def test_shards_score_as_the_whole_does_whatever_the_threads(tmp_path: Path) -> None:
-    scene, found = small_scene(tmp_path), []
+def test_shards_score_as_the_whole_does_whatever_the_threads(scene: Scene) -> None:
+    found = []
     for count, views, row in ((1, (0, 1, 3), 1), (2, (0, 1, 3), 1), (1, (1,), 0)):
         with threads(count):
             *_, scored = score(spec_of(scene, views))
@@ -104,16 +104,16 @@ def test_a_view_that_is_masked_altogether_scores_zero(tmp_path: Path) -> None:
     assert not scored.scores.any()
 
 
-def test_labels_must_fit(tmp_path: Path) -> None:
-    spec = spec_of(small_scene(tmp_path))
+def test_labels_must_fit(scene: Scene) -> None:
+    spec = spec_of(scene)
     with pytest.raises(ValueError, match="labels for"):
         list(score(replace(spec, labels=Value(spec.labels.load()[:-1]))))
     with pytest.raises(ValueError, match="0 to 1"):
         list(score(replace(spec, blocks=2)))
 
 
-def test_gradients_that_are_not_finite_stop_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = spec_of(small_scene(tmp_path))
+def test_gradients_that_are_not_finite_stop_the_run(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = spec_of(scene)
 
     def broken(loss: torch.Tensor, means: torch.Tensor) -> tuple[torch.Tensor]:
         return (torch.full_like(means, torch.nan),)
@@ -145,8 +145,7 @@ def test_on_a_card_nothing_waits_but_the_rasterizer(tmp_path: Path, monkeypatch:
     assert found == {"tolist": 1}
 
 
-def test_the_loss_is_of_colours_as_the_exposure_has_them(tmp_path: Path) -> None:
-    scene = small_scene(tmp_path)
+def test_the_loss_is_of_colours_as_the_exposure_has_them(scene: Scene) -> None:
     spec, view = spec_of(scene), load_view(scene.panoramas[0], 0, WIDTH)
     model = with_sky(scene)
     model.means.requires_grad_()

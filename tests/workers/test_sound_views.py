@@ -36,7 +36,7 @@ def spec_of(scene: Scene, config: TrainConfig = CONFIG) -> TrainSpec:
     return coarse_of(scene, config, iterations=12)
 
 
-@pytest.mark.parametrize("row", range(4))
+@pytest.mark.parametrize("row", [0, 3])
 def test_a_training_that_resumes_leaves_a_damaged_panorama_out_as_before(tmp_path: Path, row: int) -> None:
     """With one notice at the first time, and the same bytes at the end."""
     scene = small_scene(tmp_path)
@@ -104,7 +104,7 @@ def test_a_panorama_that_cannot_be_read_is_not_left_out(tmp_path: Path) -> None:
     assert not isinstance(error.value, ImageError)
 
 
-@pytest.mark.parametrize("damaged", [(2,), (1, 2), (1, 2, 3)])
+@pytest.mark.parametrize("damaged", [(2,), (1, 2, 3)])
 def test_scoring_gives_damaged_panoramas_no_score(tmp_path: Path, damaged: tuple[int, ...]) -> None:
     scene = small_scene(tmp_path)
     for row in damaged:

@@ -32,6 +32,8 @@ GROUPS: dict[str, Any] = {
     "movers": {"weigh": True},
 }
 STILL = {"densify": {"until": 0}}  # the choices of densification depend on the last bits of a gradient
+# Kernels have each with each: tests/renderer/cuda/test_kernels.py.
+combined = pytest.mark.parametrize(("projection", "exterior"), [("affine", "none"), ("exact", "baked")])
 LEARNS: dict[str, Any] = {
     "exposure": {"learn": True, "begin": 0},
     "poses": {"refine": True, "begin": 0, "visits": 0},
@@ -140,8 +142,7 @@ def learns_as_on_the_cpu(spec: TrainSpec) -> None:
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("exterior", ["none", "baked"])
-@pytest.mark.parametrize("projection", ["affine", "exact"])
+@combined
 def test_it_learns_as_on_the_cpu(projection: str, exterior: str, spec: TrainSpec, block: TrainSpec) -> None:
     """Also a block with a baked exterior, whose loss counts active pixels only."""
     task = block if exterior == "baked" else spec
@@ -216,8 +217,7 @@ def warm(spec: TrainSpec) -> Iterator[tuple[Trainer, Iterator[int]]]:
         yield trainer, steps()
 
 
-@pytest.mark.parametrize("projection", ["affine", "exact"])
-@pytest.mark.parametrize("exterior", ["none", "baked"])
+@combined
 @pytest.mark.parametrize("kind", ["collects", "still", "learns"])
 def test_no_wait_in_a_usual_iteration(
     kind: str, projection: str, exterior: str, spec: TrainSpec, block: TrainSpec
