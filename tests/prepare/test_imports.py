@@ -23,10 +23,10 @@ import panolog.prepare.sfm.pipeline
 os.kill(os.getpid(), signal.SIGTERM)
 assert seen
 """,
-    "training loads no onnxruntime": """
+    "training loads neither onnxruntime nor pycolmap": """
 import sys, panolog.workers.training.trainer
 import panolog.prepare.networks.depth_maps, panolog.prepare.networks.masks
-assert "onnxruntime" not in sys.modules
+assert not {"onnxruntime", "pycolmap"} & set(sys.modules)
 """,
 }
 

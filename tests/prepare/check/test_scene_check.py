@@ -176,7 +176,9 @@ def test_poses_that_fit_in_no_convention(town: Scene) -> None:
 
 @pytest.mark.parametrize("name", ["street", "flat"])
 def test_shared_scenes_are_sound(name: str) -> None:
-    found = check_scene(read_scene(shared(name)))
+    scene = read_scene(shared(name))
+    some = scene.panoramas[:: len(scene.panoramas) // 10]
+    found = check_scene(replace(scene, panoramas=some, train=tuple(range(len(some))), test=()))
     assert found.problems == ()
     assert found.color_correlation is not None
     assert found.color_correlation > 0.8

@@ -63,18 +63,13 @@ def changed(path: str, value: object) -> dict[str, Any]:
     [
         ("task", "mask", "task: Input should be 'depth'"),
         ("input", None, "input: Field required"),
-        ("input.layout", "CHW", "input.layout: Input should be 'NCHW' or 'NHWC'"),
         ("input.width", 65, r"input: width must be 2 \* height \+ 2 \* wrap = 72, not 65"),
         ("input.height", 10**9, "input.height: Input should be less"),
         ("input.seam", "turn", "input: wrap is the number of repeated columns"),
         ("input.divisor", 0, "input.divisor: Input should be greater than 0"),
         ("input.std", [1, 0, 1], "input.std.1: Input should be greater than 0"),
-        ("input.mean", [1, 2], "input.mean.2: Field required"),
         ("depth.factor", float("inf"), "depth.factor: Input should be a finite number"),
-        ("depth.kind", "disparity", "depth.kind: Input should be 'depth' or 'inverse'"),
-        ("depth.distance", "z", "depth.distance: "),
         ("depth.scale", 3, "there is no field depth.scale"),
-        ("sky.above", "ground", "sky.above: "),
         ("skies", {}, "there is no field skies"),
     ],
 )

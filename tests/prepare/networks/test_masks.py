@@ -11,13 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from onnx import helper
 
-from panolog.prepare.networks.masks import (
-    GIVEN,
-    MaskJob,
-    find_static,
-    make_masks,
-    share_of_sphere,
-)
+from panolog.prepare.networks.masks import GIVEN, MaskJob, find_static, make_masks, share_of_sphere
 from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.networks.nadir import black_nadir, nadir_cone
 from panolog.prepare.networks.static_regions import WIDTH as LOOKED_AT

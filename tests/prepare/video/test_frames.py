@@ -11,6 +11,7 @@ import pytest
 
 from panolog.prepare.video import frames as module
 from panolog.prepare.video.frames import extract_frames
+from panolog.prepare.video.motion import load_motion
 from panolog.scene.errors import InputError
 from panolog.scene.files import SUFFIX
 from panolog.scene.image_files import decode
@@ -138,15 +139,21 @@ def test_another_video_of_the_same_name_is_refused(extracted: Path, tmp_path: Pa
         lambda text: text.replace(b'"pieces": [', b'"pieces": [7, '),
     ],
 )
-def test_a_damaged_file_of_motion_is_made_anew(
-    damage: Callable[[bytes], bytes], short: Path, extracted: Path, tmp_path: Path
+def test_a_damaged_file_of_motion_is_none(
+    damage: Callable[[bytes], bytes], extracted: Path, tmp_path: Path
 ) -> None:
-    out = shutil.copytree(extracted, tmp_path / "out")
-    files = sorted(out.glob("*.jpg"))
-    file = out / "short.motion.json"
-    good = file.read_bytes()
+    good, file = (extracted / "short.motion.json").read_bytes(), tmp_path / "a.json"
+    file.write_bytes(good)
+    assert load_motion(file) is not None
     file.write_bytes(damage(good))
-    assert file.read_bytes() != good
+    assert file.read_bytes() != good and load_motion(file) is None
+
+
+def test_what_is_damaged_is_made_anew(short: Path, extracted: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(extracted, tmp_path / "out")
+    files, file = sorted(out.glob("*.jpg")), out / "short.motion.json"
+    good = file.read_bytes()
+    file.write_bytes(good[: len(good) // 2])
     assert extract_frames(short, out) == files
     assert file.read_bytes() == good
 

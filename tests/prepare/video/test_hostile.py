@@ -116,14 +116,6 @@ def _pixels(path: Path) -> list[bytes | None]:
     return [None if it is None else struct.pack("d", time) + it.tobytes() for time, it in pictures]
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
-def test_truncated(share: float, whole: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "clip.mp4"
-    path.write_bytes(whole[: int(share * len(whole))])
-    assert use(path) <= 12
-    read_spherical(path)
-
-
 def test_boxes_end_where_the_one_around_them_does() -> None:
     sizes = (0, 1, 7, 8, 9, 2**31, 2**32 - 1)
     contents = [struct.pack(">I4s", size, b"free") + bytes(4) for size in sizes]

@@ -226,25 +226,6 @@ def test_a_stamp_is_read_as_it_was_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.system
-def test_frames_carry_what_the_video_knows(tmp_path: Path) -> None:
-    images = tour_images(30, 45, 2)
-    path = write_video(tmp_path / "walk.mp4", images, fourcc="mp4v", fps=2)
-    samples = [
-        (1000 * n, payload(gps5(np.stack([place(n), place(n + 0.5)])), grav(np.stack([up(n), up(n + 0.5)]))))
-        for n in range(SECONDS)
-    ]
-    add_track(path, b"gpmd", samples, 1000 * SECONDS)
-    files = extract_frames(path, tmp_path / "out", parallax=2.0)
-    assert len(files) >= 3
-    for file in files:
-        time = int(file.stem[-6:]) / 2
-        found = read_exif(file)
-        assert found.fix is not None and found.attitude is not None
-        assert found.fix.latitude == pytest.approx(place(time)[0], abs=1e-7)
-        assert (found.attitude.pitch, found.attitude.roll) == pytest.approx(attitude(time), abs=0.1)
-
-
-@pytest.mark.system
 def test_the_pose_of_the_header_is_that_of_all_frames(tmp_path: Path) -> None:
     path = write_video(tmp_path / "walk.mp4", tour_images(30, 45, 2), fourcc="mp4v", fps=2)
     files = extract_frames(add_spherical(path, pose=(40.0, 12.0, -7.0)), tmp_path / "out", parallax=2.0)

@@ -132,10 +132,7 @@ def test_metadata_behind_the_pixels_of_a_png(tmp_path: Path) -> None:
     path, exif = tmp_path / "a.png", Image.open(write_still(tmp_path / "a.jpg", BLACK)).info["exif"][6:]
     Image.new("RGB", SIZE).save(path)
     data, end = path.read_bytes()[:-12], path.read_bytes()[-12:]
-    for kind, content in (
-        (b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + gpano(POSE)),
-        (b"eXIf", exif),
-    ):
+    for kind, content in ((b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + gpano(POSE)), (b"eXIf", exif)):
         part = kind + content
         data += struct.pack(">I", len(content)) + part + struct.pack(">I", zlib.crc32(part))
     path.write_bytes(data + end)
