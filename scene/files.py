@@ -7,7 +7,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import FileIO
 from pathlib import Path
@@ -23,6 +23,12 @@ def stem_of(name: str) -> str:
     """The name of an image file without its extension. A number after a dot, as in `a.1`, is none."""
     path = Path(name)
     return str(path if path.suffix[1:].isdecimal() else path.with_suffix(""))
+
+
+def some_of(names: Sequence[str], kind: str = "file") -> str:
+    """Names of a kind of things, for a message of one line: how many there are, and the first three."""
+    more = ", …" if len(names) > 3 else ""
+    return f"{len(names):,} {kind}{'s' if len(names) > 1 else ''} ({', '.join(names[:3])}{more})"
 
 
 def natural_key(name: str) -> tuple[str, str]:

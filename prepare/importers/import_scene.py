@@ -19,15 +19,17 @@ from panolog.prepare.importers import (
     roam360,
     spheresfm,
 )
-from panolog.prepare.importers.colmap_source import find_model
 from panolog.prepare.importers.interface import ImportedScene, ImportSource
+from panolog.prepare.importers.masks import find_masks
+from panolog.prepare.importers.spheresfm import find_model
 from panolog.prepare.sfm.triangulate import triangulate
 from panolog.scene.colmap_files import read_cameras
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import natural_key, stem_of
 from panolog.scene.image_files import check_images
-from panolog.scene.read import MIN_CAMERAS, check_names, find_offset
-from panolog.scene.write import NewScene, Offset, StageProgress, no_progress, require_new, write_scene
+from panolog.scene.model import NO_OFFSET, Vector
+from panolog.scene.read import MASKS, MIN_CAMERAS, check_names, find_offset
+from panolog.scene.write import NewScene, Offset, Origin, StageProgress, no_progress, require_new, write_scene
 
 
 class Format(NamedTuple):
@@ -100,10 +102,18 @@ def import_scene(
     if not len(scene.points):
         scene = _triangulated(source, scene, size, progress)
     scene, offset = _centred(scene)
-    new = NewScene(scene.images, size, scene.points, scene.colors, split=_split(scene), offset=offset)
+    masks, left_out = find_masks(source, images, scene.masks)
+    split = _split(scene)
+    new = NewScene(
+        scene.images, size, scene.points, scene.colors, split=split, layers={MASKS: masks}, offset=offset
+    )
     write_scene(output, new, link=link, progress=partial(progress, "import"))
     observations = sum(len(image.sightings[0]) for image in scene.images)
-    notes = list(scene.notes)
+    notes = [*scene.notes, *left_out]
+    if split is None and (scene.train or scene.test):
+        notes.append(
+            "the source's split is left out: it has to name panoramas to train on and others to test"
+        )
     if scene.colors is None and not observations:
         notes.append("the points have no colours and begin grey")
     return ImportReport(name, len(images), len(scene.points), observations, tuple(notes))
@@ -148,11 +158,16 @@ def _centred(scene: ImportedScene) -> tuple[ImportedScene, Offset | None]:
     """The scene moved to the origin, if float32 is too coarse where it is, and the offset."""
     offset = find_offset(np.stack([-image.rotation.T @ image.translation for image in scene.images]))
     if offset is None:
-        return scene, None
+        return scene, None if scene.place is None else _about(scene.place, NO_OFFSET)
     images = [replace(it, translation=it.translation + it.rotation @ offset) for it in scene.images]
     note = f"the world was moved to the origin: add {offset} for the source's (offset.json)"
     moved = replace(scene, images=images, points=scene.points - offset, notes=[*scene.notes, note])
-    return moved, Offset(offset=offset)
+    return moved, _about(scene.place, offset)
+
+
+def _about(place: Origin | None, offset: Vector) -> Offset:
+    """Where a world is that is metres east, north and up of a place on the earth, if there is one."""
+    return Offset(offset=offset, frame=None if place is None else "ENU", origin=place)
 
 
 def _split(scene: ImportedScene) -> dict[str, list[str]] | None:

@@ -5,8 +5,8 @@ the whole scene to our convention; it raises SceneError, with file and field, if
 wrong, and OSError if a file cannot be read.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -17,7 +17,7 @@ from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
 from panolog.scene.files import stem_of
-from panolog.scene.write import UNSEEN, PosedImage
+from panolog.scene.write import UNSEEN, Origin, PosedImage
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
 _HEAD = 65_536  # bytes that `detect` may read of a file
@@ -34,6 +34,8 @@ class ImportedScene:
     train: Sequence[str] = ()  # stems, where the format has a split
     test: Sequence[str] = ()
     notes: Sequence[str] = ()  # messages for the user, one line each: what was left out
+    place: Origin | None = None  # the world is metres east, north and up of it
+    masks: Mapping[str, Path] = field(default_factory=dict)  # by image name, where the format names them
 
     def with_cloud(self, source: "ImportSource") -> "ImportedScene":
         """The scene with the points of the user's PLY, which no panorama is known to see, if there is one."""

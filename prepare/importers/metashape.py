@@ -9,9 +9,11 @@ were exported in local ones, in metres if the chunk has a scale. Source: the Met
 
 A chunk with geographic coordinates leads to the centre of the earth, whereas its PLY is projected: that is
 refused. Labels are file names, often without extension. Cameras without a transform are not aligned and left
-out.
+out, and so are those that the user has disabled. Cameras that did not align with the others are in components
+of their own: without transforms, each of these is a world by itself, and the largest is taken.
 """
 
+from collections import defaultdict
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -22,6 +24,7 @@ from panolog.prepare.importers.json_xml import load_xml, xml_numbers
 from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.prepare.importers.poses import Array, nearest_rotation, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
+from panolog.scene.files import some_of
 from panolog.scene.write import PosedImage
 
 _GEOCENTRIC = 1e6  # metres from the origin: the surface of the earth
@@ -46,21 +49,42 @@ def read(source: ImportSource) -> ImportedScene:
     components = {c.get("id"): _component(path, c) for c in chunk.iter("component")}
     whole = _component(path, chunk)
     folders = source.image_folders("images", "imgs")
-    images, notes = [], []
-    for camera in cameras.iter("camera"):
+    images, (aligned, notes) = [], _aligned(cameras, chunk)
+    for camera in aligned:
         label = camera.get("label") or ""
         field = f"camera {label[:60]!r}"
         transform = camera.find("transform")
-        if transform is None:
-            notes.append(f"{label[:80]} is not aligned and is left out")
-            continue
-        if camera.get("sensor_id") not in spherical:
+        if transform is None or camera.get("sensor_id") not in spherical:
             raise SceneError(f"{path}: {field}: its sensor is not spherical; set its type and align again")
         to_world = components.get(camera.get("component_id"), whole)
         matrix = to_world @ xml_numbers(path, f"{field}: transform", transform.text, 16).reshape(4, 4)
         pose = pose_from_camera_to_world(f"{path}: {field}: transform", matrix, np.eye(3))
         images.append(PosedImage(*find_panorama(f"{path}: {field}", folders, label), *pose))
     return ImportedScene(images, *read_point_cloud(_cloud(source, path), source.memory), notes=notes)
+
+
+def _aligned(cameras: Element, chunk: Element) -> tuple[list[Element], list[str]]:
+    """The cameras that share a world, and one line for each kind that is left out."""
+    left_out = defaultdict[str, list[Element]](list)
+    parts = defaultdict[str | None, list[Element]](list)
+    placed = {it.get("id") for it in chunk.iter("component") if it.find("transform") is not None}
+    for camera in cameras.iter("camera"):
+        if camera.find("transform") is None:
+            left_out["not aligned"].append(camera)
+        elif (camera.get("enabled") or "true").lower() in ("false", "0"):
+            left_out["disabled"].append(camera)
+        else:
+            component = camera.get("component_id")
+            parts[None if component in placed else component].append(camera)
+    for world, apart in sorted(parts.items(), key=lambda part: -len(part[1]))[1:]:  # stable
+        name = "the components with a place" if world is None else f"component {world}"
+        left_out[f"in {name}, which nothing connects with the largest one"] += apart
+    notes = [
+        f"{some_of([(it.get('label') or '')[:80] for it in group], 'camera')}: left out, as "
+        f"{'they are' if len(group) > 1 else 'it is'} {why}"
+        for why, group in left_out.items()
+    ]
+    return max(parts.values(), key=len, default=[]), notes
 
 
 def _find(source: ImportSource) -> Path | None:

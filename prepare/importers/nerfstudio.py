@@ -21,12 +21,17 @@ from panolog.prepare.importers.poses import FLIP_YZ
 from panolog.scene.files import stem_of
 
 FILES = ("transforms.json",)
+_UNNAMED = (
+    "there is no camera_model: taken to be EQUIRECTANGULAR, as the pictures are 2:1; `panolog scene check` "
+    "says whether the poses fit"
+)
 
 
 def detect(source: ImportSource) -> bool:
     """Whether this is a transforms.json or a folder with one."""
     head = source.json_head(*FILES)
-    return head.startswith(b"{") and b'"transform_matrix"' in head and b'"camera_model"' in head
+    named = b'"camera_model"' in head or source.json_file(*FILES).name in FILES
+    return head.startswith(b"{") and b'"transform_matrix"' in head and named
 
 
 def read(source: ImportSource) -> ImportedScene:
@@ -34,8 +39,7 @@ def read(source: ImportSource) -> ImportedScene:
     path = source.json_file(*FILES)
     content = load_json(path, source.memory)
     frames = list(content["frames"])
-    for frame in frames:
-        _check_camera(frame, content)
+    unnamed = [frame for frame in frames if not _check_camera(frame, content)]
     names = [_name(frame["file_path"], path.parent) for frame in frames]
     absolute = [PurePosixPath(name).is_absolute() for name in names]
     if any(absolute) and not all(absolute):
@@ -48,42 +52,66 @@ def read(source: ImportSource) -> ImportedScene:
     folders = (
         [source.images] if source.images else [path.parent / common, path.parent / "images", path.parent]
     )
-    images = []
+    images, masks = [], dict[str, Path]()
     for frame, name in zip(frames, names, strict=True):
         spelled = str(PurePosixPath(name).relative_to(common))
         matrix = frame["transform_matrix"]
         images.append(posed_image(matrix, frame["file_path"], folders, FLIP_YZ, spelled=spelled))
+        if (mask := _mask(path.parent, frame, content)) is not None:
+            masks[images[-1].name] = mask
+    notes = [_UNNAMED] if unnamed else []
+    depths = sum("depth_file_path" in frame.value for frame in frames)
+    if depths:
+        notes.append(f"{depths} depth maps are left out; `panolog scene depth` makes them")
     train, test = (
         _stems(content, key, path.parent, names, common) for key in ("train_filenames", "test_filenames")
     )
-    return ImportedScene(images, *read_point_cloud(_cloud(source, path, content), source.memory), train, test)
+    cloud = read_point_cloud(_cloud(source, path, content), source.memory)
+    return ImportedScene(images, *cloud, train, test, notes, masks=masks)
 
 
-def _check_camera(frame: JsonNode, content: JsonNode) -> None:
-    """The camera of a frame is its own or that of the file; nothing may be cropped or shifted."""
+def _mask(folder: Path, frame: JsonNode, content: JsonNode) -> Path | None:
+    """The mask of a frame, or that of all. Raises SceneError if it is not in the folder of the file."""
+    own = frame.get("mask_path")
+    entry = content.get("mask_path") if own is None else own
+    if entry is None or not entry.value:
+        return None
+    mask = folder / _name(entry, folder)
+    if ".." in mask.parts or not mask.is_file() or not mask.resolve().is_relative_to(folder.resolve()):
+        raise entry.error(
+            "there is no such mask in the folder of the file; copy it there, or remove the entry"
+        )
+    return mask
+
+
+def _check_camera(frame: JsonNode, content: JsonNode) -> bool:
+    """Whether the camera of a frame, its own or that of the file, is named; None may be cropped or shifted.
+
+    Raises SceneError if it is no panorama. One without a name may be one, unless it has a field of view.
+    """
 
     def setting(key: str) -> JsonNode | None:
         own = frame.get(key)
         return content.get(key) if own is None else own
 
     model = setting("camera_model")
-    if model is None or model.text().upper() != "EQUIRECTANGULAR":
-        found = "none" if model is None else model.text()[:40]
-        raise (frame if model is None else model).error(
-            f"the camera model is {found}; only EQUIRECTANGULAR is a panorama"
-        )
+    if model is None and (angle := setting("camera_angle_x")) is not None:
+        raise angle.error("a camera with a field of view; only EQUIRECTANGULAR is a panorama")
+    if model is not None and model.text().upper() != "EQUIRECTANGULAR":
+        raise model.error(f"the camera model is {model.text()[:40]}; only EQUIRECTANGULAR is a panorama")
     for middle, size in (("cx", "w"), ("cy", "h")):
         at, extent = setting(middle), setting(size)
         if at is not None and extent is not None and abs(at.array() - extent.array() / 2) > 1:
             raise at.error(f"{middle} is not the middle of the image; a panorama cannot be shifted")
+    return model is not None
 
 
 def _cloud(source: ImportSource, path: Path, content: JsonNode) -> Path | None:
     if source.points:
         return source.points
     entry = content.get("ply_file_path")
-    if entry is None:
-        return None
+    if entry is None:  # versions of nerfstudio and other programs write it without an entry
+        return source.cloud_file("sparse_pc.ply", "pointcloud.ply", "point_cloud.ply", "points3D.ply")
     name = PurePosixPath(entry.text())
     if name.is_absolute() or ".." in name.parts:
         raise entry.error("leaves the folder of the file; give the cloud with --points")

@@ -15,13 +15,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.json_xml import JsonNode, load_json
 from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.scene.errors import SceneError
-from panolog.scene.write import UNSEEN, PosedImage, Sightings
+from panolog.scene.write import UNSEEN, Origin, PosedImage, Sightings
 
 FILES = ("reconstruction.json", "opensfm/reconstruction.json")
 _PANORAMA = ("spherical", "equirectangular")
@@ -54,12 +55,35 @@ def read(source: ImportSource) -> ImportedScene:
         _sightings(tracks, shots, rows, source.memory) if tracks.is_file() and not source.points else {}
     )
     images = _images(largest, source.image_folders("images"), sightings)
+    place = _place(largest, path.with_name("reference_lla.json"), source.memory)
     if source.points:
-        return ImportedScene(images, *read_point_cloud(source.points, source.memory), notes=notes)
+        cloud = read_point_cloud(source.points, source.memory)
+        return ImportedScene(images, *cloud, notes=notes, place=place)
     where = np.array([point["coordinates"].array(3) for _, point in points.items()]).reshape(-1, 3)
     colors = np.array([point["color"].array(3) for _, point in points.items()]).reshape(-1, 3)
     rgb = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
-    return ImportedScene(images, where, rgb, notes=notes)
+    return ImportedScene(images, where, rgb, notes=notes, place=place)
+
+
+def _place(part: JsonNode, file: Path, memory: int) -> Origin | None:
+    """The place on the earth that the world is about; None without GPS: then it is at latitude, longitude 0.
+
+    Raises SceneError if it is none.
+    """
+    found = part.get("reference_lla")
+    if found is None and file.is_file():
+        found = load_json(file, memory)
+    if found is None:
+        return None
+    latitude, longitude, altitude = (
+        float(found[name].array()) for name in ("latitude", "longitude", "altitude")
+    )
+    if latitude == longitude == 0:
+        return None
+    try:
+        return Origin(latitude=latitude, longitude=longitude, altitude=altitude)
+    except ValidationError as error:
+        raise found.error("is no place on the earth; run OpenSfM again") from error
 
 
 def _images(part: JsonNode, folders: Sequence[Path], sightings: dict[str, Sightings]) -> list[PosedImage]:

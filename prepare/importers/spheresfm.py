@@ -10,19 +10,48 @@ doc/format.rst.
 from collections.abc import Sequence
 from pathlib import Path
 
-from panolog.prepare.importers.colmap_source import camera_models, find_model, require_model
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.scene.colmap import ColmapImage, read_colmap
-from panolog.scene.colmap_files import EQUIRECTANGULAR, SPHERE
+from panolog.scene.colmap_files import EQUIRECTANGULAR, SPHERE, read_cameras
 from panolog.scene.errors import SceneError
+from panolog.scene.read import MODELS
 from panolog.scene.write import PosedImage
 
 PANORAMA = (SPHERE, EQUIRECTANGULAR)
 
 
+def find_model(folder: Path) -> Path | None:
+    """Where in `folder` a COLMAP model is: itself or one of MODELS; None if nowhere."""
+    for candidate in (folder, *(folder / name for name in MODELS)):
+        if all(
+            any((candidate / f"{stem}{end}").is_file() for end in (".bin", ".txt"))
+            for stem in ("cameras", "images")
+        ):
+            return candidate
+    return None
+
+
+def require_model(folder: Path) -> Path:
+    """As `find_model`. Raises SceneError if it is nowhere."""
+    found = find_model(folder)
+    if found is None:
+        raise SceneError(f"{folder}: there is no COLMAP model (cameras and images, .bin or .txt)")
+    return found
+
+
+def camera_models(folder: Path | None) -> set[str]:
+    """The camera models of the COLMAP model in `folder`; empty without one, or if its cameras are damaged."""
+    try:
+        return {camera.model for camera in read_cameras(folder).values()} if folder is not None else set()
+    except SceneError:
+        return set()
+
+
 def detect(source: ImportSource) -> bool:
-    """Whether this is a folder with a model whose cameras are panoramas."""
-    return bool(camera_models(find_model(source.path)) & set(PANORAMA))
+    """Whether this is a folder with a model of panoramas, which nerfstudio has not converted."""
+    folder = find_model(source.path)
+    copied = folder == source.path / "colmap/sparse/0" and (source.path / "transforms.json").is_file()
+    return not copied and bool(camera_models(folder) & set(PANORAMA))
 
 
 def read(source: ImportSource) -> ImportedScene:

@@ -19,7 +19,7 @@ from tests.prepare.importers.writers import WITH_SPLIT, WITH_TRACKS, WRITERS
 NOTES = {
     "openmvg, old": "mirror",
     "opensfm": "1 images of 1 smaller reconstructions are left out",
-    "metashape": "not aligned is not aligned and is left out",
+    "metashape": "1 camera (not aligned): left out, as it is not aligned",
 }
 
 
