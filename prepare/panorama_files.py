@@ -11,11 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.prepare.file_kinds import describe_left_out
 from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
-from panolog.scene.files import natural_key, stem_of
+from panolog.scene.files import natural_key, some_of, stem_of
 from panolog.scene.image_files import decode, decode_used, decode_with_alpha, read_info
+from panolog.scene.pictures.kinds import require_panorama
 from panolog.scene.read import check_names, image_folder, model_folder
 
 _ADDED = ("@eaDir", "__MACOSX")  # folders of Synology's thumbnails and of macOS's archives
@@ -41,20 +43,57 @@ class PanoramaFile:
         return self.root / folder / f"{self.name}.png"
 
 
-def find_image_files(folder: Path) -> list[Path]:
-    """The image files below a folder, in the natural order of their paths, also behind links to folders.
+@dataclass(frozen=True)
+class FolderContent:
+    """What is below a folder."""
 
-    Without what systems add: hidden files, such as macOS's `._NAME.jpg`, and thumbnails of network disks.
+    images: list[Path]  # in the natural order of their paths
+    left_out: list[str]  # what else of cameras is there, one line for each kind
+
+
+def find_image_files(folder: Path) -> list[Path]:
+    """`look_into` a folder for its images alone."""
+    return look_into(folder).images
+
+
+def look_into(folder: Path) -> FolderContent:
+    """The image files below a folder, also behind links to folders, and what is left out.
+
+    That are files of other kinds, and what systems add: hidden files, such as macOS's `._NAME.jpg`, hidden
+    folders, such as `.thumbnails`, and thumbnails of network disks.
     """
-    found, seen = list[Path](), set[Path]()
+    files, hidden, seen = list[Path](), list[str](), set[Path]()
     for place, folders, names in os.walk(folder, followlinks=True):
         here = Path(place)
-        known = here.resolve() in seen  # a link to a folder above
+        if here.resolve() in seen:  # a link to a folder above
+            folders.clear()
+            continue
         seen.add(here.resolve())
-        folders[:] = [] if known else [it for it in folders if not it.startswith(".") and it not in _ADDED]
-        files = [here / name for name in names if not known and not name.startswith(".")]
-        found += [path for path in files if path.suffix.lower() in SUFFIXES and path.is_file()]
-    return sorted(found, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
+        added = any(_is_added(part) for part in here.relative_to(folder).parts)
+        for path in (here / name for name in names):
+            if not added and not _is_added(path.name):
+                files.append(path)
+            elif path.suffix.lower() in SUFFIXES:
+                hidden.append(path.relative_to(folder).as_posix())
+    images = [path for path in files if path.suffix.lower() in SUFFIXES and path.is_file()]
+    left_out = describe_left_out(sorted(files), folder)
+    if hidden:
+        left_out.append(f"{some_of(sorted(hidden))}: left out, as hidden files and thumbnails are")
+    return FolderContent(
+        sorted(images, key=lambda path: natural_key(path.relative_to(folder).as_posix())), left_out
+    )
+
+
+def _is_added(name: str) -> bool:
+    """Whether a system has added a file or folder of that name."""
+    return name.startswith(".") or name in _ADDED
+
+
+def masks_among(images: Iterable[Path]) -> dict[Path, Path]:
+    """The masks next to panoramas, by panorama: NAME_mask.png of NAME.jpg or another picture."""
+    by_stem = {stem_of(str(path)): path for path in images}
+    owners = ((stem.removesuffix("_mask"), stem) for stem in by_stem if stem.endswith("_mask"))
+    return {by_stem[own]: by_stem[stem] for own, stem in owners if own in by_stem}
 
 
 def list_panoramas(scene: Path) -> list[PanoramaFile]:
@@ -66,6 +105,8 @@ def list_panoramas(scene: Path) -> list[PanoramaFile]:
     root = scene.resolve()
     folder = image_folder(root)
     files = find_image_files(folder)
+    masks = set(masks_among(files).values())
+    files = [path for path in files if path not in masks]
     names = [path.relative_to(folder).as_posix() for path in files]
     if not names:
         raise SceneError(f"{folder}: there are no panoramas in it ({', '.join(sorted(SUFFIXES))})")
@@ -97,12 +138,13 @@ def load_resized(path: Path, width: int) -> NDArray[np.uint8]:
     What is transparent has the colour of the nearest pixel that is not, so that it has no edge.
 
     Raises:
-        SceneError: it is damaged, not 2:1, or larger than any panorama.
+        SceneError: it is damaged, not 2:1, shows fisheye circles or two eyes, or is larger than any panorama.
     """
     info = read_info(path)
     check_panorama_size(path, info)
     reduction = next(it for it in (8, 4, 2, 1) if info.width >= 2 * it * width or it == 1)
     pixels, used = decode_with_alpha(path, width, reduction)
+    require_panorama(path, np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8))
     return pixels if used is None else _filled(pixels, used)
 
 
@@ -114,6 +156,7 @@ def load_grey(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     info = read_info(path)
     check_panorama_size(path, info)
     grey = decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    require_panorama(path, grey)
     used = decode_used(path) if info.alpha else None
     return (grey, None) if used is None else (_filled(grey, used), used)
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import InputError, SceneError
-from panolog.scene.image_files import ImageInfo, decode, layer_record, read_info
+from panolog.scene.image_files import ImageInfo, decode, decode_mask, layer_record, not_a_panorama, read_info
 
 MAX_BYTES = 2**29  # of pixels, 18,900 x 9,450 in colour: more than any camera has
 
@@ -66,7 +66,7 @@ def is_user_file(path: Path) -> bool:
 
 
 def read_layer(path: Path) -> NDArray[Any]:
-    """The pixels (H, W) of a mask or a depth map, as they are stored.
+    """The pixels (H, W) of a layer, as they are stored.
 
     Raises:
         SceneError: it is damaged, or larger than any panorama.
@@ -76,14 +76,21 @@ def read_layer(path: Path) -> NDArray[Any]:
     return pixels if pixels.ndim == 2 else decode(path, cv2.IMREAD_GRAYSCALE)
 
 
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """(H, W) True = use: `decode_mask` of a file that is not larger than any panorama. Raises SceneError."""
+    check_panorama_size(path, read_info(path))
+    return decode_mask(path)
+
+
 def check_panorama_size(path: Path, info: ImageInfo) -> None:
     """Refuses what is not a panorama, before any memory is spent on it. Raises SceneError."""
     if info.width != 2 * info.height or not info.width:
-        raise SceneError(f"{path}: {info.width} x {info.height} pixels are not 2:1, so it is not a panorama")
-    if info.width * info.height * info.channels * info.bits // 8 > MAX_BYTES:
+        raise not_a_panorama(path, info.width, info.height)
+    if (size := info.width * info.height * info.channels * info.bits // 8) > MAX_BYTES:
         raise SceneError(
-            f"{path}: its header says {info.width} x {info.height} pixels, more than any panorama has; "
-            "the file is damaged, or scale it down"
+            f"{path}: its header says {info.width} x {info.height} pixels of {info.channels} channels with "
+            f"{info.bits} bits, {size / 2**20:,.0f} MiB and more than any panorama has ({MAX_BYTES >> 20}); "
+            "scale it down, save it with 8 bits and without alpha, or copy it again if it is damaged"
         )
 
 

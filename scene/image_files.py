@@ -3,7 +3,8 @@
 import os
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -14,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import ImageError, SceneError
+from panolog.scene.pictures.kinds import describe_picture
+from panolog.scene.pictures.profiles import jpeg_segments, to_srgb
 from panolog.scene.stores.outline import whole
 
 _TAIL = 65_536  # bytes searched for the end of a JPEG before the whole file is: cameras append little
@@ -32,6 +35,8 @@ _RECORD = re.compile(rb"tEXtPanoLOG\0([0-9a-f]{64}) ([0-9a-f]{64})")
 _RECORD_SEARCHED = 4096  # bytes; it is the second chunk, editors that keep it move it little
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by colour type
 _PNG_CHUNKS = 1_000  # before the pixels that are searched for transparency: programs write ten
+_SHOWN = 2**28  # pixels of a picture that is looked at, to say what it is
+WHITE = 128  # of a mask, from which on a pixel is white
 _NO_ALPHA = b"BM"  # BMP: its fourth channel is undefined in practice
 _TIFF = (b"II", b"MM")
 
@@ -115,8 +120,15 @@ def _decoded(path: Path, data: bytes, flags: int) -> NDArray[Any]:
     return pixels
 
 
+def decode_colors(path: Path) -> NDArray[np.uint8]:
+    """(H, W, 3) BGR of a picture of any shape, in sRGB and as it is stored. Raises as `decode`."""
+    data = _read(path)
+    pixels = _decoded(path, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return to_srgb(np.asarray(pixels, np.uint8), data)
+
+
 def decode_panorama(path: Path, width: int | None = None, reduction: int = 1) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB of a panorama, resized to `width` if it is given.
+    """(H, W, 3) sRGB of a panorama, resized to `width` if it is given.
 
     Poses belong to the pixels as they are stored, so an EXIF orientation does not turn them. With a reduction
     of 2, 4 or 8 a JPEG is decoded at that fraction of its size, in a fraction of the time and memory. Other
@@ -145,16 +157,27 @@ def decode_with_alpha(
     pixels = _decoded(path, data, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
     found = pixels.shape[1], pixels.shape[0]
     if reduction == 1 and found[0] != 2 * found[1]:
-        raise ImageError(f"{path}: {found[0]} x {found[1]} pixels are not 2:1: not a panorama")
+        raise not_a_panorama(path, *found)
     opacity = _opacity(path, data)
     used = None if opacity is None or opacity.all() else opacity > 0
     if opacity is not None and data.startswith(_TIFF):
         pixels = _straight(pixels, opacity)
+    pixels = to_srgb(pixels, data)
     if width is not None:
         size = width, width // 2
         pixels = resize(pixels, size) if opacity is None else _resize_opaque(pixels, opacity, size)
         used = None if used is None else resize_used(used, size)
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8), used
+
+
+def not_a_panorama(path: Path, width: int, height: int) -> ImageError:
+    """What to raise for a picture of so many pixels, not 2:1: with what it shows, if that is known."""
+    what = None
+    if width * height <= _SHOWN:
+        with suppress(SceneError):  # a damaged one is none either
+            what = describe_picture(decode(path, cv2.IMREAD_REDUCED_GRAYSCALE_8))
+    shown = f"; it shows {what}" if what else ""
+    return ImageError(f"{path}: {width} x {height} pixels are not 2:1: not a panorama{shown}")
 
 
 def decode_used(path: Path) -> NDArray[np.bool_] | None:
@@ -165,6 +188,24 @@ def decode_used(path: Path) -> NDArray[np.bool_] | None:
     """
     opacity = _opacity(path, _read(path))
     return None if opacity is None or opacity.all() else opacity > 0
+
+
+def decode_mask(path: Path) -> NDArray[np.bool_]:
+    """(H, W) True = use, of a mask: neither black nor transparent.
+
+    White may be 255 or 1. Where there is white, what is darker than half of it is black, as at edges and in
+    JPEGs; in a map of classes, without white, 0 is.
+
+    Raises:
+        ImageError, SceneError: as `decode`.
+    """
+    pixels = decode(path, cv2.IMREAD_UNCHANGED)
+    opaque = np.ones(pixels.shape[:2], bool)
+    if pixels.ndim == 3:
+        if pixels.shape[2] == 4:
+            opaque = pixels[..., 3] >= WHITE
+        pixels = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_BGR2GRAY)
+    return np.asarray(opaque & (pixels >= (WHITE if pixels.max(initial=0) >= WHITE else 1)))
 
 
 def resize_used(used: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
@@ -233,7 +274,7 @@ def read_infos(paths: Sequence[Path]) -> list[ImageInfo]:
     width, height = infos[0].width, infos[0].height
     for path, info in zip(paths, infos, strict=True):
         if info.width != 2 * info.height:
-            raise SceneError(f"{path}: {info.width} x {info.height} pixels are not 2:1: not a panorama")
+            raise not_a_panorama(path, info.width, info.height)
         if info.width != width:
             raise SceneError(
                 f"{path}: {info.width} x {info.height} pixels, but {paths[0].name} has {width} x {height}; "
@@ -326,20 +367,6 @@ def _jpeg(path: Path, file: BinaryIO) -> ImageInfo:
             return info
         file.seek(length, os.SEEK_CUR)
     raise _truncated(path)
-
-
-def jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
-    """(marker, bytes after its length field) of a JPEG up to its scan; the file is then at those bytes."""
-    file.seek(2)
-    while True:
-        head = file.read(4)
-        while len(head) == 4 and head[:2] == b"\xff\xff":  # fill bytes
-            head = head[1:] + file.read(1)
-        if len(head) < 4 or head[0] != 0xFF:
-            return
-        yield head[1], max(0, int.from_bytes(head[2:], "big") - 2)
-        if head[1] == _JPEG_SCAN:
-            return
 
 
 def _has_end(file: BinaryIO) -> bool:

@@ -23,7 +23,15 @@ from torch import Tensor
 
 from panolog.scene.errors import ConfigError, ImageError
 from panolog.scene.files import Locate, here
-from panolog.scene.image_files import decode, decode_used, decode_with_alpha, resize, resize_used
+from panolog.scene.image_files import (
+    WHITE,
+    decode,
+    decode_mask,
+    decode_used,
+    decode_with_alpha,
+    resize,
+    resize_used,
+)
 from panolog.scene.model import Panorama, Scene
 
 _THREADS = min(4, os.cpu_count() or 1)  # on the CPU: decoding keeps up with training long before this
@@ -31,7 +39,6 @@ MOST_THREADS = 8  # for a GPU: each holds a pinned view and has one more on the 
 PASSING = 2  # views on a GPU beyond one for each thread: the one in use, and a preview's
 _ALIGNMENT = 16  # bytes between beginnings of layers, a multiple of every element
 _LAYERS = ("image", "mask", "sky", "inverse_depth", "exposure")
-_HALF = 128  # of a mask, from which on it is white
 CURVE, TOE = 2.4, 0.055  # of sRGB (IEC 61966-2-1), above its linear part
 _LOG = logging.getLogger(__name__)
 
@@ -309,12 +316,12 @@ def _load_layers(
     size = (width, width // 2)
     sky = depth = None
     if panorama.mask:
-        given = resize_used(decode(locate(panorama.mask), cv2.IMREAD_GRAYSCALE) > 0, size)
+        given = resize_used(decode_mask(locate(panorama.mask)), size)
         used = given if used is None else given & used
     mask = None if used is None else torch.from_numpy(used)
     if panorama.sky_mask:
         foreground = _foreground(locate(panorama.sky_mask))
-        sky = torch.from_numpy(resize(foreground, size) < _HALF)
+        sky = torch.from_numpy(resize(foreground, size) < WHITE)
     if panorama.depth:
         raw = decode(locate(panorama.depth), cv2.IMREAD_UNCHANGED)
         depth = torch.from_numpy(_resize_depth(raw, size))
@@ -330,7 +337,7 @@ def _foreground(path: Path) -> NDArray[np.uint8]:
     """A sky mask, 255 or 1 = no sky. Raises ImageError for a map of classes, where all would be sky."""
     values = decode(path, cv2.IMREAD_GRAYSCALE)
     most = int(values.max())
-    if 1 < most < _HALF:
+    if 1 < most < WHITE:
         raise ImageError(
             f"{path}: its largest value is {most}, so all of it would be sky: in a sky mask that is 0"
         )

@@ -64,8 +64,8 @@ class SceneCheck:
             )
         if self.black_nadir_degrees is not None:
             found.append(
-                f"all panoramas are black within {self.black_nadir_degrees:g} degrees of straight down: "
-                "`panolog scene mask SCENE --nadir auto` masks that"
+                f"all panoramas without a mask are black within {self.black_nadir_degrees:g} degrees of straight "
+                "down: `panolog scene mask SCENE --nadir auto` masks that"
             )
         return found
 
@@ -114,10 +114,9 @@ def check_scene(scene: Scene) -> SceneCheck:
 
 
 def _black_nadir(evidence: Evidence) -> float | None:
-    """The angle of `black_nadir`, if no panorama has a mask or is transparent."""
-    if any(evidence.scene.panoramas[row].masked for row in evidence.views):
-        return None
-    return black_nadir(evidence.pictures)
+    """The angle of `black_nadir` of the panoramas that have no mask and are not transparent."""
+    masked = (evidence.scene.panoramas[row].masked for row in evidence.views)
+    return black_nadir(it for it, known in zip(evidence.pictures, masked, strict=True) if not known)
 
 
 def _conventions(evidence: Evidence, reprojection: float | None) -> list[str]:

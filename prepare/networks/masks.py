@@ -26,7 +26,7 @@ from panolog.prepare.provenance import (
     check_panorama_size,
     is_user_file,
     png_with_provenance,
-    read_layer,
+    read_mask,
     read_provenance,
 )
 from panolog.scene.errors import SceneError
@@ -128,7 +128,7 @@ def make_masks(
             path.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(path, png_with_provenance(np.where(used, 255, 0).astype(np.uint8), key))
         else:
-            used = _read(path)
+            used = read_mask(path)
         results.append(MaskResult(picture.name, 1 - share_of_sphere(used), fresh))
         progress(done, len(pictures))
     return results
@@ -172,7 +172,7 @@ def _used(picture: PanoramaFile, job: MaskJob, given: Path | None, info: ImageIn
     if info.alpha and (opaque := decode_used(picture.path)) is not None:
         used &= opaque
     if given is not None:
-        used &= ~_resized(~_read(given), height)
+        used &= ~_resized(~read_mask(given), height)
     if job.nadir is not None:
         used &= ~nadir_cone(height, job.nadir)
     if job.static is not None:
@@ -210,11 +210,6 @@ def _keep(picture: PanoramaFile) -> None:
     if is_user_file(path) and not kept.is_file():
         kept.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(kept, path.read_bytes())
-
-
-def _read(path: Path) -> Mask:
-    """(h, 2h) a mask, True = use. Raises SceneError if it is damaged or not 2:1."""
-    return np.asarray(read_layer(path) > 0)
 
 
 def _key(job: MaskJob, given: Path | None, size: tuple[int, int], alpha: bool) -> str:

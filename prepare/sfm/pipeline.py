@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.panorama_files import SUFFIXES, PanoramaFile, find_image_files
+from panolog.prepare.panorama_files import SUFFIXES, PanoramaFile, look_into, masks_among
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
 from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
@@ -103,7 +103,7 @@ def make_scene(
     made = any(panorama.path.is_relative_to(folder) for panorama in panoramas)
     link = settings.link and not made  # the workspace is removed, with the frames and whole panoramas in it
     write_scene(output, _scene(found, world), link=link, progress=lambda d, n: progress("scene", d, n))
-    report = SfmReport(found, world, (*notes, *world.notes))
+    report = SfmReport(found, world, (*notes, *world.notes), _left_out(source))
     write_report(output, report)
     shutil.rmtree(folder, ignore_errors=True)
     return report
@@ -112,22 +112,33 @@ def make_scene(
 def panoramas_in_folder(source: Path) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
     """The panoramas in a folder, or in its folder images or imgs, and the layers next to or among them.
 
+    A picture NAME_mask.png next to NAME.jpg is its mask.
+
     Raises:
         SceneError: there is no such folder, there are fewer than two panoramas, or their names collide.
     """
     if not source.is_dir():
         raise SceneError(f"{source}: there is no such folder or video")
     inner = _image_folder(source)
-    files = [path for path in find_image_files(inner) if path.relative_to(inner).parts[0] not in _LAYERS]
+    content = look_into(inner)
+    images = [path for path in content.images if path.relative_to(inner).parts[0] not in _LAYERS]
+    among = masks_among(images)
+    files = [path for path in images if path not in among.values()]
     if len(files) < MIN_CAMERAS:
-        kinds = ", ".join(sorted(SUFFIXES))
-        raise SceneError(f"{inner}: {len(files)} panoramas ({kinds}); at least {MIN_CAMERAS} are needed")
+        reason = "; ".join([f"at least {MIN_CAMERAS} are needed", *content.left_out])
+        raise SceneError(f"{inner}: {len(files)} panoramas ({', '.join(sorted(SUFFIXES))}); {reason}")
     names = tuple(path.relative_to(inner).as_posix() for path in files)
     check_names(inner, names)
     is_root = inner != source or any((source / layer).is_dir() for layer in _LAYERS)
     root = source if is_root else source.parent
     layers = {layer: find_layer(root, layer, names) for layer in _LAYERS}
+    layers[MASKS] = [mask or among.get(file) for mask, file in zip(layers[MASKS], files, strict=True)]
     return tuple(PanoramaFile(root, name, file) for name, file in zip(names, files, strict=True)), layers
+
+
+def _left_out(source: Path) -> tuple[str, ...]:
+    """`FolderContent.left_out` of a source; nothing of a video."""
+    return tuple(look_into(_image_folder(source)).left_out)  # a file has nothing below it
 
 
 def _image_folder(source: Path) -> Path:

@@ -24,6 +24,7 @@ class SfmReport:
     found: Reconstruction  # in the scene's world
     world: Georeference
     notes: tuple[str, ...]  # of the source and of the world, one line each
+    left_out: tuple[str, ...] = ()  # what of the source was not read, one line for each kind
 
     def as_json(self) -> dict[str, Any]:
         """As `--json` prints it. Errors are in pixels of the panoramas, scale errors relative."""
@@ -62,6 +63,7 @@ class SfmReport:
             ],
             "world": self._world(),
             "notes": list(self.notes),
+            "left_out": list(self.left_out),
         }
 
     def lines(self) -> Iterator[str]:
@@ -92,6 +94,7 @@ class SfmReport:
             )
         yield self._frame()
         yield from self.notes
+        yield from self.left_out
 
     def _world(self) -> dict[str, Any]:
         content: dict[str, Any] = {

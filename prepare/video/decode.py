@@ -14,10 +14,13 @@ from av.sidedata.sidedata import SideData
 from av.stream import Disposition
 from numpy.typing import NDArray
 
+from panolog.prepare.file_kinds import describe_file
+from panolog.prepare.panorama_files import SUFFIXES
 from panolog.prepare.video.colour import ColourError, Converter, check_colours
-from panolog.prepare.video.layout import STITCH, Layout, LayoutError, layout_of
+from panolog.prepare.video.layout import Layout, LayoutError, layout_of
 from panolog.prepare.video.spherical import read_spherical, spherical_of
 from panolog.scene.errors import SceneError
+from panolog.scene.pictures.kinds import STITCH
 
 MAX_FRAMES = 1_000_000  # nine hours at 30 frames per second
 _WIDTHS = (256, 12_288)  # pixels: enough to track anything, and more than any camera records
@@ -190,12 +193,13 @@ def open_video(path: Path) -> Iterator[Video]:
     """
     if not path.is_file():
         raise SceneError(f"{path}: there is no such video")
+    if path.suffix.lower() in SUFFIXES:
+        raise SceneError(f"{path}: is one picture; give the folder of the panoramas")
     try:
         container = av.open(str(path.resolve()), options=_OPTIONS, metadata_errors="replace")
     except (av.FFmpegError, UnicodeError) as error:
-        raise SceneError(
-            f"{path}: cannot be opened as a video; it is damaged, truncated before its index, or no video"
-        ) from error
+        reason = describe_file(path) or "it is damaged, truncated before its index, or no video"
+        raise SceneError(f"{path}: cannot be opened as a video; {reason}") from error
     with container, ThreadPoolExecutor(1) as ahead:
         yield Video(path, container, ahead)
 
@@ -233,15 +237,3 @@ def video_digest(path: Path) -> str:
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
     return found.hexdigest()
-
-
-def is_two_fisheyes(grey: NDArray[np.uint8]) -> bool:
-    """Whether a frame (H, W) is not a panorama but two circles side by side: black around, bright within.
-
-    Near its top and bottom a panorama shows the poles, so all pixels of a row there are similar.
-    """
-    height, width = grey.shape
-    rows = np.concatenate([grey[: max(1, height // 40)], grey[-max(1, height // 40) :]])
-    phase = np.abs((np.arange(width) + 0.5) / width % 0.5 - 0.25)  # widths from the middle of a circle
-    around, within = rows[:, phase > 0.17], rows[:, phase < 0.02]
-    return float(np.percentile(around, 99)) < 16 and float(within.mean()) > 40

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.video.decode import Video, is_two_fisheyes, open_video, video_digest
-from panolog.prepare.video.layout import STITCH
+from panolog.prepare.video.decode import Video, open_video, video_digest
 from panolog.prepare.video.motion import MotionTracker, VideoMotion, load_motion
 from panolog.prepare.video.selection import choose_frames
 from panolog.prepare.video.stamp import stamped
@@ -17,6 +16,7 @@ from panolog.prepare.video.telemetry import Telemetry, read_telemetry
 from panolog.prepare.world.exif import Attitude
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import SUFFIX, write_bytes
+from panolog.scene.pictures.kinds import describe_picture
 from panolog.scene.read import MASKS
 from panolog.scene.write import Progress, no_progress
 
@@ -143,8 +143,8 @@ def _search(video: Path, key: str, progress: Progress) -> VideoMotion:
         for number in source.frames():
             grey = source.grey()
             if grey is not None:
-                if not motion.pieces and is_two_fisheyes(grey):
-                    raise SceneError(f"{video}: its frames are two fisheye circles; {STITCH}")
+                if not motion.pieces and (what := describe_picture(grey)) is not None:
+                    raise SceneError(f"{video}: its frames are {what}")
                 motion.add(number, source.time, grey)
             progress(number + 1, 2 * max(source.promised, number + 1))
         found = VideoMotion(key, source.decoded, motion.finish(), source.notes())

@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.video.spherical import Spherical, Stereo
-
-_EXPORT = "export it as equirectangular 2:1 (mono) first"
-STITCH = f"stitch it in the camera's program, such as Insta360 Studio or GoPro Player, and {_EXPORT}"
+from panolog.scene.pictures.kinds import EXPORT, STITCH
 
 Turn = tuple[int, int, int, int]  # (a, b, c, d): x' = a x + c y, y' = b x + d y, each -1, 0 or 1
 
@@ -103,9 +101,9 @@ def layout_of(
         whole = Span(0, height, 0, width)
         return Layout(turn, whole, whole, width)
     if spherical.projection != "equirectangular":
-        raise LayoutError(f"its projection is {spherical.projection}, not equirectangular; {_EXPORT}")
+        raise LayoutError(f"its projection is {spherical.projection}, not equirectangular; {EXPORT}")
     if spherical.stereo not in _LEFT_EYE:
-        raise LayoutError(f"how it stores its two eyes is not known ({spherical.stereo}); {_EXPORT}")
+        raise LayoutError(f"how it stores its two eyes is not known ({spherical.stereo}); {EXPORT}")
     left, top, right, bottom = _LEFT_EYE[spherical.stereo]
     eye = Span(round(top * height), round(bottom * height), round(left * width), round(right * width))
     return _placed(turn, eye, spherical, widest)
@@ -123,7 +121,7 @@ def _placed(turn: Turn, eye: Span, spherical: Spherical, widest: int) -> Layout:
         place = Span(*(round(edge) for edge in edges))
         if min(place.shape) > 0:
             return Layout(turn, eye, place, width)
-    raise LayoutError(f"its frames cover too little of the panorama that its header describes; {_EXPORT}")
+    raise LayoutError(f"its frames cover too little of the panorama that its header describes; {EXPORT}")
 
 
 def _turn(matrix: bytes | None, width: int, height: int) -> Turn:

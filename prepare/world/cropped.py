@@ -20,7 +20,7 @@ from panolog.prepare.provenance import MAX_BYTES
 from panolog.prepare.world.exif import Crop, Exif, essential_exif, read_exif
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, stem_of
-from panolog.scene.image_files import ImageInfo, decode, decode_used, read_info
+from panolog.scene.image_files import ImageInfo, decode_colors, decode_used, read_info
 from panolog.scene.write import Progress, no_progress
 
 _THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama
@@ -111,7 +111,7 @@ def _completed(path: Path, exif: Exif, crop: Crop, output: Path) -> Path:
 
 def _placed(path: Path, crop: Crop) -> NDArray[np.uint8]:
     """(H, 2 H, 4) BGR and opacity of the full panorama; transparent where the picture has nothing."""
-    pixels = decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    pixels = decode_colors(path)
     used = decode_used(path)
     height = _full_height(read_info(path), crop)
     scale = height / crop.full[1]

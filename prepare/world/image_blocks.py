@@ -5,7 +5,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 
-from panolog.scene.image_files import jpeg_segments
+from panolog.scene.pictures.profiles import jpeg_segments
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")

@@ -156,10 +156,11 @@ def is_scene(source: Path) -> bool:
 
 
 def _look_at(source: Path) -> tuple[bool, int, int, bool]:
-    """Whether a source is a video, how many panoramas or frames it has, their width, whether it has masks.
+    """Whether a source is a video, how many panoramas or frames it has, their width, whether all have masks.
 
     Raises SceneError if it is damaged, or none of both.
     """
+    from panolog.prepare.panorama_files import load_resized
     from panolog.prepare.sfm.pipeline import panoramas_in_folder  # loading it is slow
     from panolog.prepare.video.decode import open_video
     from panolog.scene.image_files import check_images
@@ -169,7 +170,8 @@ def _look_at(source: Path) -> tuple[bool, int, int, bool]:
             return True, video.promised, video.width, False
     panoramas, layers = panoramas_in_folder(source)
     width, _ = check_images([panorama.path for panorama in panoramas])
-    return False, len(panoramas), width, any(layers.get(MASKS, []))
+    load_resized(panoramas[0].path, 256)  # fisheye circles, of which all are, are refused at once
+    return False, len(panoramas), width, all(layers[MASKS])
 
 
 def check_output(root: Path, settings: Settings) -> None:

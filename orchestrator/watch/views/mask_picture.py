@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import PanoramaFile, load_resized
-from panolog.prepare.provenance import read_layer
+from panolog.prepare.provenance import read_mask
 from panolog.scene.files import write_bytes
 from panolog.scene.read import MASKS
 
@@ -45,7 +45,7 @@ def _tile(panorama: PanoramaFile) -> NDArray[np.uint8]:
     mask = panorama.layer(MASKS)
     if not mask.is_file():
         return picture
-    used = read_layer(mask) > 0
+    used = read_mask(mask)
     out = cv2.resize((~used).astype(np.float32), (_WIDTH, _WIDTH // 2), interpolation=cv2.INTER_AREA)
     share = _TINT * out[..., None]
     return np.asarray(picture * (1 - share) + _RED * share, np.uint8)

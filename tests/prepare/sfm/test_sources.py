@@ -66,3 +66,50 @@ def test_where_pictures_and_masks_are(pictures: str, given: str, tmp_path: Path)
     assert [panorama.name for panorama in panoramas] == ["0.png", "1.png"]
     assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
     assert layers["depths"] == [None, None]
+
+
+def test_a_mask_next_to_its_panorama_is_no_panorama(tmp_path: Path) -> None:
+    """It was reconstructed as one more picture, and the operator was trained."""
+    _pictures(tmp_path / "images")
+    mask = np.full((64, 128), 255, np.uint8)
+    cv2.imwrite(str(tmp_path / "images" / "1_mask.png"), mask)
+    panoramas, layers = panoramas_in_folder(tmp_path / "images")
+    assert [panorama.name for panorama in panoramas] == ["0.png", "1.png"]
+    assert layers["masks"] == [None, tmp_path / "images" / "1_mask.png"]
+
+
+def test_what_is_left_out_is_in_the_refusal(tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    _pictures(folder)
+    (folder / "0.png").rename(folder / "0.insp")
+    (folder / "2.HEIC").touch()
+    lines = (
+        r"1 file \(0\.insp\): left out, each a photograph of two fisheye",
+        r"1 file \(2\.HEIC\): left out, each HEIC; convert it with `heif",
+    )
+    words = "1 panoramas .*; at least 2 are needed; " + ".*; ".join(lines)
+    with pytest.raises(InputError, match=words):
+        panoramas_in_folder(folder)
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ((64, 128), "is no panorama, but shows two fisheye circles; stitch it"),
+        ((128, 64), "512 x 1024 pixels are not 2:1: not a panorama; it shows two fisheye circles; stitch it"),
+        ((64, 64), "512 x 512 pixels are not 2:1: not a panorama; it shows one fisheye circle; stitch it"),
+    ],
+)
+def test_fisheye_circles_are_refused_by_name(shape: tuple[int, int], words: str, tmp_path: Path) -> None:
+    """Poses were found for two circles as if they were a panorama; one among six was 79 degrees off."""
+    scale, folder = 8, tmp_path / "images"
+    _pictures(folder)
+    for path in folder.iterdir():
+        cv2.imwrite(str(path), np.random.default_rng(0).integers(60, 255, (64 * scale, 128 * scale, 3)))
+    height, width = (scale * size for size in shape)
+    side = min(height, width)
+    y, x = (np.mgrid[:height, :width] + 0.5) % side / side * 2 - 1
+    circles = np.where(np.hypot(x, y) < 1, np.random.default_rng(0).integers(60, 255, (height, width)), 0)
+    cv2.imwrite(str(folder / "1.png"), circles)
+    with pytest.raises(InputError, match=f"1.png: {words}"):
+        make_scene(folder, tmp_path / "scene", SfmSettings(), no_progress)

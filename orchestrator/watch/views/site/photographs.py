@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from panolog.scene.colmap_files import read_image_records
 from panolog.scene.errors import InputError
+from panolog.scene.pictures.profiles import in_srgb
 from panolog.scene.read import check_names, image_folder, model_folder
 from panolog.scene.stores.outline import whole
 from panolog.scene.stores.store import PATIENCE_S
@@ -41,7 +42,7 @@ def small_copy(file: BinaryIO, name: str, width: int) -> bytes:
             picture.draft("RGB", (width, width // 2))  # JPEG can be decoded smaller
             picture.thumbnail((width, width // 2), reducing_gap=3.0)
             output = BytesIO()
-            picture.convert("RGB").save(output, "JPEG", quality=85)
+            in_srgb(picture).save(output, "JPEG", quality=85)
     except _DAMAGED as error:
         raise InputError(f"{name} cannot be decoded") from error
     return output.getvalue()

@@ -130,7 +130,13 @@ def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     writer = cv2.VideoWriter(str(tmp_path / "flat.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (320, 240))
     writer.write(np.zeros((240, 320, 3), np.uint8))
     writer.release()
+    for name in ("a.png", "b.png"):
+        circles = np.full((128, 256), 90, np.uint8)
+        circles[np.hypot(*(np.mgrid[:128, :256] % 128 - 63.5)) > 64] = 0
+        (tmp_path / "fisheye").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "fisheye" / name), circles)
     wrong = {
+        "fisheye": "a.png: is no panorama, but shows two fisheye circles; stitch it in",
         "one": "1 panoramas .*; at least 2 are needed",
         "flat": "64 x 40 pixels are not 2:1",
         "sizes": "all panoramas must have one size",

@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
+from panolog.orchestrator.cli.session.preparing import settings_of
 from panolog.orchestrator.runs import control
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import PENDING, read_info
 from panolog.orchestrator.runs.preparation import notes
-from panolog.orchestrator.runs.preparation.settings import Step, read_settings
+from panolog.orchestrator.runs.preparation.settings import Options, Step, read_settings
 from panolog.orchestrator.runs.records import Noticed, Preparing
 from panolog.orchestrator.runs.state import ignore
 from panolog.orchestrator.runs.store import read_records
@@ -162,6 +163,16 @@ def test_masks_of_the_source_are_kept_as_they_are(town: Path, sfm: FakeSfm, tmp_
     settings = read_settings(RunFolder(tmp_path / "run"))
     assert settings is not None
     assert settings.steps() == (Step.SFM, Step.CHECK)
+
+
+def test_one_mask_in_the_source_switches_nothing_off_for_the_others(
+    town: Path, sfm: FakeSfm, tmp_path: Path
+) -> None:
+    """The operator was trained in all panoramas that have none."""
+    for count in (1, 8):
+        settings = settings_of(with_masks(town, tmp_path / str(count), count), Options())
+        assert settings is not None
+        assert (settings.nadir, settings.static) == (10, True)
 
 
 def test_masks_of_the_source_are_joined_with_what_is_wanted(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:

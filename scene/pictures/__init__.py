@@ -1,0 +1,1 @@
+"""Pictures: which are no panoramas, and what their colours mean."""
