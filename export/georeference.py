@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.export.coordinates import GEOCENTRIC, check_unit, is_plane, to_geocentric
 from panolog.export.earth import enu_to_ecef, geodetic_of
 from panolog.export.frame import HALF_TURN, Y_DOWN, Frame
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.model import NO_OFFSET, Scene, Vector
 from panolog.scene.write import Origin, read_offset
 
-GEOCENTRIC = 4978  # EPSG: WGS84 as x, y, z in metres from the middle of the earth
 _AGREEMENT = 0.7  # length of the mean of the cameras' unit ups from which on they have one
 _SNAP = 0.996  # cosine of 5 degrees: an up so close to an axis of the world is that axis
 _STEP = 10.0  # metres, over which a projection is taken to be linear: it errs by less than a millimetre
@@ -32,7 +32,20 @@ class Georeference:
     offset: Vector = NO_OFFSET
     origin: Origin | None = None  # the source's coordinates are metres east, north and up of it
     epsg: int | None = None  # the source's coordinate system
-    metres: float | None = None  # of a unit; None = not known
+    metres: float | None = None  # of a unit, as the user or the scene says; None = not known
+    geoid: float | None = None  # metres above the ellipsoid, if heights are above the sea
+
+    @property
+    def unit(self) -> float | None:
+        """Metres of a unit; None if nothing is known of it.
+
+        Raises InputError if the coordinate system is not known, or has another unit than `metres` says.
+        """
+        if self.epsg is not None:
+            return check_unit(self.epsg, self.metres)
+        if self.origin is not None and self.metres not in (None, 1.0):
+            raise ConfigError("the scene is in metres east, north and up of its place; leave out the metres")
+        return self.metres
 
     @property
     def frame(self) -> Frame:
@@ -45,6 +58,11 @@ class Georeference:
         upright = self.frame
         return Frame(HALF_TURN.rotation @ upright.rotation, upright.origin)
 
+    @property
+    def heights_known(self) -> bool:
+        """Whether it is known what heights are above. Raises InputError as `unit`."""
+        return self.geoid is not None or (self.epsg is not None and not is_plane(self.epsg))
+
     def to_ecef(self) -> Doubles | None:
         """(4, 4) from the model's coordinates to metres from the earth's middle (WGS84); None if unknown.
 
@@ -54,13 +72,14 @@ class Georeference:
         offset[:3, 3] = self.offset
         if self.origin is not None:
             place = self.origin
-            return enu_to_ecef(place.latitude, place.longitude, place.altitude) @ offset
+            height = place.altitude + (self.geoid or 0)
+            return enu_to_ecef(place.latitude, place.longitude, height) @ offset
         if self.epsg == GEOCENTRIC:
             return offset
-        return None if self.epsg is None else self._projected(self.epsg)
+        return None if self.epsg is None else self._in_system(self.epsg)
 
     def tiles_to_ecef(self) -> Doubles | None:
-        """(4, 4) from the axes of 3D Tiles, x, −z and y of an export, to metres from the earth's middle.
+        """(4, 4) from the axes of 3D Tiles, x, −z and y of an export in metres, to ECEF.
 
         Rigid: a projection's scale, some tenths of a thousandth, is left out. None and what it raises as
         `to_ecef`.
@@ -91,11 +110,13 @@ class Georeference:
                 "frame": "ENU" if self.origin else None,
                 "origin": self.origin.model_dump() if self.origin else None,
                 "epsg": self.epsg,
-                "metres_per_unit": self.metres,
+                "metres_per_unit": self.unit,
+                "geoid": self.geoid,
                 "to_ecef": None if ecef is None else ecef.tolist(),
             },
             "exports": {
                 "axes": "x right, y up, z backward",
+                "in_metres": [".glb", "tileset.json"],
                 "half_turn_around_z": [".sog", ".compressed.ply", "lod-meta.json"],
                 "rotation": frame.rotation.tolist(),
                 "origin": frame.origin.tolist(),
@@ -104,23 +125,11 @@ class Georeference:
             "provenance": dict(provenance),
         }
 
-    def _projected(self, epsg: int) -> Doubles:
-        """`to_ecef` of a coordinate system that needs the library PROJ."""
-        try:
-            from pyproj import CRS, Transformer  # noqa: PLC0415  # needed for this alone
-            from pyproj.exceptions import CRSError, ProjError  # noqa: PLC0415
-        except ModuleNotFoundError as error:
-            reason = "converting coordinate systems needs pyproj: `pip install pyproj`"
-            raise ConfigError(f"EPSG:{epsg}: {reason}") from error
+    def _in_system(self, epsg: int) -> Doubles:
+        """`to_ecef` of a coordinate system."""
         middle = np.array(self.offset) + self.middle
         points = middle + _STEP * np.concatenate([np.zeros((1, 3)), np.eye(3)])
-        x, y, z = points.T
-        try:
-            system = CRS.from_epsg(epsg).to_3d()
-            convert = Transformer.from_crs(system, CRS.from_epsg(GEOCENTRIC), always_xy=True)
-            found = np.stack(convert.transform(x, y, z, errcheck=True), axis=1)
-        except (CRSError, ProjError) as error:
-            raise ConfigError(f"EPSG:{epsg}: cannot be converted to WGS84: {error}") from error
+        found = to_geocentric(epsg, points, self.geoid)
         linear = np.eye(4)
         linear[:3, :3] = (found[1:] - found[0]).T / _STEP
         linear[:3, 3] = found[0] - linear[:3, :3] @ self.middle
@@ -135,14 +144,14 @@ def georeference_of(scene: Scene) -> Georeference:
     found = Georeference(_up(scene), middle, scene.offset)
     if known is None:
         return found
-    metric = known.frame is not None or known.epsg is not None
     return replace(
         found,
         up=(0.0, 0.0, 1.0) if known.frame == "ENU" else found.up,
         offset=tuple((np.array(scene.offset) + known.offset).tolist()),
         origin=known.origin,
         epsg=known.epsg,
-        metres=known.metres or (1.0 if metric else None),
+        metres=known.metres or (1.0 if known.frame else None),
+        geoid=known.geoid,
     )
 
 
@@ -155,7 +164,8 @@ def georeference_from(content: Any, where: object) -> Georeference:
         if vectors.shape != (3, 3) or not np.isfinite(vectors).all():
             raise ValueError("a direction or a place is not three numbers")
         up, middle, offset = map(tuple, vectors.tolist())
-        return Georeference(up, middle, offset, origin, model["epsg"], model["metres_per_unit"])
+        known = model["epsg"], model["metres_per_unit"], model.get("geoid")
+        return Georeference(up, middle, offset, origin, *known)
     except (KeyError, TypeError, ValueError) as error:
         raise SceneError(f"{where}: is not of this PanoLOG's format: {error}; remove it") from error
 

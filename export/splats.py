@@ -18,6 +18,7 @@ Part = Literal["scene", "sky", "all"]
 
 REST = (0, 3, 8, SH_REST)  # coefficients of one channel beyond degree 0, by degree
 ROWS = 65_536  # of a piece
+_INSIDE = 0.999  # of a reach, which a model that was larger has
 _LIMIT = (
     30.0  # of logarithms, so that an opacity of 1 and a size of 0, as other trainers have them, are finite
 )
@@ -70,6 +71,13 @@ class Splats:
         """The same in a frame."""
         means, quats, rest = frame.turn(self.means, self.quats, self.shN)
         return replace(self, means=means, quats=quats, shN=rest)
+
+    def scaled(self, factor: float) -> "Splats":
+        """The same, so many times as large, around the origin."""
+        if factor == 1:
+            return self
+        grown = np.float32(np.log(factor))
+        return replace(self, means=self.means * np.float32(factor), scales=self.scales + grown)
 
     def reduced(self, degree: int) -> "Splats":
         """The same with spherical harmonics of at most a degree."""
@@ -162,6 +170,7 @@ class ModelSource:
     path: Path
     selection: Selection = field(default_factory=Selection)
     frame: Frame = field(default_factory=Frame)
+    scale: float = 1.0  # exported units, such as metres, of one of the model
     count: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -175,12 +184,24 @@ class ModelSource:
 
     def part(self, part: Part) -> "ModelSource":
         """The same model, choice and frame, of another part."""
-        return ModelSource(self.path, replace(self.selection, part=part), self.frame)
+        return ModelSource(self.path, replace(self.selection, part=part), self.frame, self.scale)
+
+    def within(self, reach: float, size: float) -> "ModelSource":
+        """The same, made smaller around the origin of its frame until it fits: from there it looks the same.
+
+        Args: reach, the largest coordinate, and size, the largest of a Gaussian, that a file can hold.
+        Raises PlyError if the file has changed meanwhile.
+        """
+        shrink = 1.0
+        for piece in self.pieces():
+            far, large = float(np.abs(piece.means).max()), float(np.exp(piece.scales.max()))
+            shrink = min(shrink, _INSIDE * reach / max(far, _INSIDE), size / large)
+        return self if shrink == 1 else replace(self, scale=self.scale * shrink)
 
     def pieces(self) -> Iterator[Splats]:
         """All of them, `ROWS` or fewer at a time. Raises PlyError if the file has changed meanwhile."""
         for chosen in self._selected():
-            yield chosen.reduced(self.degree).turned(self.frame)
+            yield chosen.reduced(self.degree).turned(self.frame).scaled(self.scale)
 
     def _selected(self) -> Iterator[Splats]:
         """In the coordinates of the model."""

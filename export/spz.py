@@ -42,6 +42,8 @@ _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, degree, fractional
 _EXTENDED = 2  # flag: there are extensions
 _TABLE = struct.Struct("<QQ")  # compressed and plain size of a stream
 _BITS = range(12, 24)  # fractional bits: 12 are the default of the reference, whose users rely on ±2048
+REACH = 2.0 ** (23 - _BITS[0])  # units from the origin, in an axis, up to which positions fit
+LARGEST = 380.0  # units of a Gaussian: one more is a byte of 256
 _STEPS = 8.0  # of positions, at least, in the size of the smallest Gaussians
 _SMALL = 0.01  # of the Gaussians are smaller
 _DEGREES = 4  # of the spherical harmonics, at most, in a file
@@ -80,7 +82,7 @@ def encode(file: BinaryIO, source: SplatSource, version: Version = 3) -> None:
     extent = float(np.abs(means).max())
     if not np.isfinite(extent) or most_bits(extent) < _BITS[0]:
         raise FormatError(
-            f"a Gaussian is {extent:.0f} units from the origin, and SPZ holds ±{2 ** (23 - _BITS[0])}; "
+            f"a Gaussian is {extent:.0f} units from the origin, and SPZ holds ±{REACH:.0f}; "
             f"export without the sky, or crop the model"
         )
     order = morton_order(means)

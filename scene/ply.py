@@ -188,6 +188,26 @@ def ply_exact(path: Path) -> bool:
     return exact_of(_open(path)[0])
 
 
+def describe_faults(path: Path) -> list[str]:
+    """What is wrong with the Gaussians of a PLY, one line for each kind. Raises PlyError as `ply_header`."""
+    table, _, _ = _open(path)
+    numbers = [name for name in COLUMNS if name in (table.dtype.names or ())]
+    infinite = empty = 0
+    for start in range(0, table.count, CHUNK):
+        rows = table.rows(start, min(start + CHUNK, table.count))
+        infinite += int((~np.all([np.isfinite(rows[name]) for name in numbers], axis=0)).sum())
+        empty += int(np.all([rows[f"rot_{axis}"] == 0 for axis in range(4)], axis=0).sum())
+    lines, of = [], f"of {table.count:,} Gaussians have"
+    if infinite:
+        lines.append(f"{path}: {infinite:,} {of} numbers that are not finite; exports leave them out")
+    if empty:
+        lines.append(
+            f"{path}: {empty:,} {of} a rotation of zeros, as rows have that a program did not write; export "
+            "the model again"
+        )
+    return lines
+
+
 def _header(count: int, sky: int, offset: Vector, exact: bool) -> bytes:
     lines = [
         "ply",

@@ -53,8 +53,9 @@ class Offset(_Strict):
 
     A scene's coordinates plus `offset` are the source's: those of the program that it was imported from, or
     metres east, north and up of `origin` (WGS84; degrees, metres). One may add what is known of others:
-    `epsg`, the number of the source's coordinate system (east, north, up, or geocentric, in metres), or the
-    metres of a unit. Training computes in float32, so large numbers are here and never in the coordinates.
+    `epsg`, the number of the source's coordinate system (projected, or geocentric), the metres of a unit, or
+    `geoid`, if heights are above the sea: how high it is there above the ellipsoid. Training computes in
+    float32, so large numbers are here and never in the coordinates.
     """
 
     offset: tuple[_Coordinate, _Coordinate, _Coordinate] = Field(description="to be added, in scene units")
@@ -64,6 +65,12 @@ class Offset(_Strict):
     origin: Origin | None = None
     epsg: int | None = Field(default=None, ge=1, le=999_999, description="of the source's coordinate system")
     metres: float | None = Field(default=None, gt=0, lt=1e9, description="of a unit of the scene")
+    geoid: float | None = Field(
+        default=None,
+        ge=-120,
+        le=120,
+        description="metres of the geoid above the ellipsoid, of heights above it",
+    )
 
     @model_validator(mode="after")
     def _together(self) -> "Offset":

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from panolog.orchestrator.cli.console import print_result, progress_bar
+from panolog.orchestrator.cli.console import print_result, progress_bar, say
 from panolog.orchestrator.cli.options import AnyModelArg, JsonOption
 from panolog.orchestrator.cli.stores import opened
 from panolog.scene.errors import InputError
@@ -58,6 +58,10 @@ Up = Annotated[
 ]
 Epsg = Annotated[int | None, _place("N", "Coordinate system of the scene's coordinates.", min=1)]
 Metres = Annotated[float | None, _place("M", "Metres of a unit. Default: as the scene says.", min=1e-6)]
+Geoid = Annotated[
+    float | None,
+    _place("M", "Heights are above the sea: how high that is there above the ellipsoid.", min=-120, max=120),
+]
 
 
 def export(
@@ -79,6 +83,7 @@ def export(
     up: Up = None,
     epsg: Epsg = None,
     metres: Metres = None,
+    geoid: Geoid = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write a model as small files for viewers, browsers, engines and globes."""
@@ -101,8 +106,9 @@ def export(
             up=direction or None,
             epsg=epsg,
             metres=metres,
+            geoid=geoid,
         )
-        sizes = {str(path): size_of(path) for path in export_model(root, output, spec, show)}
+        sizes = {str(path): size_of(path) for path in export_model(root, output, spec, show, say)}
     lines = (f"{path}  {size / 1e6:,.1f} MB" for path, size in sizes.items())
     files = [{"path": path, "bytes": size} for path, size in sizes.items()]
     print_result({"files": files}, lines, as_json=as_json)

@@ -40,6 +40,69 @@ def test_projected_coordinates() -> None:
         replace(place, epsg=999_999).to_ecef()
 
 
+def placed(epsg: int, offset: tuple[float, float, float], **fields: float) -> Georeference:
+    pytest.importorskip("pyproj", reason="pyproj is not installed")
+    return Georeference(up=(0, 0, 1), offset=offset, epsg=epsg, **fields)
+
+
+def test_feet() -> None:
+    """A model in feet is as large as it is, and as high: it was 3.28 times too large."""
+    place = placed(2263, (987_000.0, 213_000.0, 1_000.0))
+    foot = 1200 / 3937
+    assert place.unit == pytest.approx(foot, rel=1e-9)
+    ecef = place.to_ecef()
+    assert ecef is not None
+    np.testing.assert_allclose(np.linalg.norm(ecef[:3, :3], axis=0), foot, rtol=1e-3)
+    assert geodetic_of(ecef[:3, 3])[2] == pytest.approx(1_000 * foot, abs=1e-3)
+    with pytest.raises(
+        ConfigError, match=r"EPSG:2263 has units of 0\.304801 m, not of 1 m; leave out the metres"
+    ):
+        _ = replace(place, metres=1.0).unit
+
+
+@pytest.mark.parametrize(
+    ("epsg", "words"),
+    [
+        (
+            4326,
+            r"EPSG:4326 \(WGS 84\): is in degree, and a model's axes are lengths; give a projected system",
+        ),
+        (4979, "is in degree and metre, and a model's axes are lengths"),
+        (5773, "is in metre, and a model's axes are lengths"),  # heights alone
+        (8360, "is in degree and metre"),  # degrees, with heights above the sea
+    ],
+)
+def test_systems_that_models_cannot_be_in(epsg: int, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        _ = placed(epsg, (8.5, 47.3, 400.0)).unit
+
+
+def test_heights_above_the_sea() -> None:
+    """The geoid is 47 m above the ellipsoid at Zurich: so much too low the model used to be."""
+    zurich = (465_000.0, 5_247_000.0, 400.0)
+    with pytest.raises(
+        ConfigError, match=r"EPSG:5555 .*: has heights above the sea, and .* give EPSG:25832 and"
+    ):
+        placed(5555, zurich).to_ecef()
+    heights = {}
+    for geoid in (None, 47.0):
+        place = placed(25832, zurich, **({} if geoid is None else {"geoid": geoid}))
+        ecef = place.to_ecef()
+        assert ecef is not None
+        assert place.heights_known == (geoid is not None)
+        heights[geoid] = geodetic_of(ecef[:3, 3])
+    assert heights[None] == pytest.approx((47.3755213, 8.5363698, 400.0), abs=1e-3)
+    assert heights[47.0] == pytest.approx((47.3755213, 8.5363698, 447.0), abs=1e-3)
+    gps = Georeference(up=(0, 0, 1), origin=MUNICH, geoid=46.0).to_ecef()
+    assert gps is not None
+    assert geodetic_of(gps[:3, 3])[2] == pytest.approx(566.0, abs=1e-6)
+
+
+def test_metres_that_contradict_the_place() -> None:
+    with pytest.raises(ConfigError, match="in metres east, north and up of its place; leave out the metres"):
+        _ = Georeference(origin=MUNICH, metres=0.5).unit
+
+
 def test_a_scene_with_cameras_alone(tmp_path: Path) -> None:
     scene = read_scene(write_scene(tmp_path / "scene"))
     found = georeference_of(scene)  # its cameras are turned at random

@@ -195,6 +195,13 @@ def test_blocks_with_few_cameras_keep_what_stage_one_made() -> None:
     assert Plan.from_json(stored).trained.tolist() == [True, True]
 
 
+def test_audit_names_blocks_of_hardly_any_gaussians() -> None:
+    scores = np.ones((6, 4))
+    few = replace(plan(scores), gaussians=np.array([1000, 26, 100, 500]))
+    (line,) = (line for line in audit(few, scores) if "hardly anything" in line)
+    assert line.startswith("block 1 begins with 26 Gaussians of Stage I")
+
+
 def test_audit_reports_uneven_blocks() -> None:
     scores = np.ones((6, 4))
     made = plan(scores)

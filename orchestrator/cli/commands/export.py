@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from panolog.export.compressed_ply import write_compressed_ply
-from panolog.export.detail import SIDE
 from panolog.export.frame import Frame
 from panolog.export.georeference import Georeference, georeference_from, georeference_of
 from panolog.export.gltf.glb import write_glb
@@ -19,14 +18,14 @@ from panolog.export.site.write import DESCRIPTION
 from panolog.export.sky import render_sky, write_sky_image
 from panolog.export.sog.write import write_sog
 from panolog.export.splats import ModelSource, Part, Selection
-from panolog.export.spz import Version, write_spz
+from panolog.export.spz import LARGEST, REACH, Version, write_spz
 from panolog.orchestrator.cli.session.delivery import provenance
 from panolog.orchestrator.engine.stages.scenes import scene_of
 from panolog.orchestrator.runs.folder import RunFolder, model_of, write_json
 from panolog.orchestrator.runs.info import read_info
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_file, site_of_run, write_folder
 from panolog.scene.errors import ConfigError, InputError
-from panolog.scene.ply import read_sky
+from panolog.scene.ply import describe_faults, read_sky
 from panolog.scene.write import StageProgress
 
 # By option, the ending of what it writes.
@@ -54,6 +53,7 @@ class ExportSpec:
     up: tuple[float, float, float] | None = None  # in the model's coordinates; None = as the scene has it
     epsg: int | None = None  # of the source's coordinates, instead of what the scene says
     metres: float | None = None  # of a unit, likewise
+    geoid: float | None = None  # metres above the ellipsoid, likewise: heights are above the sea
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +67,14 @@ class _Model:
     made_of: dict[str, Any]
 
 
-def export_model(source: Path, output: Path, spec: ExportSpec, progress: StageProgress) -> list[Path]:
+def export_model(
+    source: Path, output: Path, spec: ExportSpec, progress: StageProgress, say: Callable[[str], None]
+) -> list[Path]:
     """Writes a model in some formats; returns what was written, files and folders.
 
     With one format whose ending `output` has, that is the file; else it is a folder, with georef.json.
 
-    Args: source, the folder of a run or a PLY.
+    Args: source, the folder of a run or a PLY; say, is called with what the user should know of the model.
     Raises InputError if the source is no model, the place or a format does not fit, or `output` exists as
     something else; OSError if it cannot be written.
     """
@@ -91,6 +93,9 @@ def export_model(source: Path, output: Path, spec: ExportSpec, progress: StagePr
     if output.is_dir() and written != [output]:
         write_json(output / _GEOREFERENCE, model.place.as_json(model.made_of))
         written.append(output / _GEOREFERENCE)
+    faults = describe_faults(model.ply) if model.run is None else []
+    for line in (*faults, *_doubts(model.place, formats)):
+        say(line)
     progress("writing", len(jobs), len(jobs))
     return written
 
@@ -109,13 +114,23 @@ def _model(source: Path, spec: ExportSpec) -> _Model:
         )
     else:
         ply, place, made_of, name = source, Georeference(), {}, source.stem
-    place = replace(
-        place, up=spec.up or place.up, epsg=spec.epsg or place.epsg, metres=spec.metres or place.metres
-    )
     if spec.epsg is not None:
-        place = replace(place, origin=None, metres=spec.metres or 1.0)
+        place = replace(place, origin=None, epsg=spec.epsg, metres=None, geoid=None)
+    geoid = place.geoid if spec.geoid is None else spec.geoid
+    place = replace(place, up=spec.up or place.up, metres=spec.metres or place.metres, geoid=geoid)
     _frame(place)
+    _ = place.unit  # that it fits is known before anything is written
     return _Model(folder, ply, name, place, made_of)
+
+
+def _doubts(place: Georeference, formats: tuple[str, ...]) -> list[str]:
+    """What of its place is not known, and matters for a globe."""
+    if "3dtiles" not in formats or place.heights_known or place.to_ecef() is None:
+        return []
+    return [
+        "heights are taken to be above the ellipsoid of WGS84; if they are above the sea, as those of maps "
+        "and most GPS receivers, give with --geoid how high that is there above the ellipsoid"
+    ]
 
 
 def _place_of(folder: RunFolder) -> Georeference:
@@ -160,10 +175,12 @@ def _place(output: Path, name: str, kind: str, count: int) -> Path:
     return output / (ending[1:] if folder else f"{stem}{ending}")
 
 
-def _source(model: _Model, spec: ExportSpec, part: Part, frame: Frame | None = None) -> ModelSource:
+def _source(
+    model: _Model, spec: ExportSpec, part: Part, frame: Frame | None = None, scale: float = 1.0
+) -> ModelSource:
     """Raises InputError if nothing is left of the model."""
     selection = replace(spec.selection, part=part)
-    found = ModelSource(model.ply, selection, frame or model.place.frame)
+    found = ModelSource(model.ply, selection, frame or model.place.frame, scale)
     if not found.count:
         raise InputError(f"{model.ply}: nothing is left of it; select more")
     return found
@@ -179,12 +196,12 @@ def _sog(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
 
 
 def _spz(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
-    """The sky, whose size SPZ may not hold, is a file of its own."""
+    """The sky, whose size SPZ may not hold, is a file of its own: pulled in, so that it looks the same."""
     write_spz(path, _source(model, spec, "scene"), spec.spz)
     if not spec.sky or not len(read_sky(model.ply)):
         return [path]
     sky = sky_of(path)
-    write_spz(sky, _source(model, spec, "sky"), spec.spz)
+    write_spz(sky, _source(model, spec, "sky").within(REACH, LARGEST), spec.spz)
     return [path, sky]
 
 
@@ -194,15 +211,18 @@ def _compressed_ply(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
 
 
 def _glb(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
-    write_glb(path, _source(model, spec, "scene"))
+    write_glb(path, _in_metres(model, spec))
     return [path]
 
 
 def _tiles(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
-    side = SIDE / (model.place.metres or 1.0)
-    source = _source(model, spec, "scene")
-    write_tiles(path, source, to_ecef=model.place.tiles_to_ecef(), side=side, levels=spec.levels)
+    write_tiles(path, _in_metres(model, spec), to_ecef=model.place.tiles_to_ecef(), levels=spec.levels)
     return [path]
+
+
+def _in_metres(model: _Model, spec: ExportSpec) -> ModelSource:
+    """The scene in the unit of glTF and 3D Tiles, where it is known how large one of the model's is."""
+    return _source(model, spec, "scene", scale=model.place.unit or 1.0)
 
 
 def _web(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:

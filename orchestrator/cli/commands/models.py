@@ -9,7 +9,9 @@ from typing import Literal
 from panolog.export.frame import Frame
 from panolog.export.georeference import georeference_of
 from panolog.export.reading import convert_to_ply, is_ply
+from panolog.orchestrator.cli.console import say
 from panolog.scene.model import Scene
+from panolog.scene.ply import describe_faults
 
 Axes = Literal["export", "model"]
 
@@ -36,6 +38,8 @@ def as_ply(path: Path, frame: Callable[[], Frame], *, exact: bool) -> Iterator[P
     Raises FormatError if it is no model.
     """
     if path.is_file() and is_ply(path):
+        for line in describe_faults(path):
+            say(line)
         yield path
         return
     with TemporaryDirectory(prefix="panolog-model-") as folder:

@@ -200,3 +200,67 @@ def test_files_that_are_no_models(run: RunFolder, tmp_path: Path, content: bytes
     for command in ("eval", "render"):
         options = ["-o", tmp_path / "x", "--path", 2] if command == "render" else []
         assert str(file) in one_line(panolog(command, run.root, "--model", file, *options))
+
+
+def box_of(folder: Path) -> NDArray[np.float64]:
+    """(3,) half the size of a tileset."""
+    root = json.loads((folder / "tileset.json").read_bytes())["root"]
+    return np.array(root["boundingVolume"]["box"][3:]).reshape(3, 3).diagonal()
+
+
+def test_gltf_and_3d_tiles_are_in_metres(run: RunFolder, tmp_path: Path) -> None:
+    """`--metres` was ignored."""
+    for name, options in (("units", []), ("metres", ["--metres", 0.25])):
+        export(run.point_cloud, "-o", tmp_path / name, "--3dtiles", *options)
+    np.testing.assert_allclose(box_of(tmp_path / "metres"), box_of(tmp_path / "units") / 4, rtol=1e-3)
+    wrong = panolog("export", run.root, "-o", tmp_path / "no", "--3dtiles", "--metres", 0.25)
+    assert "in metres east, north and up of its place" in one_line(wrong)
+    assert not (tmp_path / "no").exists()
+
+
+def test_heights_of_a_globe(run: RunFolder, tmp_path: Path) -> None:
+    """What GPS gave is above the sea with most receivers: that it is not known is said, and can be given."""
+    heights = []
+    for name, options, said in (("a", [], True), ("b", ["--geoid", 46], False)):
+        done = export(run.root, "-o", tmp_path / name, "--3dtiles", "--glb", *options)
+        assert ("heights are taken to be above the ellipsoid" in done.stderr) == said
+        heights.append(
+            json.loads((tmp_path / name / "georef.json").read_bytes())["exports"]["wgs84"]["height"]
+        )
+    assert heights[1] - heights[0] == pytest.approx(46, abs=1e-3)
+
+
+def test_a_sky_that_spz_cannot_hold_is_pulled_in(run: RunFolder, tmp_path: Path) -> None:
+    """A scene with a point beyond 205 m was refused at the radius of its sky."""
+    whole = read_ply(run.point_cloud)
+    tensors = whole.tensors()
+    means, scales = tensors["means"].clone(), tensors["scales"].clone()
+    means[-whole.sky :] *= 300
+    scales[-whole.sky :] += np.log(300)
+    write_ply(tmp_path / "far.ply", whole.with_tensors(tensors | {"means": means, "scales": scales}))
+    assert means.abs().max() > 2048
+    export(tmp_path / "far.ply", "-o", tmp_path / "far.spz")
+    found, true = (
+        read_model(tmp_path / "far-sky.spz"),
+        whole.select(torch.arange(len(whole)) >= len(whole) - 4),
+    )
+    assert 1000 < np.abs(found.means).max() < 2048  # less, as its Gaussians have to fit, too
+    sizes = [np.exp(side.scales).max() / np.linalg.norm(side.means, axis=1).max() for side in (found,)]
+    was = float(true.scales.exp().max() / true.means.norm(dim=1).max())
+    assert sizes[0] == pytest.approx(was, rel=0.1)  # as large as it was, seen from the origin
+    assert len(read_model(tmp_path / "far.spz")) == len(whole) - whole.sky
+
+
+def test_rows_that_are_no_gaussians_are_counted(run: RunFolder, tmp_path: Path) -> None:
+    whole = read_ply(run.point_cloud)
+    tensors = {name: tensor.clone() for name, tensor in whole.tensors().items()}
+    tensors["means"][:5] = torch.nan
+    for tensor in tensors.values():
+        tensor[10:17] = 0
+    write_ply(tmp_path / "bad.ply", whole.with_tensors(tensors))
+    done = export(tmp_path / "bad.ply", "-o", tmp_path / "bad.sog")
+    assert (
+        f"5 of {len(whole)} Gaussians have numbers that are not finite; exports leave them out" in done.stderr
+    )
+    assert f"7 of {len(whole)} Gaussians have a rotation of zeros" in done.stderr
+    assert "not finite" not in export(run.point_cloud, "-o", tmp_path / "good.sog").stderr

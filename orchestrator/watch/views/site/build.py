@@ -141,7 +141,7 @@ def _page(title: str, model: Model, place: Georeference, wanted: Wanted) -> Page
         total=model.total,
         start=Pose.towards(middle + away, -away),
         step=radius / _STEPS,
-        metres_per_unit=place.metres,
+        metres_per_unit=place.unit,
         sky=None if model.sky is None or not wanted.sky else _sky_picture(model.sky, place.frame),
     )
 
@@ -166,7 +166,7 @@ def _reduced(
             write_sog(folder / MODEL, source)
             return MODEL
         sky = None if model.sky is None or not wanted.sky else _sky_source(model.sky, place.upside_down)
-        side = SIDE / (place.metres or 1.0)
+        side = SIDE / (place.unit or 1.0)
         write_streamed(folder / STREAMED, source, sky, side=side, levels=wanted.levels)
         _write_indices(folder)
         return f"{STREAMED}/{INDEX}"

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from panolog.scene.colmap_files import read_image_records
 from panolog.scene.errors import InputError
+from panolog.scene.files import file_of
 from panolog.scene.pictures.profiles import in_srgb
 from panolog.scene.read import check_names, image_folder, model_folder
 from panolog.scene.stores.outline import whole
@@ -60,7 +61,7 @@ def photograph(scene: Path, name: str, width: int = WIDE, patience: float = PATI
     Raises InputError if there is no such scene, or no image of that name really below it; StoreLostError.
     """
     check_names(scene, [name])
-    path = (image_folder(scene) / name).resolve()
+    path = file_of(image_folder(scene), name).resolve()
     if not (path.is_file() and path.is_relative_to(scene.resolve())):
         raise InputError(f"{name} is missing in {image_folder(scene)}, or a link that leads out of the scene")
     require_size(path.stat().st_size, name)

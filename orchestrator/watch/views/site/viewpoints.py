@@ -1,6 +1,7 @@
 """Where a page in 3D may be looked at from: the cameras of a run's plan, and where to begin."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 
@@ -11,7 +12,9 @@ from panolog.orchestrator.runs.folder import RunFolder, read_head
 from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import InputError
 from panolog.scene.files import Locate, here
+from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
+from panolog.scene.stores.url import is_url
 from panolog.workers.tasks import Stage, TaskId
 
 
@@ -35,30 +38,47 @@ class Viewpoints:
 def read_viewpoints(
     folder: RunFolder, task: TaskId | None, camera: str | None = None, locate: Locate = here
 ) -> Viewpoints | None:
-    """The viewpoints of a run's model or of a task's; None before there is a plan, if no camera is named.
+    """The viewpoints of a run's model or of a task's; without a plan and a scene on this machine None.
 
-    Cameras are those that train the task, each towards the next in the plan's order. The page begins at the
+    Cameras are those that train the task, each towards the next in the plan's order; without a plan, as a run
+    without blocks has none, those that train the scene. The page begins at the
     panorama `camera`, else at the most central of them, towards the farthest.
 
     Args: camera, the name of a panorama of the plan, or of the scene if `locate` is `here`; locate says where
     the run's files are to be read.
     Raises InputError if there is no such panorama, or the plan cannot be read.
     """
-    if not folder.plan.is_file():
-        if camera is None:
-            return None
+    plan = read_plan(locate(folder.plan)) if folder.plan.is_file() else None
+    if plan is not None:
+        names, centers = plan.names, plan.centers
+        shown = [names[plan.rows.index(row)] for row in _rows(plan, task)]
+    elif (scene := _scene_here(folder, locate)) is not None:
+        names = tuple(scene.panoramas[row].name for row in scene.train)
+        shown = list(names)
+        centers = scene.centers[list(scene.train)]
+    elif camera is None:
+        return None
+    else:
         raise InputError(
             f"{folder.root}: has no plan yet, so no camera {camera}; wait for the end of Stage I"
         )
-    plan = read_plan(locate(folder.plan))
-    up = _up(plan.centers)
-    ahead = _towards_next(plan.centers, up)
-    every = {name: Viewpoint(*pose) for name, *pose in zip(plan.names, plan.centers, ahead, strict=True)}
-    shown = [plan.names[plan.rows.index(row)] for row in _rows(plan, task)]
+    up = _up(centers)
+    ahead = _towards_next(centers, up)
+    every = {name: Viewpoint(*pose) for name, *pose in zip(names, centers, ahead, strict=True)}
     start = _overview(np.stack([every[name].position for name in shown]), up)
     if camera is not None:
-        start = every[camera] if camera in every else _of_scene(folder, camera, plan.names, up, locate)
+        start = every[camera] if camera in every else _of_scene(folder, camera, names, up, locate)
     return Viewpoints(up, start, {name: every[name] for name in shown})
+
+
+def _scene_here(folder: RunFolder, locate: Locate) -> Scene | None:
+    """The scene of a run, if it is on this machine."""
+    path = read_head(folder)[0]
+    if locate is not here or is_url(str(path)):
+        return None
+    with suppress(InputError):
+        return read_scene(path)
+    return None
 
 
 def _rows(plan: Plan, task: TaskId | None) -> Sequence[int]:

@@ -51,6 +51,23 @@ def test_a_page_begins_at_the_panorama_that_is_named(folder: RunFolder) -> None:
     assert of_block.start.position.tolist() == [5, 5, 1]
 
 
+def test_without_a_plan_the_cameras_are_those_of_the_scene(tmp_path: Path) -> None:
+    """A run with refine=false has no plan, and had no cameras."""
+    folder = make_run(tmp_path / "run", tmp_path / "scene")
+    assert read_viewpoints(folder, None) is None  # its scene is not here
+    scene = read_scene(write_scene(tmp_path / "scene"))
+    found = read_viewpoints(folder, None)
+    assert found is not None
+    assert list(found.cameras) == [scene.panoramas[row].name for row in scene.train]
+    first = scene.panoramas[scene.train[0]]
+    assert np.allclose(found.cameras[first.name].position, first.center)
+    held_out = scene.panoramas[scene.test[0]]
+    begins = read_viewpoints(folder, None, held_out.name)
+    assert begins is not None
+    assert np.allclose(begins.start.position, held_out.center)
+    assert read_viewpoints(folder, None, locate=lambda path: path) is None
+
+
 def test_a_panorama_that_is_held_out_comes_from_the_scene(tmp_path: Path) -> None:
     folder = make_run(tmp_path / "run", tmp_path / "scene")
     save_plan(folder)
