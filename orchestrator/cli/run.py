@@ -235,20 +235,20 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     state = with_step(state, prepared)
     if as_json:
         from panolog.orchestrator.watch.views.summary import summarize
-        from panolog.orchestrator.watch.views.timing import progress_of
 
-        progress = progress_of(state, info, prepared_share(prepared) if prepared else None)
-        head = {"run": run, "scene": scene, "width": width, "progress": progress}
+        head = {"run": run, "scene": scene, "width": width}
+        done = prepared_share(prepared) if prepared else None
+        summary = summarize(state, running=running, root=run, prepared=done)
         head |= {"preparation": prepared.model_dump(mode="json")} if prepared else {}
         head |= {"store": vars(mirror) | {"lag": mirror.lag}} if mirror else {}
-        print_json(head | summarize(state, running=running, root=run).model_dump(mode="json"))
+        print_json(head | summary.model_dump(mode="json"))
         return
     from rich import get_console
 
     from panolog.orchestrator.watch.views.terminal import WIDE, page
 
     console = get_console()
-    shown = page(state, root=root, name=run, info=info, running=running, wide=console.width >= WIDE)
+    shown = page(state, root=root, name=run, running=running, wide=console.width >= WIDE)
     console.print(shown, crop=False)  # a command longer than a line is whole
     if mirror:
         console.print(mirror.line, style="yellow" if mirror.late else "dim", markup=False, highlight=False)

@@ -39,6 +39,7 @@ from panolog.orchestrator.runs.records import (
     Part,
     PauseRequested,
     PlanSaved,
+    PreflightSaved,
     Preparing,
     PreviewSaved,
     Progressed,
@@ -106,19 +107,21 @@ def _written(root: Path, clock: Clock, began: float, blocks: str) -> Iterator[Wr
     scene = SceneRef(path=str(place), fingerprint="9f2c41d07be35a68")
     created = np.datetime64(round(clock.now), "s")
     write_info(folder, RunInfo(scene=scene, config=config, seed=7, versions=_VERSIONS, created=f"{created}Z"))
-    stages = {"coarse": 900, "score": 60, "partition": 5, "block": 3000, "merge": 20, "evaluation": 90}
+    stages: dict[str, float | None] = {"coarse": 900, "score": 60, "block": 3000, "merge": 20, "eval": 90}
     write_json(
         folder.preflight, {"estimate": {"stages": [{"name": n, "seconds": s} for n, s in stages.items()]}}
     )
     with closing(Database(folder.database)) as database:
         run = Written(folder, clock, database, now)
         run.add(RunBegan(HOST, 4711, resumed=False))
-        needs = "8.4 GiB of memory for a task of 1,120,000 Gaussians, 3.1 GiB of disk"
+        needs = "8.4 GiB of memory for the largest task, 3.1 GiB of disk"
+        needs += "; Gaussians, roughly: Stage I 1,120,000, largest block 410,000"
         if blocks == "auto":  # it has no scene yet
             yield run
             clock.now = now
             return
         run.add(Noticed(Part.PREFLIGHT, f"1 h 7 min with blocks {config.grid}, {needs}"))
+        run.add(PreflightSaved("preflight.json", stages), after=0.0)
         yield run
     clock.now = now
 

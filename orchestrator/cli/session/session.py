@@ -21,7 +21,7 @@ from panolog.orchestrator.engine.driver.job import Job
 from panolog.orchestrator.engine.driver.journal import Journal, Patience
 from panolog.orchestrator.engine.driver.purse import require_enough
 from panolog.orchestrator.engine.driver.requests import interruptible, on_signals
-from panolog.orchestrator.engine.estimates.preflight import Preflight, examine
+from panolog.orchestrator.engine.estimates.preflight import Preflight, examine, require_memory
 from panolog.orchestrator.engine.scheduling.pool import Pool
 from panolog.orchestrator.engine.stages.measuring import Measuring
 from panolog.orchestrator.engine.stages.scenes import measured_scene, save_measured, scene_of
@@ -45,6 +45,8 @@ from panolog.orchestrator.runs.records import (
     Preparing,
     Record,
     RunBegan,
+    RunContinued,
+    RunWaiting,
     Stored,
 )
 from panolog.orchestrator.runs.retention.clean import remove_models
@@ -86,6 +88,10 @@ def start(
     budget = (wanted or Wanted()).budget(RunState())
     new = preparing.found(source, config, options or Options())
     new.check_output(root)
+    if address is None and config.device == "cuda":
+        choose_device(config.device)
+    if new.scene is not None:
+        require_memory(new.scene, new.config)
     folder = RunFolder(root)
     made = run_folder.make(root)
     with lock.hold(folder.lock), ExitStack() as undo:
@@ -191,6 +197,7 @@ class _Beginning:
     pool: Pool | None
     nice: int | None
     made: Scene | None = None  # None until it is prepared
+    _since: float = 0.0  # Clock.monotonic() of the latest reason to wait
 
     @property
     def scene(self) -> Scene:
@@ -250,7 +257,7 @@ class _Beginning:
         self._measure(info.config)
         self.journal.record([Preparing("calibrating")])
         prices, local = prices_of(self.journal.state), self.address is None
-        found = _examine(workers, self.scene, info.config, root, self.warn, prices, self._doing, local=local)
+        found = _examine(workers, self.scene, info.config, root, self.warn, prices, self._waits, local=local)
         found.require()
         info = info.model_copy(update={"config": found.config})
         self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
@@ -270,6 +277,12 @@ class _Beginning:
 
     def _doing(self, what: str) -> None:
         self.journal.record([Preparing(what)])
+
+    def _waits(self, why: str) -> None:
+        """For a machine, or "" once there is one."""
+        now = self.journal.clock.monotonic()
+        self._since = now if why else self._since
+        self.journal.record([RunWaiting(why) if why else RunContinued(now - self._since)])
 
     def warn(self, line: str) -> None:
         """Something the user should read once."""

@@ -16,6 +16,8 @@ from panolog.orchestrator.runs.machines.nodes import Node
 from panolog.orchestrator.runs.money.prices import of_record, price_by
 from panolog.orchestrator.runs.records import NodeLeaving, Noticed, Record, RunContinued, RunWaiting
 
+_NAMED = 6  # paused blocks that are named one by one
+
 
 class Machines:
     """Which there are, which leave, which are in quarantine, and which are on their way."""
@@ -68,8 +70,8 @@ class Machines:
         come = self._grow(growth, work(), running, nodes) if growth.groups else Coming()
         every, busy = [*nodes, *come.nodes], [*running, *come.fill]
         placed = placement.place(waiting, every, busy, cuda=self._cuda)
-        idle = bool(waiting) and not placed and not running
-        self._explain(self._why(growth) if idle else "")
+        idle = not placed and not running
+        self._explain(self._why(growth, waits=bool(waiting)) if idle else "")
         return placed
 
     @property
@@ -97,12 +99,19 @@ class Machines:
         self._pool.request(found.wanted)
         return found
 
-    def _why(self, growth: Growth) -> str:
-        """Why nothing can start."""
-        what = "GPU" if self._cuda else "core"
+    def _why(self, growth: Growth, *, waits: bool) -> str:
+        """Why nothing can start. Args: waits, whether there is a task that could."""
+        state, what = self._journal.state, "GPU" if self._cuda else "core"
+        if not waits:
+            return _paused(state.held_blocks())
+        able = placement.able(self._pool.nodes(), cuda=self._cuda)
+        if not growth.groups and not able:
+            return f"waiting for a machine with a {what}: the cluster has none now"
+        staying = leaving.staying(state, able)
+        if shut := quarantine.waiting(state, staying):
+            return f"waiting: {shut}"
         if not growth.groups:
-            able = placement.able(self._pool.nodes(), cuda=self._cuda)
-            return "" if able else f"waiting for a machine with a {what}: the cluster has none now"
+            return "" if staying else f"waiting for a machine with a {what}: all that are there leave"
         since = self._expected.since
         if not since:
             why = f"waiting for a machine with a {what}: Ray's autoscaler has started all that it may"
@@ -137,3 +146,11 @@ class Machines:
             self._journal.record(changes)
             self._journal.record(quarantine.notice(self._journal.state, nodes, config))
         return bool(changes)
+
+
+def _paused(blocks: Sequence[int]) -> str:
+    """That a run waits because a user has paused these blocks; "" if there are none."""
+    if len(blocks) < 2:
+        return "".join(f"waiting: block {block} is paused" for block in blocks)
+    named = ", ".join(map(str, blocks)) if len(blocks) <= _NAMED else f"{blocks[0]} to {blocks[-1]}"
+    return f"waiting: {len(blocks)} blocks are paused ({named})"

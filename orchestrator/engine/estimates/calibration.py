@@ -105,7 +105,8 @@ def await_machine(
     Returns after how many seconds that came; None if it was not requested. Raises ClusterError where none can
     be started and none joins.
 
-    Args: need, returns the bytes of memory that a task should have; say, called with why it waits.
+    Args: need, returns the bytes of memory that a task should have; say, called with why it waits, and
+    with "" when it does no more.
     """
     said, began = "", time.monotonic()
     while not placement.able(pool.nodes(), cuda=cuda):
@@ -124,6 +125,8 @@ def await_machine(
             say(text)
             said = text
         pool.ready(_WAIT_S)
+    if said:
+        say("")
     pool.request({})
     return time.monotonic() - began if said and pool.growth().groups else None
 

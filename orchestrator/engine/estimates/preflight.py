@@ -31,8 +31,11 @@ from panolog.partition.balance import Budget, fewest_blocks
 from panolog.scene.errors import InputError
 from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
+from panolog.workers import device_memory
 from panolog.workers.tasks import Stage
 
+# Whose Gaussians people want to know.
+_TRAINED = {Stage.DISTRICT: "largest district", Stage.COARSE: "Stage I", Stage.BLOCK: "largest block"}
 _CAMERAS = 16  # a block that is only there to keep a machine busy has at least so many
 
 
@@ -67,13 +70,16 @@ class Preflight:
 
     def summary(self) -> str:
         """One line for people."""
-        task = max(self.estimate.stages, key=lambda stage: (stage.device, stage.host))
+        memory = max(stage.device or stage.host for stage in self.estimate.stages)
+        trained = [
+            f"{_TRAINED[it.name]} {it.gaussians:,}" for it in self.estimate.stages if it.name in _TRAINED
+        ]
         cap = self.chosen.get("densify.max_gaussians")
         divided = ", ".join(f"{key}={value}" for key, value in self.chosen.items() if key in DIVISIONS)
         return (
             f"{time_of(self.estimate.seconds)} with blocks {self.estimate.blocks},"
-            f" {gib(task.device or task.host)} of memory for a task of {task.gaussians:,} Gaussians,"
-            f" {gib(self.estimate.disk)} of disk"
+            f" {gib(memory)} of memory for the largest task, {gib(self.estimate.disk)} of disk"
+            f"; Gaussians, roughly: {', '.join(trained)}"
             + (f"; so that tasks fit into memory: {divided}" if divided else "")
             + (
                 f"; a task trains at most {cap:,} scene Gaussians (memory, densify.max_gaussians)"
@@ -137,6 +143,21 @@ def examine(
 
     table = workers(on, nodes, prices)
     return Preflight(estimator.config, basis, estimator.estimate(), nodes, free, why, chosen, table)
+
+
+def require_memory(scene: Scene, config: RunConfig) -> None:
+    """Refuses a `memory` that is less than what a task takes without any Gaussians, before anything starts.
+
+    Args: config with a width. Raises InputError, which says what is the least.
+    """
+    if config.memory is None or config.memory * 2**30 >= device_memory.CONTEXT:
+        return
+    bare = change(config, {"densify.max_gaussians": 1, "cache.memory": config.memory})
+    least = math.ceil(10 * _most_memory(_whole(scene, bare, assumed(scene, bare))) / 2**30) / 10
+    raise InputError(
+        f"{scene.root}: --memory {config.memory:g}GiB is too little for any task: at --width {config.width}"
+        f" give at least {least:g}GiB"
+    )
 
 
 def _whole(scene: Scene, config: RunConfig, basis: Basis) -> Estimate:

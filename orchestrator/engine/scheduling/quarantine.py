@@ -98,7 +98,7 @@ def waiting(state: RunState, nodes: Sequence[Node]) -> str | None:
     if not nodes or usable(state, nodes):
         return None
     first = min(_in_quarantine(state, nodes), key=lambda known: known.until or 0.0)
-    return f"every machine is in quarantine, {first.host} because {first.reason}"
+    return f"every machine is in quarantine; {first.host}: {first.reason}"
 
 
 def notice(state: RunState, nodes: Sequence[Node], config: QuarantineConfig) -> list[Noticed]:

@@ -22,7 +22,7 @@ from panolog.orchestrator.watch.views.summary import (
     ViewModel,
     summarize,
 )
-from panolog.orchestrator.watch.views.timing import progress_of, setting, share_of, tasks_of
+from panolog.orchestrator.watch.views.timing import share_of, tasks_of
 from panolog.workers.tasks import Stage
 from panolog.workers.training.recipes import RECIPES
 
@@ -132,12 +132,13 @@ def view_run(
     """
     state, now = history.state, time.time()
     state = replace(state, waiting=state.waiting or waiting)
-    summary = summarize(state, running=running, now=now, root=root)
+    prepared = prepared_share(preparation) if preparation else None
+    summary = summarize(state, running=running, now=now, root=root, prepared=prepared)
     stages = _stages(history, info, running=running, now=now)
     return RunView(
         now=now,
         latest=_later(state.latest, preparation.latest if preparation else None),
-        progress=progress_of(state, info, prepared_share(preparation) if preparation else None),
+        progress=summary.progress,
         eta=summary.eta,
         paused=summary.paused,
         stages=tuple(_with_share(stage, preparation) for stage in stages),
@@ -159,15 +160,15 @@ def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: fl
     """The stages of a run in their order, also those to come. Args: now, epoch seconds."""
     state = history.state if running else at_rest(history.state)
     left_out = set[Stage]()
-    if not setting(info, "refine", default=True):
+    if not _setting(info, "refine", default=True):
         left_out |= {Stage.SCORE, Stage.PLAN, Stage.BLOCK}
     planned = {task.stage for tasks in state.between for task in tasks}
     left_out |= {Stage.UNION} | {Stage.ROUND, Stage.REPAIR} - planned  # unions take next to no time
     if not state.measures:
         left_out.add(Stage.MEASURE)
-    if not setting(info, "deliver", default=False):  # nor of older versions
+    if not _setting(info, "deliver", default=False):  # nor of older versions
         left_out.add(Stage.DELIVER)
-    if setting(info, "districts", default=1) == 1:
+    if _setting(info, "districts", default=1) == 1:
         left_out.add(Stage.DISTRICT)
     if Stage.PREPARE not in history.spans:
         left_out.add(Stage.PREPARE)
@@ -233,6 +234,12 @@ def _stage_status(
     if Status.FAILED in statuses and (not running or statuses <= {Status.DONE, Status.FAILED}):
         return Status.FAILED
     return STOPPED if statuses and begun and not running else Status.WAITING
+
+
+def _setting(info: Mapping[str, Any], key: str, *, default: Any) -> Any:
+    """A setting of run.json, whatever that holds."""
+    config = info.get("config")
+    return config.get(key, default) if isinstance(config, dict) else default
 
 
 def _nodes(

@@ -11,7 +11,15 @@ from panolog.orchestrator.runs.machines.history import Leave, NodeState, why_lea
 from panolog.orchestrator.runs.money.account import MoneyView, view_money
 from panolog.orchestrator.runs.records import Leaving, task_name
 from panolog.orchestrator.runs.state import RunState, Status, TaskState, at_rest
-from panolog.orchestrator.watch.views.timing import eta_of, run_eta, seconds_of, share_of, tasks_of
+from panolog.orchestrator.watch.views.timing import (
+    elapsed,
+    eta_of,
+    progress_of,
+    run_eta,
+    seconds_of,
+    share_of,
+    tasks_of,
+)
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
 STAGES: dict[str, str] = {
@@ -144,6 +152,7 @@ class SummaryHead(ViewModel):
     reason: Text | None  # why the run has failed, or that its driver is lost
     waiting: Text  # why it waits for its disk or a machine; "" if it does not
     resume: Text | None  # the command that resumes it
+    progress: float  # elapsed ÷ (elapsed + left), 0 to 1
     seconds: float | None
     eta: float | None
     paused: tuple[int, ...]
@@ -170,31 +179,39 @@ class Summary(SummaryHead):
 
 
 def summarize(
-    state: RunState, *, running: bool, now: float | None = None, root: Path | str | None = None
+    state: RunState,
+    *,
+    running: bool,
+    now: float | None = None,
+    root: Path | str | None = None,
+    prepared: float | None = None,
 ) -> Summary:
     """The summary of a state.
 
-    Args: running, whether a driver works on it; now, epoch seconds; root, the run folder in commands.
+    Args: running, whether a driver works on it; now, epoch seconds; root, the run folder in commands;
+    prepared, as `progress_of`.
     """
     status, stage, reason = (
         status_of(state, running=running),
         stage_of(state),
         reason_of(state, running=running),
     )
+    end = state.ended or (None if running else state.latest) or (time.time() if now is None else now)
+    progress = progress_of(state, end, prepared)
     if not running:
         state = at_rest(state)
-    waits = "waiting" if state.waiting else "preparing" if running and stage == Stage.PREPARE else ""
-    end = state.ended or (time.time() if now is None else now)
+    preparing = "preparing" if running and stage == Stage.PREPARE else ""
     merged, idle = state.merged, not running and status != "done"
     return Summary(
         status=status,
-        label=waits or LABELS.get(status, status),
+        label=_waits(state.waiting) or preparing or LABELS.get(status, status),
         stage=stage,
         step=state.step or None,
         reason=reason,
         waiting=state.waiting,
         resume=command_line("resume", root) if idle and root is not None else None,
-        seconds=None if state.began is None else state.worked(state.began, end),
+        progress=progress,
+        seconds=elapsed(state, end),
         eta=run_eta(state, end) if running else None,
         paused=state.held_blocks(),
         training_gaussians=_training(state),
@@ -219,6 +236,11 @@ def summarize(
             for b in state.plan or ()
         ),
     )
+
+
+def _waits(why: str) -> str:
+    """Why a run waits in a few words: "waiting: block 1 is paused"; "waiting" if that takes a sentence."""
+    return why.partition("; ")[0] if why.startswith("waiting: ") else "waiting" * bool(why)
 
 
 def _leaving(node: NodeState) -> LeavingView:
@@ -252,7 +274,7 @@ def _task_view(task: TaskState, now: float) -> TaskView:
         name=str(task.id),
         status=task.status,
         share=share_of(task),
-        eta=eta_of(task),
+        eta=eta_of(task, now),
         seconds=seconds_of(task, now),
         checkpoint=task.checkpoint,
         node=task.node or None,

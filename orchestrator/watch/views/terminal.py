@@ -4,7 +4,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -12,7 +11,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from panolog.orchestrator.runs.folder import RunFolder, command_line, read_json
+from panolog.orchestrator.runs.folder import RunFolder, command_line
 from panolog.orchestrator.runs.machines.history import leave_text
 from panolog.orchestrator.runs.money.records import BudgetNear, BudgetReached
 from panolog.orchestrator.runs.records import (
@@ -28,12 +27,10 @@ from panolog.orchestrator.runs.records import (
     Noticed,
     PauseRequested,
     PlanSaved,
-    PreflightSaved,
     Preparing,
     Progressed,
     Record,
     RetryRequested,
-    RunBegan,
     StopRequested,
     Stored,
     TaskFailed,
@@ -54,7 +51,7 @@ from panolog.orchestrator.watch.views.summary import (
     summarize,
     task_label,
 )
-from panolog.orchestrator.watch.views.timing import eta_of, progress_of, seconds_of, tasks_of
+from panolog.orchestrator.watch.views.timing import eta_of, seconds_of, tasks_of
 from panolog.workers.tasks import Stage, TaskId
 
 WIDE = 120  # columns from which on a table has all its columns
@@ -71,19 +68,17 @@ _REQUESTS: dict[type[Record], str] = {
 }
 
 
-def table(
-    state: RunState, *, root: Path, info: Mapping[str, Any], running: bool, wide: bool, name: str = ""
-) -> RenderableType:
+def table(state: RunState, *, root: Path, running: bool, wide: bool, name: str = "") -> RenderableType:
     """The whole run for a terminal; `wide` also shows memory and PSNR.
 
-    Args: root, the run folder; info, run.json; running, whether a driver works on it; name, of the run in
+    Args: root, the run folder; running, whether a driver works on it; name, of the run in
     commands, if that is not its folder.
     """
     now = time.time()
-    summary = summarize(state, running=running, now=now, root=root)
     preparation = view_preparation(RunFolder(root), state, running=running)
     prepared = None if preparation is None else prepared_share(preparation)
-    head = headline(state, summary, progress_of(state, info, prepared), name or root)
+    summary = summarize(state, running=running, now=now, root=root, prepared=prepared)
+    head = headline(state, summary, name or root)
     rows = _rows(wide=wide)
     if not running:
         state = at_rest(state)
@@ -102,7 +97,7 @@ def table(
         for task in one_by_one:
             rows.add_row(*_task_row(task, now, wide=wide))
     shown = [rows] if stages else []
-    waits = [Text(summary.waiting, style="yellow")] if summary.waiting else []
+    waits = [Text(summary.waiting, style="yellow")] if summary.waiting not in ("", summary.label) else []
     waits += _leaving(summary, now)
     waits += _quarantined(summary, now, name or root)
     waits += [Text(summary.money.line(), style="dim")] if summary.money else []
@@ -163,9 +158,7 @@ def _to_copy(line: str) -> Text:
     return Text(line, style="yellow", no_wrap=True, overflow="ignore")
 
 
-def page(
-    state: RunState, *, root: Path, info: Mapping[str, Any], running: bool, wide: bool, name: str = ""
-) -> RenderableType:
+def page(state: RunState, *, root: Path, running: bool, wide: bool, name: str = "") -> RenderableType:
     """`table`, and of a run that does not proceed why, and what resumes it."""
     lines = []
     if reason := reason_of(state, running=running):
@@ -173,16 +166,16 @@ def page(
     if not running and state.outcome != "done":
         more = ("--max-cost", "none", "--deadline", "none") if state.outcome == "limited" else ()
         lines.append(_to_copy(f"`{command_line('resume', name or root, *more)}` resumes it"))
-    return Group(table(state, root=root, info=info, running=running, wide=wide, name=name), *lines)
+    return Group(table(state, root=root, running=running, wide=wide, name=name), *lines)
 
 
-def headline(state: RunState, summary: Summary, progress: float, root: Path | str) -> Text:
-    """The state of the run in one line. Args: progress, 0 to 1; root, the run folder in commands."""
+def headline(state: RunState, summary: Summary, root: Path | str) -> Text:
+    """The state of the run in one line. Args: root, the run folder in commands."""
     stage = "" if summary.label == "preparing" else STAGES.get(summary.stage)
     text = Text(summary.label + (f" · {stage}" if stage else ""), style="bold")
     if summary.step:
         text.append(f": {summary.step}")
-    text.append(f" · {progress:.0%}")
+    text.append(f" · {summary.progress:.0%}")
     if summary.seconds is not None:
         text.append(f" · {duration(summary.seconds)} elapsed")
     if summary.eta is not None:
@@ -209,7 +202,7 @@ def _task_row(task: TaskState, now: float, *, wide: bool) -> Iterator[Renderable
     yield _bar(done, total, task.status, wide=wide)
     yield f"{progress.iteration:,}/{progress.iterations:,}" if progress else ""
     yield f"{progress.rate:.1f} it/s" if progress and task.status == Status.RUNNING else task.status
-    eta, seconds = eta_of(task), seconds_of(task, now)
+    eta, seconds = eta_of(task, now), seconds_of(task, now)
     yield f"{duration(eta)} left" if eta is not None else duration(seconds) if seconds else ""
     yield f"{progress.loss:.4f}" if progress and progress.loss is not None else ""
     yield f"{progress.gaussians:,}" if progress and progress.gaussians is not None else ""
@@ -244,16 +237,14 @@ def progress(console: Console, root: Path) -> Iterator[OnChange]:
     if not console.is_terminal:
         yield _Lines(console).show
         return
-    latest, info = RunState(), dict[str, Any]()
+    latest = RunState()
 
     def render() -> RenderableType:  # called from a thread of the display
         running, wide = latest.outcome is None, console.width >= WIDE
-        return table(latest, root=root, info=info, running=running, wide=wide)
+        return table(latest, root=root, running=running, wide=wide)
 
     def show(state: RunState, news: Sequence[Stored]) -> None:
-        nonlocal latest, info
-        if any(isinstance(stored.record, RunBegan | PreflightSaved) for stored in news):
-            info = read_json(RunFolder(root))
+        nonlocal latest
         latest = state
         for stored in news:
             if line := _urgent(stored.record):

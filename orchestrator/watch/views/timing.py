@@ -1,16 +1,13 @@
 """How far a run is and how long it still takes."""
 
-from collections.abc import Mapping, Sequence
-from math import prod
-from typing import Any
+from collections.abc import Sequence
 
 from panolog.orchestrator.runs.state import RunState, Status, TaskState
-from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
+from panolog.workers.tasks import COARSE, Stage, TaskId
 
-_SMALL = 0.01  # share of the whole run that each stage without training counts as
-_PREPARED = (
-    0.1  # the same of making the scene, where the run does that: how long it takes is not known before
-)
+_WELL = 0.25  # of its iterations after which the mean rate of a task alone says how long it takes
+_SLOWEST = 4.0  # times the estimate: beyond, it was not of this machine
+_PREPARED = 0.1  # share of a run that making its scene is taken for: what follows is not known before
 
 
 def tasks_of(state: RunState) -> list[TaskState]:
@@ -28,12 +25,31 @@ def share_of(task: TaskState) -> float:
     return min(1.0, progress.iteration / progress.iterations) if progress and progress.iterations else 0.0
 
 
-def eta_of(task: TaskState) -> float | None:
-    """Seconds that a running task still needs at its present rate."""
+def eta_of(task: TaskState, now: float) -> float | None:
+    """Seconds that a running task still needs; None of others, and before its first iterations.
+
+    Args: now, epoch seconds.
+    """
+    whole = _whole(task, now)
+    return None if whole is None else (1 - share_of(task)) * whole
+
+
+def _whole(task: TaskState, now: float, expected: float | None = None) -> float | None:
+    """Seconds of a running task for all of its iterations; None of others, and before its first ones.
+
+    At first as expected, or else at its present rate, and the more it has done the more at its mean rate:
+    the present one varies with all else that the machine does.
+
+    Args: now, epoch seconds; expected, seconds of the same.
+    """
     progress = task.progress
     if task.status != Status.RUNNING or progress is None or progress.rate <= 0:
         return None
-    return (progress.iterations - progress.iteration) / progress.rate
+    whole, done = expected or progress.iterations / progress.rate, progress.iteration - task.begun
+    if task.since is None or done <= 0:
+        return whole
+    known = min(1.0, done / (_WELL * progress.iterations)) ** 2  # the time of a start weighs little
+    return (1 - known) * whole + known * (now - task.since) * progress.iterations / done
 
 
 def seconds_of(task: TaskState, now: float) -> float | None:
@@ -46,11 +62,37 @@ def seconds_of(task: TaskState, now: float) -> float | None:
 def run_eta(state: RunState, now: float) -> float | None:
     """Seconds until a run is done: its tasks at their present rates, what is to come as estimated before.
 
-    Args: now, epoch seconds. None if the run has ended, or if a stage that trains has neither a rate nor an
-    estimate.
+    Args: now, epoch seconds. None if the run has ended or waits, or if a stage that trains has neither a rate
+    nor an estimate.
     """
-    if state.outcome is not None:
-        return None
+    return None if state.outcome is not None or state.waiting else _time_left(state, now)
+
+
+def elapsed(state: RunState, now: float) -> float | None:
+    """Seconds in which a driver was at work on a run; None before the first. Args: now, epoch seconds."""
+    return None if state.began is None else state.worked(state.began, state.ended or now)
+
+
+def progress_of(state: RunState, now: float, prepared: float | None = None) -> float:
+    """How much of a run's time is over, 0 to 1: elapsed ÷ (elapsed + left).
+
+    It stands still while the run waits. Before the preflight, which estimates what is left, it is 0, with a
+    preparation at most `_PREPARED`.
+
+    Args: now, epoch seconds; prepared, how much of the preparation is done, None of a run that was given a
+    scene.
+    """
+    if state.outcome == "done":
+        return 1.0
+    end = state.ended or (state.latest if state.waiting and state.latest is not None else now)
+    spent, left = elapsed(state, end), _time_left(state, end)
+    if spent is None or left is None:
+        return _PREPARED * (prepared or 0.0)
+    return spent / (spent + left) if left > 0 else min(spent, 1.0)
+
+
+def _time_left(state: RunState, now: float) -> float | None:
+    """Seconds that the stages of a run still need; None if that of one is not known."""
     stages = [stage for stage in Stage if state.estimate is None or stage in state.estimate]
     left = [_stage_left(state, stage, now) for stage in stages]
     known = [seconds for seconds in left if seconds is not None]
@@ -67,15 +109,29 @@ def _stage_left(state: RunState, stage: Stage, now: float) -> float | None:
     if over:
         return 0.0
     expected = (state.estimate or {}).get(stage)
-    etas = [eta for task in left if (eta := eta_of(task)) is not None]
-    if not etas and not (stage is Stage.DISTRICT and tasks and expected is not None):
+    if expected is not None and stage is not Stage.COARSE:
+        expected *= _slowness(state, now)
+    running = [task for task in left if task.status == Status.RUNNING and task.progress]
+    each = None if expected is None or stage.in_shards else expected * len(running) / max(1, len(tasks))
+    wholes = {task.id: whole for task in running if (whole := _whole(task, now, each)) is not None}
+    if not wholes and not (stage is Stage.DISTRICT and tasks and expected is not None):
         return _expected_left(stage, expected, tasks, left, now)
-    if stage.refines:
-        return max(*etas, _blocks_left(left))
+    etas = [(1 - share_of(task)) * wholes[task.id] for task in running if task.id in wholes]
+    if stage.refines:  # the others as long as those that run, one after another on their places
+        return max(*etas, _undone(left) * sum(wholes.values()) / len(wholes) ** 2)
     if (stage is Stage.DISTRICT or stage.in_shards) and expected is not None:  # tasks that wait are not known
         began = min((task.since for task in tasks if task.since is not None), default=now)
         return max([*etas, 0.0, expected - (now - began)])
     return max(etas)
+
+
+def _slowness(state: RunState, now: float) -> float:
+    """How many times longer than estimated Stage I takes: what follows on the machines does too."""
+    task, expected = state.task(COARSE), (state.estimate or {}).get(Stage.COARSE)
+    taken = _whole(task, now, expected)
+    if task.status == Status.DONE and task.seconds and task.iterations and task.iterations > task.begun:
+        taken = task.seconds * task.iterations / (task.iterations - task.begun)
+    return min(max(1 / _SLOWEST, taken / expected), _SLOWEST) if taken and expected else 1.0
 
 
 def _expected_left(
@@ -90,77 +146,6 @@ def _expected_left(
     return max(0.0, expected * undone - max(waited, default=0.0))
 
 
-def _blocks_left(left: Sequence[TaskState]) -> float:
-    """That of the blocks that are left, as long as the running ones, at the rate of all these together."""
-    running = [task.progress for task in left if task.status == Status.RUNNING and task.progress]
-    return _undone(left) * max(p.iterations for p in running) / sum(p.rate for p in running)
-
-
 def _undone(tasks: Sequence[TaskState]) -> float:
     """How many tasks' work is left."""
     return sum(1 - share_of(task) for task in tasks)
-
-
-def progress_of(state: RunState, info: Mapping[str, Any], prepared: float | None = None) -> float:
-    """How much of the run's work is done, 0 to 1: iterations of Stage I and of blocks, and a little else.
-
-    Args: info, run.json; prepared, how much of the preparation is done, None of a run that was given a scene.
-    """
-    if state.outcome == "done":
-        return 1.0
-    trained = _trained_share(state, info)
-    return trained if prepared is None else _PREPARED * prepared + (1 - _PREPARED) * trained
-
-
-def _trained_share(state: RunState, info: Mapping[str, Any]) -> float:
-    """The same of all that comes after the preparation."""
-    coarse = _coarse_share(state, info)
-    if not setting(info, "refine", default=True):
-        small = [share_of(state.task(MERGE)), _measured_share(state)]
-        return (1 - _SMALL * len(small)) * coarse + _SMALL * sum(small)
-    blocks = [share_of(state.task(TaskId.block(b.block))) for b in state.plan or () if b.train]
-    count = len(blocks) if state.plan is not None else _block_count(info)
-    scores = [share_of(task) for task in state.tasks.values() if task.id.stage is Stage.SCORE]
-    small = [share_of(state.task(PLAN)), share_of(state.task(MERGE)), _measured_share(state)]
-    small.append(sum(scores) / len(scores) if scores else 0.0)
-    later, most = _later_share(state, info, count)
-    trained = (coarse + sum(blocks) + later) / (1 + count + most)
-    return (1 - _SMALL * len(small)) * trained + _SMALL * sum(small)
-
-
-def _measured_share(state: RunState) -> float:
-    """How much of the evaluation is done, 0 to 1."""
-    shares = [share_of(state.task(task)) for task in state.measures or (EVAL,)]
-    return sum(shares) / len(shares)
-
-
-def _later_share(state: RunState, info: Mapping[str, Any], blocks: int) -> tuple[float, float]:
-    """How much of the passes over the blocks' union is done, and how much there is: in blocks' trainings."""
-    given = setting(info, "passes", default={})
-    given = given if isinstance(given, dict) else {}
-    parts = {stage: float(given.get(stage, 0)) for stage in (Stage.ROUND, Stage.REPAIR)}
-    if state.plan is None:
-        return 0.0, blocks * sum(parts.values())
-    tasks = [task for tasks in state.passes for task in tasks]
-    done = sum(parts[task.stage] * share_of(state.task(task)) for task in tasks)
-    return done, sum(parts[task.stage] for task in tasks)
-
-
-def _coarse_share(state: RunState, info: Mapping[str, Any]) -> float:
-    """How much of Stage I is done, 0 to 1: of its districts, if there are several."""
-    count = setting(info, "districts", default=1)
-    if not isinstance(count, int) or count < 2 or state.status(COARSE) == Status.DONE:
-        return share_of(state.task(COARSE))
-    return sum(share_of(state.task(TaskId.district(i))) for i in range(count)) / count
-
-
-def _block_count(info: Mapping[str, Any]) -> int:
-    """How many blocks the settings request."""
-    sizes = str(setting(info, "blocks", default="")).split("x")
-    return prod(map(int, sizes)) if all(size.isdecimal() for size in sizes) else 1
-
-
-def setting(info: Mapping[str, Any], key: str, *, default: Any) -> Any:
-    """A setting of run.json, whatever that holds."""
-    config = info.get("config")
-    return config.get(key, default) if isinstance(config, dict) else default

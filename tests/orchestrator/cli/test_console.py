@@ -111,7 +111,7 @@ def test_the_reason_of_a_failed_run_is_printed_once(terminal: bool, tmp_path: Pa
     with progress(shown, tmp_path) as show:
         show(replay(stored), stored)
     status = Console(file=StringIO(), width=120)
-    status.print(page(replay(stored), root=tmp_path, info={}, running=False, wide=True))
+    status.print(page(replay(stored), root=tmp_path, running=False, wide=True))
     for display, times in ((shown, 0), (status, 1)):
         assert isinstance(display.file, StringIO)
         assert display.file.getvalue().count("no memory") == times

@@ -22,6 +22,8 @@ from panolog.orchestrator.runs.records import (
     PlanSaved,
     Record,
     RetryRequested,
+    RunContinued,
+    RunWaiting,
     ScoresSaved,
     TaskFailed,
     TaskYielded,
@@ -284,6 +286,8 @@ def test_a_block_is_paused_and_unpaused(listening: Listening, dies: bool) -> Non
     assert [spec.checkpoint for spec in listening.trainings(ONE)] == [None, None if dies else checkpoint]
     task = listening.state.task(ONE)
     assert (task.retries, task.reasons, task.held) == (dies, (DIED.reason,) * dies, False)
+    assert [record.reason for record in listening.records(RunWaiting)] == ["waiting: block 1 is paused"]
+    assert len(listening.records(RunContinued)) == 1 and listening.state.waiting == ""
 
 
 def test_a_failed_block_is_retried_while_another_trains(listening: Listening) -> None:

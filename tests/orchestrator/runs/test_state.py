@@ -136,7 +136,7 @@ def test_summary_names_stage_status_and_time_left() -> None:
     expected = PreflightSaved("preflight.json", {"coarse": 30.0})
     state = after(BEGAN, expected, started(COARSE), Progressed(COARSE, 25, 100, 5.0, loss=0.1))
     shown = summarize(state, running=True, now=11.0)
-    assert (shown.status, shown.label, shown.stage, shown.eta) == ("running", "running", "coarse", 15.0)
+    assert (shown.status, shown.label, shown.stage, shown.eta) == ("running", "running", "coarse", 24.0)
     assert (shown.seconds, shown.tasks[0].status) == (10.0, Status.RUNNING)
     killed = summarize(state, running=False, now=11.0)
     assert (killed.status, killed.label, killed.stage, killed.eta) == (

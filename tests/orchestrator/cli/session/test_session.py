@@ -320,3 +320,17 @@ def test_other_sources_are_a_notice(failed: Path, monkeypatch: pytest.MonkeyPatc
     resume(failed)
     line = f"resumed with other sources ({own} → 0123456789ab): what is trained now may differ"
     assert notices(failed).count(line) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [({"device": "cuda"}, "there is no GPU that torch can use"), ({"memory": 0.1}, "give at least")],
+)
+def test_what_cannot_be_is_refused_before_a_worker_starts(
+    given: dict[str, object], why: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    pool = FakePool(fails_in_training, [MACHINE])
+    with pytest.raises(InputError, match=why):
+        session.start(scene, tmp_path / "run", load_config(flags=SETTINGS | given), None, ignore, pool)
+    assert not (tmp_path / "run").exists() and pool.started == []

@@ -136,7 +136,7 @@ def test_a_block_for_which_no_gpu_is_large_enough_is_reported_and_the_rest_merge
     task = harness.state.task(TaskId.block(0))
     assert "no device has more memory" in task.reasons[-1]
     with (console := Console(width=200)).capture() as shown:
-        console.print(table(harness.state, root=harness.folder.root, info={}, running=False, wide=True))
+        console.print(table(harness.state, root=harness.folder.root, running=False, wide=True))
     assert f"block 0: {task.reasons[-1]}" in shown.get()
     assert (task.status, harness.state.status(TaskId.block(1))) == (Status.FAILED, Status.DONE)
     assert ply_header(harness.folder.point_cloud) == (202, 2)

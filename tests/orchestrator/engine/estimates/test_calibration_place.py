@@ -57,7 +57,7 @@ def test_without_a_machine_one_is_requested_and_waited_for() -> None:
     assert await_machine(pool, lambda: 2**30, said.append, cuda=False) is not None
     assert pool.requests == [{"small": 1}, {"small": 1}, {}]
     requested = "waiting for a machine: small (2 cores, 8.0 GiB) is requested from Ray's autoscaler"
-    assert said == [requested, f"{requested}; it reports: no spot machines"]
+    assert said == [requested, f"{requested}; it reports: no spot machines", ""]
     pool = ComingPool((large, small))
     await_machine(pool, lambda: 2**34, said.append, cuda=False)
     assert pool.requests[0] == {"large": 1}
@@ -66,7 +66,7 @@ def test_without_a_machine_one_is_requested_and_waited_for() -> None:
 def test_where_none_can_be_started_one_may_join() -> None:
     pool, said = ComingPool(()), list[str]()
     assert await_machine(pool, lambda: 0, said.append, cuda=False) is None
-    assert said == ["waiting for a machine with a core: the cluster has none"]
+    assert said == ["waiting for a machine with a core: the cluster has none", ""]
 
 
 def test_a_cluster_that_stays_empty_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

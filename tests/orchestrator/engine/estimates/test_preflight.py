@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from panolog.orchestrator.engine.estimates import calibration, suggestions
-from panolog.orchestrator.engine.estimates.calibration import Basis, calibrate
+from panolog.orchestrator.engine.estimates.calibration import Basis, assumed, calibrate
 from panolog.orchestrator.engine.estimates.estimate import Estimator
-from panolog.orchestrator.engine.estimates.preflight import Preflight, choose_blocks, examine
+from panolog.orchestrator.engine.estimates.preflight import Preflight, choose_blocks, examine, require_memory
 from panolog.orchestrator.engine.estimates.suggestions import DETAIL, problem
 from panolog.orchestrator.engine.scheduling.pool import NONE, Failed
 from panolog.orchestrator.runs.config import RunConfig, change
@@ -64,6 +64,29 @@ def test_a_job_that_fits_has_no_problem(scene: Scene) -> None:
     assert found.problem is None
     assert found.config.blocks == "2x1x1"
     assert "blocks 2x1x1" in found.summary()
+    trained = {it.name: it.gaussians for it in found.estimate.stages}
+    both = f"Stage I {trained[Stage.COARSE]:,}, largest block {trained[Stage.BLOCK]:,}"
+    assert f"Gaussians, roughly: {both}" in found.summary() and trained[Stage.COARSE] != trained[Stage.BLOCK]
+
+
+def test_memory_that_no_task_fits_into_is_refused_with_the_least_that_one_does(scene: Scene) -> None:
+    """Before anything is measured: the least is that of the same job on assumptions."""
+
+    def config(memory: float | None) -> RunConfig:
+        given = {"width": 64, "device": "cpu", "blocks": "auto", "memory": memory}
+        return RunConfig.model_validate(given)
+
+    with pytest.raises(
+        InputError, match=r"--memory 0\.1GiB is too little .* at --width 64 give at least"
+    ) as no:
+        require_memory(scene, config(0.1))
+    least = float(str(no.value).rpartition(" ")[2].removesuffix("GiB"))
+    for enough in (None, 0.5, least):
+        require_memory(scene, config(enough))
+    estimator = Estimator(
+        scene, change(config(least), {"blocks": "1x1x1"}), assumed(scene, config(least)), ()
+    )
+    assert 0.4 < least < 1.2 * max(stage.host for stage in estimator.estimate().stages) / 2**30
 
 
 def test_a_job_that_does_not_fit_is_refused_in_one_line_before_it_starts(scene: Scene) -> None:

@@ -180,7 +180,7 @@ def test_the_progress_of_a_run_grows_with_each_part_of_the_preparation(tmp_path:
         notes.write_note(notes.progress_path(folder), written)
         view = view_preparation(folder, state, running=True)
         assert view is not None
-        found.append(progress_of(state, {}, prepared_share(view)))
+        found.append(progress_of(state, 9.0, prepared_share(view)))
 
     show(Step.SFM, "finding poses and points")
     show(Step.SFM, "frames", 3, 9)

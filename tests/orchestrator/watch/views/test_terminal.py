@@ -26,7 +26,6 @@ from panolog.orchestrator.runs.records import (
 from panolog.orchestrator.runs.state import RunState
 from panolog.orchestrator.watch.views.terminal import WIDE, page, progress
 from tests.orchestrator.watch.views.test_timing import (
-    INFO,
     MEASURED,
     MERGED,
     ONE,
@@ -47,9 +46,12 @@ LARGE: list[Timed] = [
 
 
 def shown(records: list[Timed], width: int, *, running: bool) -> str:
+    """What a terminal shows a second after the last record."""
+    began = time.time() - records[-1][0] - 1
+    records = [(began + at, record) for at, record in records]
     console = Console(file=StringIO(), width=width)
     root = Path("runs/my street")
-    content = page(state(records), root=root, info=INFO, running=running, wide=width >= WIDE)
+    content = page(state(records), root=root, running=running, wide=width >= WIDE)
     console.print(content, crop=False)
     assert isinstance(console.file, StringIO)
     return console.file.getvalue()
@@ -91,6 +93,13 @@ def test_a_run_that_waits_for_its_disk_says_so_and_what_to_do() -> None:
     first, second, *_ = shown(waiting, 120, running=True).splitlines()
     assert first.startswith("waiting · Stage II · ")
     assert second.strip() == reason
+    paused = "waiting: block 1 is paused"
+    (first,) = (
+        line
+        for line in shown([*LARGE, (20_001, RunWaiting(paused))], 160, running=True).splitlines()
+        if paused in line
+    )
+    assert first.startswith(f"{paused} · Stage II · ") and "left" not in first
     continued = shown([*waiting, (20_900, RunContinued(899.0))], 120, running=True)
     assert continued.startswith("running · Stage II · ")
     assert reason not in continued + shown(waiting, 120, running=False)

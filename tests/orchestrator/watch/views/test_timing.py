@@ -19,7 +19,9 @@ from panolog.orchestrator.runs.records import (
     Progressed,
     Record,
     RunBegan,
+    RunContinued,
     RunEnded,
+    RunWaiting,
     ScoresSaved,
     Stored,
     TaskFailed,
@@ -218,11 +220,11 @@ def test_the_seconds_of_a_task_are_of_all_its_attempts() -> None:
     [
         (STAGE_ONE[:4], 11, 320),  # before the first worker: as estimated
         (STAGE_ONE[:5], 22, 310),  # without a rate: less what has passed
-        (STAGE_ONE[:6], 60, 50 + 220),  # at the present rate, and what is to come
+        (STAGE_ONE[:6], 60, 48 + 0.96 * 220),  # at its mean rate, and what is to come is as much quicker
         (STAGE_ONE, 112, 220),  # between two stages
         (STAGE_TWO[:8], 115, 8 + 210),  # scoring
         (STAGE_TWO[:10], 121, 210),  # after the plan
-        (STAGE_TWO, 150, 80 + 10),  # the later of two blocks
+        (STAGE_TWO, 150, 0.8 * (0.36 * 200 + 0.64 * 125) + 10),  # the later of two blocks
         (TRAINED, 205, 10),
         ([*TRAINED, (206, MERGED), (206, started(EVAL))], 208, 4),
         ([*TRAINED, *SHARDED, (206, MERGED)], 206, 12 + 6),
@@ -234,12 +236,58 @@ def test_the_time_left_is_that_of_the_whole_run(records: list[Timed], now: float
     assert summarize(state(records), running=True, now=now).eta == pytest.approx(eta)
 
 
-def test_an_evaluation_in_shards_is_as_much_of_a_run_as_one_task() -> None:
+@pytest.mark.parametrize(
+    ("records", "now"), [(STAGE_ONE[:5], 22.0), (STAGE_ONE, 112.0), (STAGE_TWO, 150.0), (TRAINED, 205.0)]
+)
+def test_progress_is_the_share_of_the_time_that_is_over(records: list[Timed], now: float) -> None:
+    shown = summarize(state(records), running=True, now=now)
+    assert shown.seconds is not None and shown.eta is not None
+    assert shown.progress == pytest.approx(shown.seconds / (shown.seconds + shown.eta))
+    killed = summarize(state(records), running=False, now=now + 9_999)
+    assert 0 < killed.progress <= shown.progress  # it has ended with its last record
+    assert summarize(state([*records, (now, RunEnded(Outcome.DONE))]), running=False).progress == 1.0
+
+
+def test_a_run_without_an_estimate_has_no_progress_but_that_of_its_preparation() -> None:
+    early = STAGE_ONE[:3]
+    assert summarize(state(early), running=True, now=9).progress == 0
+    assert 0 < summarize(state(early), running=True, now=9, prepared=0.5).progress < 0.1
+
+
+def test_the_more_of_a_task_is_done_the_more_its_own_pace_counts() -> None:
+    """It takes 200 s where 100 were estimated; what follows is then expected to take twice as long, too."""
+    found = []
+    for done in (1, 10, 25, 50, 90):
+        records: list[Timed] = [*STAGE_ONE[:5], (12 + 2 * done, at(COARSE, done, rate=5.0))]
+        eta = summarize(state(records), running=True, now=12 + 2 * done).eta
+        assert eta is not None
+        found.append(eta / (200 - 2 * done + 2 * 220))
+    assert found == sorted(found) and found[0] == pytest.approx(0.5, abs=0.01)
+    assert found[2:] == pytest.approx([1, 1, 1])
+
+
+def test_while_a_run_waits_its_progress_stands_still_and_there_is_no_time_left() -> None:
+    why = "waiting: block 1 is paused"
+    paused: list[Timed] = [
+        *STAGE_TWO,
+        (160, TaskYielded(ONE)),
+        (205, model(ZERO, 80)),
+        (205, RunWaiting(why)),
+    ]
+    soon, late = (summarize(state(paused), running=True, now=now) for now in (206.0, 9_999.0))
+    assert (late.label, late.waiting, late.eta) == (why, why, None)
+    assert late.progress == soon.progress > 0.5
+    again = summarize(state([*paused, (306, RunContinued(101.0))]), running=True, now=307.0)
+    assert (again.label, again.waiting) == ("running", "") and again.eta is not None
+    shut = "waiting: every machine is in quarantine; gpu-a: 3 tasks have failed there in a row"
+    (label, full) = ("waiting: every machine is in quarantine", "disk full, waiting: free 2.0 GiB")
+    assert summarize(state([*STAGE_TWO, (151, RunWaiting(shut))]), running=True, now=152.0).label == label
+    assert summarize(state([*STAGE_TWO, (151, RunWaiting(full))]), running=True, now=152.0).label == "waiting"
+
+
+def test_the_shards_of_an_evaluation_are_a_stage() -> None:
     parts = [*TRAINED, *SHARDED, (206, MERGED)]
-    one = view([*TRAINED, (206, MERGED), (206, started(EVAL)), (208, at(EVAL, 50))], running=True).progress
-    assert view([*parts, (206, started(PART)), (208, at(PART, 50))], running=True).progress < one
     begun = view([*parts, *MEASURED[:2]], running=True)
-    assert view(parts, running=True).progress < begun.progress
     measuring = stage(begun, "measure")
     assert (measuring.label, measuring.status, measuring.tasks, measuring.done) == (
         "measurement",

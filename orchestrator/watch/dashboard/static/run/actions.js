@@ -9,12 +9,12 @@ import { taskLabel } from "panolog/shared/format.js";
 
 /** @typedef {"stop" | "resume" | "pause" | "unpause" | "retry" | "release"} Action */
 
-/** Title, text and button of each confirmation; {} is the block or the machine. @type {Record<Action, [string, string, string]>} */
+/** Title, text and button of each confirmation; {} is the block, the blocks or the machine. @type {Record<Action, [string, string, string]>} */
 const TEXTS = {
   stop: ["Stop the run?", "Every task that trains saves a checkpoint first. The run can be resumed from there.", "Stop"],
   resume: ["Resume the run?", "A new driver starts on this machine and resumes from the last checkpoints.", "Resume"],
   pause: ["Pause {}?", "It saves a checkpoint and waits. The others continue; the merge waits for it.", "Pause"],
-  unpause: ["Resume {}?", "It resumes from its last checkpoint when a worker is free.", "Resume"],
+  unpause: ["Resume {}?", "From the last checkpoint, when a worker is free.", "Resume"],
   release: ["Release {}?", "It gets the next task that waits. If tasks fail there again, it goes back into quarantine.", "Release"],
   retry: ["Retry {}?", "It gets all its attempts again and resumes from its last checkpoint.", "Retry"],
 };
@@ -24,6 +24,9 @@ const POSSIBLE = {
   unpause: ["paused", "pausing"],
   retry: ["failed", "waiting", "running"],
 };
+
+/** @param {number[]} blocks one at least */
+const blocksLabel = (blocks) => (blocks.length > 1 ? `${blocks.length} blocks` : taskLabel(`block/${blocks[0]}`));
 
 /** @typedef {ReturnType<typeof actions>} ActionButtons */
 
@@ -35,18 +38,28 @@ export function actions(path) {
   /**
    * A button. One that is not possible stays in the tab order, so that its reason can be read.
    * @param {Action} action
-   * @param {number | null} block
+   * @param {number[]} blocks none for an action on the run or a machine
    * @param {string} why it is not possible; empty if it is
    * @param {NodeView["quarantine"]} machine
    */
-  function button(action, block, why, machine = null) {
+  function button(action, blocks, why, machine = null) {
     const [title, text, label] = TEXTS[action];
-    const name = machine ? machine.host : taskLabel(`block/${block}`);
+    const name = machine ? machine.host : blocks.length ? blocksLabel(blocks) : "";
     const texts = /** @type {[string, string, string]} */ ([title.replace("{}", name), text, label]);
     const stop = action === "stop";
-    const request = { action, block, node: machine ? machine.node : null };
-    const click = () => why || confirm(texts, stop, () => post(`${path}/actions`, request));
+    const node = machine ? machine.node : null;
+    const send = async () => {
+      for (const block of blocks.length ? blocks : [null]) await post(`${path}/actions`, { action, block, node });
+    };
+    const click = () => why || confirm(texts, stop, send);
     return el("button", { type: "button", "data-action": action, class: stop && !why ? "danger" : null, "aria-disabled": why ? "true" : null, title: why || null, on: { click } }, label);
+  }
+
+  /** Resumes all blocks that are paused. @param {number[]} blocks */
+  function unpause(blocks) {
+    const made = button("unpause", blocks, refusal("unpause"));
+    made.append(` ${blocksLabel(blocks)}`);
+    return made;
   }
 
   /** Why an action is not possible; empty if it is. @param {Action} action @param {Row} [row] */
@@ -95,23 +108,25 @@ export function actions(path) {
     /** The buttons of a block. @param {Row} row */
     ofBlock(row) {
       const pause = row.status === "paused" || row.status === "pausing" ? "unpause" : "pause";
-      return [button(pause, row.block, refusal(pause, row)), button("retry", row.block, refusal("retry", row))];
+      const blocks = row.block === null ? [] : [row.block];
+      return [button(pause, blocks, refusal(pause, row)), button("retry", blocks, refusal("retry", row))];
     },
     /** The button of a machine in quarantine. @param {NonNullable<NodeView["quarantine"]>} machine */
-    ofMachine: (machine) => button("release", null, refusal("release"), machine),
+    ofMachine: (machine) => button("release", [], refusal("release"), machine),
     /** A line for touch screens, which show no tooltips, where no action is possible. @param {Row} row */
     whyNot(row) {
       const whys = /** @type {const} */ (["pause", "unpause", "retry"]).map((action) => refusal(action, row));
       return whys.every(Boolean) && el("p", { class: "muted small" }, `Not possible now: ${whys[0]}.`);
     },
     /** @param {RunPage} run */
-    update({ actions: current, result, summary: { status, tasks } }) {
+    update({ actions: current, result, paused, summary: { status, tasks } }) {
       given = current;
       const model = tasks.some((task) => task.checkpoint || task.status === "done");
-      replaceIfChanged(byId("actions"), [given, result, status, model], () => {
+      replaceIfChanged(byId("actions"), [given, result, status, model, paused], () => {
         setMessage(byId("why"), status === "done" || given.allowed ? given.failed ?? "" : `Actions are disabled: ${given.why}`);
         return [
-          status === "running" ? button("stop", null, refusal("stop")) : status !== "done" && button("resume", null, refusal("resume")),
+          status === "running" && paused.length > 0 && unpause(paused),
+          status === "running" ? button("stop", [], refusal("stop")) : status !== "done" && button("resume", [], refusal("resume")),
           model && viewer(null),
           result.model && link("point_cloud.ply", "Download PLY"),
           result.report && link("report.html", "Report"),

@@ -112,8 +112,8 @@ export function overview() {
     document.title = `${live ? `${percent(run.progress)} ` : ""}${name} · PanoLOG`;
     setText(byId("name"), name);
     setText(byId("scene"), [run.info.scene?.path, run.began && `began ${clock(run.began)}`].filter(Boolean).join(" · "));
-    setPill(byId("status"), running && !live ? "unknown" : summary.status, running && !live ? "last state: running" : summary.label);
-    setMessage(byId("reason"), summary.waiting || (summary.reason ?? ""));
+    setPill(byId("status"), running && !live ? "unknown" : summary.waiting ? "paused" : summary.status, running && !live ? "last state: running" : summary.label);
+    setMessage(byId("reason"), summary.waiting === summary.label ? "" : summary.waiting || (summary.reason ?? ""));
     const [text, command] = hint(run) ?? ["", ""];
     byId("hint").hidden = !text;
     setText(byId("hint-text"), text);

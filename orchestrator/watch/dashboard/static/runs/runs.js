@@ -89,7 +89,7 @@ function fillRow(row, run) {
   setText(below, run.error ?? (run.scene ? `scene ${run.scene}` : ""));
   below.classList.toggle("error", Boolean(run.error));
   const unsure = lost && run.status === "running";
-  setPill(first(".pill", row), unsure ? "unknown" : run.status, unsure ? "last state: running" : run.label || run.status);
+  setPill(first(".pill", row), unsure ? "unknown" : run.label.startsWith("waiting") ? "paused" : run.status, unsure ? "last state: running" : run.label || run.status);
   setBar(first("progress", row), run.progress, `progress of ${title(run)}`);
   setText(first(".share", row), percent(run.progress));
   for (const { key, text } of COLUMNS) if (text) setText(first(`[data-column="${key}"]`, row), text(run));

@@ -532,6 +532,7 @@ export interface Summary {
   reason: string | null;
   waiting: string;
   resume: string | null;
+  progress: number;
   seconds: number | null;
   eta: number | null;
   paused: Array<number>;
@@ -557,6 +558,7 @@ export interface SummaryHead {
   reason: string | null;
   waiting: string;
   resume: string | null;
+  progress: number;
   seconds: number | null;
   eta: number | null;
   paused: Array<number>;

@@ -20,6 +20,7 @@ from panolog.orchestrator.runs.records import (
     PlanSaved,
     Record,
     RunEnded,
+    RunWaiting,
     Stored,
     TaskFailed,
     TaskStarted,
@@ -307,5 +308,8 @@ def test_where_all_nodes_fail_the_run_waits_and_then_says_why(many: Harness) -> 
     assert {released.reason for released in many.records(NodeReleased)} == {"its time is over"}
     assert 5 * 600 <= clock.now - 1e9 < 2 * 3600
     assert many.state.failed_blocks() == ()  # none is given up
+    waits = many.records(RunWaiting)
+    assert all(wait.reason.startswith("waiting: every machine is in quarantine; gpu-") for wait in waits)
+    assert len(waits) == 5  # of six rounds, after the last of which it gives up
     assert any("all are used again after 10:00" in notice.message for notice in many.state.notices)
     assert many.drive(resumed=True).outcome == "done"
