@@ -83,7 +83,15 @@ def _unusual(plan: Plan) -> list[str]:
             lines.append(
                 f"block {block} has no camera: its {int(count):,} Gaussians stay as they were after Stage I"
             )
-        elif not plan.trained[block]:
+        elif plan.trained[block]:
+            continue
+        elif seen >= plan.config.min_cameras:
+            share = f"partition.min_share={plan.config.min_share:g} of the mean"
+            lines.append(
+                f"block {block} has {int(count):,} Gaussians, not more than {share}: they stay as they were "
+                "after Stage I"
+            )
+        else:
             lines.append(
                 f"block {block} has {int(seen)} camera{'s' * int(seen != 1)}, fewer than "
                 f"partition.min_cameras={plan.config.min_cameras}: "

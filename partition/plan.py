@@ -62,6 +62,13 @@ class PartitionConfig(BaseModel):
         description="Cameras a block needs to be trained; with fewer it keeps its Stage I Gaussians. Two "
         "place a surface and only a third can contradict them: with fewer, training overfits.",
     )
+    min_share: float = Field(
+        default=0.01,
+        ge=0.0,
+        le=1.0,
+        description="Gaussians a block needs to be trained, as a share of the mean of all blocks; with no "
+        "more it keeps those of Stage I: a cell at the rim with a few dozen would take as long as any other.",
+    )
 
     def box(self, centers: ArrayLike) -> Aabb:
         """The AABB (eq. 9) of training cameras at centers (K, 3), world units. Raises as `aabb`."""
@@ -102,9 +109,9 @@ class Plan:
 
     @cached_property
     def trained(self) -> NDArray[np.bool_]:
-        """(B,) which blocks are trained: those with Gaussians and enough cameras; others keep Stage I's."""
+        """(B,) which blocks are trained: those with enough cameras and Gaussians; others keep Stage I's."""
         enough: NDArray[np.bool_] = self.assignment.counts >= self.config.min_cameras
-        enough &= self.gaussians > 0
+        enough &= self.gaussians > self.config.min_share * self.gaussians.mean()
         return enough
 
     def cameras(self, block: int) -> tuple[int, ...]:
@@ -135,6 +142,7 @@ class Plan:
             aspect=self.config.aspect,
             tau_grad=self.config.tau_grad,
             min_cameras=self.config.min_cameras,
+            min_share=self.config.min_share,
             grid=self.grid.shape if isinstance(self.grid, Grid) else None,
             cells=self.grid.layout if isinstance(self.grid, Grid) else self.config.cells,
             cuts=self.grid.cuts if isinstance(self.grid, Cuts) else (),
@@ -203,6 +211,7 @@ class Plan:
                 aspect=file.aspect,
                 tau_grad=file.tau_grad,
                 min_cameras=file.min_cameras,
+                min_share=file.min_share,
                 cells=file.cells,
                 cuts=file.cuts,
             ),

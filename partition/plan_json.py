@@ -52,6 +52,7 @@ class PlanFile(_Strict):
     aspect: float = 0.5  # before there was such a setting, it was this
     tau_grad: float
     min_cameras: int = 1  # before there was such a setting, one was enough
+    min_share: float = 0.0  # and any Gaussians were
     grid: tuple[int, int, int] | None  # (B_x, B_y, B_z); None where blocks are balanced
     cells: Layout = "cube"  # what the cells along an axis of a grid are equal parts of
     cuts: tuple[Cut, ...] = ()  # of balanced blocks, as `cells.Cuts`

@@ -58,7 +58,7 @@ def check(scene: AnySceneArg, as_json: JsonOption = False) -> None:
 
         found = check_scene(read_scene(scene))
     problems = [f"WRONG   {problem}" for problem in found.problems]
-    print_result(asdict(found), [*found.lines(), *problems], as_json=as_json)
+    print_result(asdict(found), [*found.lines(), *problems, found.verdict], as_json=as_json)
     if problems:
         raise typer.Exit(2)
 

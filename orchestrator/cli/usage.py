@@ -1,7 +1,9 @@
 """How commands and groups present their usage. Separate: the program and its groups need it."""
 
+import re
 from typing import Any
 
+import typer
 from typer.core import TyperCommand, TyperGroup
 
 from panolog.scene.errors import StoreError
@@ -10,6 +12,15 @@ from panolog.scene.stores.url import PROTOCOLS, is_url
 # What takes URLs of object stores.
 _RUNS = ("run", "resume", "status", "events", "report", "export", "doctor", "scene info", "scene check")
 _STORES = (*_RUNS, "clean", *(f"cluster {name}" for name in ("submit", "resume", "status", "stop")))
+
+
+# What typer says of a value, with the words of its library, and the same for people.
+_PLAIN = (
+    (r"Value error, ", ""),
+    (r"Input should be a valid integer.*", "write a whole number"),
+    (r"Input should be a valid number.*", "write a number"),
+    (r"Input should be ", "must be "),
+)
 
 
 class _PlainUsage:
@@ -44,7 +55,12 @@ class Command(_PlainUsage, TyperCommand):
                         f"{protocol}://…: `panolog {name}` takes files and folders of this machine only;"
                         " docs/storage.md has the commands that take URLs"
                     )
-        return super().parse_args(ctx, args)
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            for words, plain in _PLAIN:
+                error.message = re.sub(f"^{words}", plain, error.message)
+            raise
 
 
 class Group(_PlainUsage, TyperGroup):

@@ -39,6 +39,14 @@ class SceneCheck:
     black_nadir_degrees: float | None  # from straight down, within which the panoramas are black and unmasked
     problems: tuple[str, ...]
 
+    @property
+    def verdict(self) -> str:
+        """Whether it can be trained on, as text."""
+        if not self.problems:
+            return "verdict: poses, points and panoramas fit together"
+        count = f"{len(self.problems)} problems" if len(self.problems) > 1 else "a problem"
+        return f"verdict: {count}; fix that first, or training yields fog"
+
     def lines(self) -> list[str]:
         """The measurements as text."""
         found = [f"{self.panoramas} panoramas, {self.observations:,} observations of points"]

@@ -137,11 +137,13 @@ def _change(data: dict[str, Any], path: list[Any], value: Any) -> dict[str, Any]
     ("path", "value", "words"),
     [
         (["version"], 3, "version"),
+        (["cameras", 0, "center", 1], "much", "cameras.0.center.1"),
         (["cameras", 0, "center", 1], float("nan"), "center"),
         (["extra"], 1, "extra"),
         (["grid"], [2, 0, 2], "at least 1"),
         (["aabb", "lower"], [1e9, 0, 0], "lower < upper"),
         (["blocks", 0, "cameras"], [], "'blocks'"),
+        (["blocks", 1, "gaussians"], 3.5, "integer"),
         (["cameras", 2, "block"], 3, "'cameras'"),
         (["cameras", 2, "assigned"], {}, "'blocks'"),
         (["cameras", 2, "assigned", 9], "gradient", "contradicts"),
@@ -195,11 +197,20 @@ def test_blocks_with_few_cameras_keep_what_stage_one_made() -> None:
     assert Plan.from_json(stored).trained.tolist() == [True, True]
 
 
-def test_audit_names_blocks_of_hardly_any_gaussians() -> None:
-    scores = np.ones((6, 4))
-    few = replace(plan(scores), gaussians=np.array([1000, 26, 100, 500]))
-    (line,) = (line for line in audit(few, scores) if "hardly anything" in line)
-    assert line.startswith("block 1 begins with 26 Gaussians of Stage I")
+def test_blocks_with_next_to_no_gaussians_keep_what_stage_one_made() -> None:
+    centers = np.array([[x, 0.0, 0] for x in (-3, -2, -1, 1, 2, 3)])
+    means = np.concatenate([np.repeat(centers[3:], 800, axis=0), centers[:1].repeat(12, axis=0)])
+    made = planned(centers, means, np.zeros((6, 2)), Grid((2, 1, 1)))
+    assert made.gaussians.tolist() == [12, 2400] and made.trained.tolist() == [False, True]
+    (line,) = (line for line in audit(made, np.zeros((6, 2))) if "min_share" in line)
+    assert line == (
+        "block 0 has 12 Gaussians, not more than partition.min_share=0.01 of the mean: they stay as they were"
+        " after Stage I"
+    )
+    stored = json.loads(json.dumps(made.to_json()))
+    assert Plan.from_json(stored).trained.tolist() == [False, True]
+    del stored["min_share"]  # of a version that trained all blocks with a Gaussian
+    assert Plan.from_json(stored).trained.tolist() == [True, True]
 
 
 def test_audit_reports_uneven_blocks() -> None:

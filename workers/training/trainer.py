@@ -199,7 +199,7 @@ class Trainer:
             exterior.of(row, self._camera(row))
             if self.meter.due():
                 yield self.meter.progress(self.iteration, len(self.state.gaussians))
-        yield Notice(self.spec.task, exterior.finish(self._cameras()))
+        _LOG.info("%s: %s", self.spec.task, exterior.finish(self._cameras()))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint. Raises RunError if it is of another task or a longer run."""
@@ -258,12 +258,12 @@ class Trainer:
             if stopped:
                 return
         yield from self.saver.finished(wait=True)
-        if self.exterior is not None and self.spec.initial is not None and self.spec.cell is not None:
+        exterior, initial, cell = self.exterior, self.spec.initial, self.spec.cell
+        if _LOG.isEnabledFor(logging.INFO) and exterior and initial and cell:
             self.settle()
             own = self.state.gaussians.to("cpu")
-            whole = with_block(self.spec.initial.load(), self.spec.cell, own)
-            differences = self.exterior.differences(own, whole, self._cameras())
-            yield Notice(self.spec.task, f"at the end the colours of what is baked {differences}")
+            found = exterior.differences(own, with_block(initial.load(), cell, own), self._cameras())
+            _LOG.info("%s: at the end the colours of what is baked %s", self.spec.task, found)
 
     def result(self) -> Gaussians:
         """The whole model (Stage I), or the block's retained set (eq. 12)."""

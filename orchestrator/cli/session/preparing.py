@@ -145,13 +145,14 @@ def settings_of(source: Path, options: Options) -> Settings | None:
 
 
 def is_scene(source: Path) -> bool:
-    """Whether a folder has a model; also if it is missing or empty, so that reading it says what is wrong."""
-    if source.is_file():
-        return False
+    """Whether a folder has a model. Raises SceneError if nothing is there."""
+    if not source.exists() or (source.is_dir() and not any(source.iterdir())):
+        what = "the folder is empty" if source.exists() else "there is no such file or folder"
+        raise SceneError(f"{source}: {what}; give a scene, a folder of panoramas or a 360° video")
     try:
         model_folder(source.resolve())
     except SceneError:
-        return not source.is_dir() or not any(source.iterdir())
+        return False
     return True
 
 

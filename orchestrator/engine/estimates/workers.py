@@ -63,12 +63,13 @@ class Workers:
         price = f", {self.price:g} {self.currency} per hour" if self.price is not None else ""
         money = f"{self.currency:>12}" if self.price is not None else ""
         found = [f"workers of {self.kind}{price}", f"{'workers':>9}{'time':>10}{'machine hours':>15}{money}"]
-        for row in self.rows:
+        for i, row in enumerate(self.rows):
             cost = "" if row.cost is None else f"{row.cost:>12,.2f}"
             bar = "█" * max(1, round(_BAR * row.seconds / longest))
-            knee = "  knee: more hardly shorten it" if row.workers == self.knee else ""
+            note = "  more machines save little time" if row.workers == self.knee else ""
+            note = "  no faster" if i and row.seconds >= self.rows[i - 1].seconds else note
             time = f"{duration(row.seconds):>10}{row.machine_hours:>15.2f}"
-            found.append(f"{row.workers:>9}{time}{cost}  {bar}{knee}")
+            found.append(f"{row.workers:>9}{time}{cost}  {bar}{note}")
         return found
 
 

@@ -54,7 +54,9 @@ class MoneyView(_Model):
         return hours(used.seconds) if used.cost is None else f"{used.cost:,.2f} {self.currency}"
 
     def line(self) -> str:
-        """The account in one line."""
+        """The account in one line; "" where it says nothing: of one machine without a price."""
+        if self.used.cost is None and sum(kind.count for kind in self.kinds) < 2:
+            return ""
         limit = f" of at most {self.max_cost:,.2f}" if self.max_cost is not None else ""
         parts = [f"{self.text(self.used)}{limit}"]
         if self.used.cost is not None:

@@ -100,7 +100,8 @@ def table(state: RunState, *, root: Path, running: bool, wide: bool, name: str =
     waits = [Text(summary.waiting, style="yellow")] if summary.waiting not in ("", summary.label) else []
     waits += _leaving(summary, now)
     waits += _quarantined(summary, now, name or root)
-    waits += [Text(summary.money.line(), style="dim")] if summary.money else []
+    money = summary.money.line() if summary.money else ""
+    waits += [Text(money, style="dim")] if money else []
     return Group(head, *waits, *_gaussians(summary), *shown, *_failures(state))
 
 
@@ -200,7 +201,8 @@ def _task_row(task: TaskState, now: float, *, wide: bool) -> Iterator[Renderable
     done = progress.iteration if progress else int(task.status == Status.DONE)
     total = progress.iterations if progress else 1
     yield _bar(done, total, task.status, wide=wide)
-    yield f"{progress.iteration:,}/{progress.iterations:,}" if progress else ""
+    views = "" if task.id.stage.trains else " views"
+    yield f"{progress.iteration:,}/{progress.iterations:,}{views}" if progress else ""
     yield f"{progress.rate:.1f} it/s" if progress and task.status == Status.RUNNING else task.status
     eta, seconds = eta_of(task, now), seconds_of(task, now)
     yield f"{duration(eta)} left" if eta is not None else duration(seconds) if seconds else ""
@@ -300,8 +302,9 @@ def _urgent(record: Record) -> str:
             return f"{task}: {record.reason}; {then}"
         case BudgetNear() | BudgetReached():
             return record.what if isinstance(record, BudgetNear) else record.reason
-        case StopRequested():
-            return f"stopping: {record.tasks} tasks save a checkpoint first; repeat to stop at once"
+        case StopRequested() if record.tasks:
+            tasks = "a task saves" if record.tasks == 1 else f"{record.tasks} tasks save"
+            return f"stopping: {tasks} a checkpoint first; repeat to stop at once"
         case NodeQuarantined():
             return f"{record.host} ({record.node[:8]}): in quarantine: {record.reason}"
         case NodeReleased():
@@ -344,7 +347,8 @@ def _milestone(record: Record) -> str:
 
 def _progress_line(record: Progressed) -> str:
     parts = [
-        f"{task_label(task_name(record))}: {record.iteration}/{record.iterations}",
+        f"{task_label(task_name(record))}: {record.iteration}/{record.iterations}"
+        + " views" * (not record.task.stage.trains),
         f"{record.rate:.1f} it/s",
     ]
     if record.rate > 0:

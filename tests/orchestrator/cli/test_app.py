@@ -68,8 +68,14 @@ def test_wrong_options(scene: Path, tmp_path: Path, arguments: tuple[str, ...], 
 def test_folders_that_are_no_run_and_no_scene(tmp_path: Path) -> None:
     for command in ("status", "resume", "events", "eval", "partition"):
         assert "is not a run folder" in one_line(call(command, tmp_path))
-    assert "no such folder" in one_line(call("run", tmp_path / "none", "-o", tmp_path / "run"))
+    asked = "give a scene, a folder of panoramas or a 360° video"
+    none = one_line(call("run", tmp_path / "none", "-o", tmp_path / "run"))
+    assert none == f"panolog: {tmp_path / 'none'}: there is no such file or folder; {asked}"
+    (tmp_path / "empty").mkdir()
+    empty = one_line(call("run", tmp_path / "empty", "-o", tmp_path / "run"))
+    assert empty == f"panolog: {tmp_path / 'empty'}: the folder is empty; {asked}"
     assert "no such folder" in one_line(call("scene", "info", tmp_path / "none"))
+    assert "`panolog run` makes one of panoramas" in one_line(call("scene", "info", tmp_path / "empty"))
 
 
 def test_what_cannot_be_done_yet(run: Path, tmp_path: Path) -> None:
@@ -99,6 +105,24 @@ def test_usage_errors_exit_with_two() -> None:
     for words in (("run",), ("nonsense",), ("status", "a", "--nope")):
         assert call(*words).exit_code == 2
     assert call("--help").exit_code == 0
+    number = call("run", "a", "-o", "b", "--width", "abc")
+    assert number.exit_code == 2 and "'--width': write a whole number" in number.stderr
+    assert "must be less than or equal to 19" in call("run", "a", "-o", "b", "--nice", "40").stderr
+
+
+def test_the_help_of_run_begins_with_the_basic_options() -> None:
+    text = call("run", "--help").stdout
+    basics, *groups = text.split("─ Options ─")[1].split("\n╭─ ")
+    names = ("output", "blocks", "iterations", "width", "device", "help")
+    assert re.findall(r" --[a-z]+", basics) == [f" --{name}" for name in names]
+    assert [re.split(" ─", group)[0] for group in groups] == [
+        "Settings",
+        "Panoramas or a video instead of a scene",
+        "Machines and the driver",
+        "Notifications and logs",
+        "Cost and time (docs/money.md)",
+    ]
+    assert len(text.splitlines()) < 92
     result = call("--version")
     assert (result.exit_code, result.stdout) == (0, f"panolog {version('panolog')}\n")
 

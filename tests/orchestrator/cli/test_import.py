@@ -29,6 +29,7 @@ def test_import_as_json(tmp_path: Path) -> None:
     assert result.exit_code == 2
     (line,) = [line for line in result.stdout.splitlines() if line.startswith("WRONG")]
     assert "points and pixels hardly correlate" in line
+    assert result.stdout.splitlines()[-1] == "verdict: a problem; fix that first, or training yields fog"
     found = call("scene", "check", tmp_path / "scene", "--json")
     assert found.exit_code == 2
     assert len(json.loads(found.stdout)["problems"]) == 1

@@ -122,6 +122,7 @@ BROKEN: dict[str, tuple[Breakage, str]] = {
 def test_a_sound_town(tracks: bool, town: Scene) -> None:
     found = check_scene(town if tracks else without_tracks(town))
     assert found.problems == ()
+    assert found.verdict == "verdict: poses, points and panoramas fit together"
     assert found.color_correlation is not None
     assert found.color_correlation > 0.6
     assert found.patch_correlation > 0.6 or not tracks

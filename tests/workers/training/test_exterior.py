@@ -1,6 +1,7 @@
 """What surrounds a block: frozen or baked, it is the same to the block."""
 
 import gc
+import logging
 import tempfile
 import threading
 from dataclasses import replace
@@ -123,10 +124,15 @@ def test_a_block_that_ends_early_leaves_neither_its_thread_nor_its_file(
         gc.enable()
 
 
-def test_it_reports_what_was_baked_and_drops_the_model(scene: Scene, initial: Gaussians) -> None:
+def test_it_logs_what_was_baked_and_drops_the_model(
+    scene: Scene, initial: Gaussians, caplog: pytest.LogCaptureFixture
+) -> None:
     task = block(scene, initial)
-    events = list(train(task))
-    baked, ended = notices(events)
+    with caplog.at_level(logging.INFO):
+        events = list(train(task))
+    name = f"{task.task}: "
+    baked, ended = (text.removeprefix(name) for text in caplog.messages if "baked" in text)
+    assert notices(events) == []
     assert baked.startswith("baked what surrounds the block for 2 panoramas")
     assert ended.startswith("at the end the colours of what is baked differ from the full render by at most ")
     for notice, most in ((baked, 0.002), (ended, 0.02)):

@@ -30,7 +30,8 @@ def test_the_knee_is_where_a_doubling_takes_less_than_a_quarter_off(
 def test_the_table_marks_the_knee_and_has_costs_only_with_a_price() -> None:
     lines = table(7200, 3600, 3500).lines()
     assert "1 USD per hour" in lines[0]
-    assert [("knee" in line) for line in lines[2:]] == [False, True, False]
+    assert ["save little time" in line for line in lines[2:]] == [False, True, False]
+    assert table(7200, 7300).lines()[3].endswith("  no faster")
     assert "2.00" in lines[2]
     free = table(7200, 3600, price=None)
     assert "USD" not in "".join(free.lines())

@@ -2,6 +2,7 @@
 
 import pytest
 
+from panolog.orchestrator.runs.money.account import view_money
 from panolog.orchestrator.runs.money.losses import settled
 from panolog.orchestrator.runs.money.records import NodeReserved, NodeReturned, WorkLost
 from panolog.orchestrator.runs.money.spending import Spending
@@ -82,6 +83,17 @@ def test_without_a_price_the_seconds_count() -> None:
     state = after((0, BEGAN), (0, NodeReserved("node", "node", "2 cores", None)), (4, started(COARSE)))
     money = state.money.until(10)
     assert (money.used.seconds, money.idle.seconds, money.used.cost, money.priced) == (10, 4, 0, False)
+
+
+def test_a_line_about_one_machine_without_a_price_would_say_nothing() -> None:
+    free = [(0.0, NodeReserved(name, name, "2 cores", None)) for name in ("node", "b")]
+    lines = []
+    for machines in (free[:1], free, [(0.0, A)]):
+        view = view_money(after((0, BEGAN), *machines), 3600.0, running=True)
+        assert view is not None
+        lines.append(view.line())
+    hours = "2.00 machine hours, 2.00 machine hours idle, 0.00 machine hours lost"
+    assert lines[:2] == ["", hours] and lines[2].startswith("3,600.00 ")
 
 
 def test_runs_of_older_versions_have_no_account() -> None:

@@ -20,11 +20,13 @@ from panolog.orchestrator.runs.records import (
     Record,
     RunContinued,
     RunWaiting,
+    StopRequested,
     Stored,
     TaskYielded,
 )
 from panolog.orchestrator.runs.state import RunState
 from panolog.orchestrator.watch.views.terminal import WIDE, page, progress
+from panolog.workers.tasks import EVAL
 from tests.orchestrator.watch.views.test_timing import (
     MEASURED,
     MERGED,
@@ -35,6 +37,7 @@ from tests.orchestrator.watch.views.test_timing import (
     TRAINED,
     ZERO,
     Timed,
+    started,
     state,
 )
 
@@ -139,6 +142,26 @@ def test_plain_lines_say_what_leaves_and_what_moves() -> None:
         "gpu-07 (3f2a81c4): has left",
         "gpu-08 (7f2a81c4): stays after all, and is used again",
     ]
+
+
+def test_lines_say_views_where_nothing_is_trained_and_no_stop_of_nothing() -> None:
+    console = Console(file=StringIO(), width=80)
+    records: list[Record] = [
+        StopRequested(0),
+        StopRequested(1),
+        StopRequested(3),
+        Progressed(EVAL, 7, 216, 9.0),
+    ]
+    with progress(console, Path("run")) as show:
+        show(RunState(), [Stored(number, 0.0, record) for number, record in enumerate(records, 1)])
+    assert isinstance(console.file, StringIO)
+    assert console.file.getvalue().splitlines() == [
+        "stopping: a task saves a checkpoint first; repeat to stop at once",
+        "stopping: 3 tasks save a checkpoint first; repeat to stop at once",
+        "evaluation: 7/216 views, 9.0 it/s, 0:23 left",
+    ]
+    measured: list[Timed] = [*LARGE, (20_001, started(EVAL)), (20_002, Progressed(EVAL, 216, 216, 9.0))]
+    assert "216/216 views" in shown(measured, 120, running=True)
 
 
 def test_plain_lines_say_it_also_where_no_record_can_be_stored() -> None:

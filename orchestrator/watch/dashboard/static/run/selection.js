@@ -95,7 +95,7 @@ function blockNumbers(row) {
   ].filter(([, value]) => value && value !== "–");
   return [
     el("div", { class: "panel-title" }, el("h3", {}, taskLabel(row.name)), pill(row.status)),
-    row.kept && el("p", { class: "muted small" }, "Not trained: it is empty or no camera is assigned to it, so it keeps its Stage I Gaussians."),
+    row.kept && el("p", { class: "muted small" }, "Not trained: it has next to no Gaussians or too few cameras, so it keeps its Stage I Gaussians."),
     el("dl", { class: "numbers" }, numbers.map(([label, value]) => el("div", {}, el("dt", {}, label), el("dd", {}, value)))),
     error && el("p", { class: "notice error" }, error),
   ];
