@@ -72,6 +72,7 @@ class TaskSpec(ABC):
     width: int  # pixels of the panoramas; height is width / 2
     device: str = "cpu"
     locate: Locate = here  # where the panoramas are
+    taken: int = 0  # bytes of its GPU that it was to have, and that others have taken
 
     @abstractmethod
     def run(self) -> Iterator[Event | Calibration]:

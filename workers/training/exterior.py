@@ -55,9 +55,14 @@ class Rooms:
     baked: int  # of `BakedViews`, where the task computes
 
     @staticmethod
-    def of(cache: CacheConfig, device: str, panorama: Panorama, width: int, *, bakes: bool) -> "Rooms":
-        """As the settings have it. Args: panorama, any of the task's; width in pixels."""
-        host, room = int(cache.memory * 2**30), int((cache.device or 0) * 2**30)
+    def of(
+        cache: CacheConfig, device: str, panorama: Panorama, width: int, *, bakes: bool, taken: int = 0
+    ) -> "Rooms":
+        """As the settings have it.
+
+        Args: panorama, any of the task's; width in pixels; taken, `TaskSpec.taken`.
+        """
+        host, room = int(cache.memory * 2**30), max(0, int((cache.device or 0) * 2**30) - taken)
         if not bakes:
             return Rooms(host, room, 0)
         view, pixels = view_bytes(panorama, width), width * (width // 2)

@@ -98,7 +98,8 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
     """
     started = time.monotonic()
     scene, config = spec.scene.load(), spec.config
-    rooms = Rooms.of(config.cache, spec.device, scene.panoramas[spec.views[0]], spec.width, bakes=spec.bakes)
+    first = scene.panoramas[spec.views[0]]
+    rooms = Rooms.of(config.cache, spec.device, first, spec.width, bakes=spec.bakes, taken=spec.taken)
     with (
         open_cache(spec, scene, spec.views, rooms.host, rooms.device) as cache,
         closing(Trainer(spec, scene, cache, rooms.baked)) as trainer,

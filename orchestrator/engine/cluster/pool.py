@@ -30,7 +30,15 @@ from panolog.orchestrator.engine.cluster.nodes import RayNodes
 from panolog.orchestrator.engine.cluster.places import Others, Places
 from panolog.orchestrator.engine.scheduling.delivery import Large, announced
 from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
-from panolog.orchestrator.engine.scheduling.pool import NONE, Ended, Failed, Hello, Message, guarded
+from panolog.orchestrator.engine.scheduling.pool import (
+    NONE,
+    Ended,
+    Failed,
+    Hello,
+    Message,
+    guarded,
+    on_its_card,
+)
 from panolog.orchestrator.engine.scheduling.scaling import NO_GROWTH, Growth
 from panolog.orchestrator.runs import log
 from panolog.orchestrator.runs.info import own_code
@@ -153,7 +161,7 @@ class RayPool:
             _generator_backpressure_num_objects=_UNREAD,
         )
         self._agents.start(placement.node)
-        self._running[spec.task] = _Task(placement, remote.remote(spec, placement.threads, own_code()))
+        self._running[spec.task] = _Task(placement, remote.remote(spec, placement, own_code()))
 
     @reported
     def stop(self, task: TaskId) -> None:
@@ -261,26 +269,28 @@ def _environment(placement: Placement, *, pin: bool) -> dict[str, Any] | None:
     return {"env_vars": names} if names else None
 
 
-def _run(spec: TaskSpec, threads: int, code: str) -> Iterator[Hello | Event | Calibration | Usage | Large]:
+def _run(
+    spec: TaskSpec, where: Placement, code: str
+) -> Iterator[Hello | Event | Calibration | Usage | Large]:
     """What runs on the worker. Args: code, the driver's."""
-    os.environ["OMP_NUM_THREADS"] = str(threads)
+    os.environ["OMP_NUM_THREADS"] = str(where.threads)
     log.configure()
-    prepare(threads)
+    prepare(where.threads)
     _send_tensors_as_arrays()
     stopping.listen()
     cards = gpus_to_share() if spec.device == "cuda" else ()
     yield Hello(socket.gethostname(), os.getpid(), oom_kills(), cards[0] if len(cards) == 1 else "")
-    yield from announced(with_usage(guarded(spec.task, _with_code(code, spec))), _UNREAD)
+    yield from announced(with_usage(guarded(spec.task, _with_code(code, spec, where))), _UNREAD)
 
 
-def _with_code(code: str, spec: TaskSpec) -> Iterator[Event | Calibration | Usage]:
+def _with_code(code: str, spec: TaskSpec, where: Placement) -> Iterator[Event | Calibration | Usage]:
     """What a spec yields. Raises RunError if the code is not the driver's: parts of a model would differ."""
     if (own := own_code()) != code:
         raise RunError(
             f"{socket.gethostname()} has another PanoLOG than the driver (sources {own}, not {code}):"
             " install the same version on all machines"
         )
-    yield from run_remotely(spec)
+    yield from run_remotely(on_its_card(spec, where))
 
 
 def _send_tensors_as_arrays() -> None:

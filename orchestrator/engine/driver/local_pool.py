@@ -31,6 +31,7 @@ from panolog.orchestrator.engine.scheduling.pool import (
     InProcess,
     Message,
     guarded,
+    on_its_card,
 )
 from panolog.orchestrator.engine.scheduling.watch import Watch
 from panolog.orchestrator.runs import log
@@ -175,7 +176,7 @@ def _work(placement: Placement, pipe: Connection, environment: dict[str, str]) -
     _send(pipe, Hello(socket.gethostname(), os.getpid(), oom_kills()))
     with _Ending(pipe):
         spec: TaskSpec = pickle.loads(pipe.recv_bytes())
-        for event in announced(with_usage(guarded(spec.task, spec.run()))):
+        for event in announced(with_usage(guarded(spec.task, on_its_card(spec, placement).run()))):
             _send(pipe, event)
 
 

@@ -4,8 +4,10 @@
 plain processes of this one.
 """
 
+import logging
+import re
 from collections.abc import Iterable, Iterator, Mapping, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -19,13 +21,19 @@ from panolog.orchestrator.runs.machines.usage import Usage
 from panolog.orchestrator.runs.records import Failure
 from panolog.scene.errors import DeviceError, InputError, PanologError, RunError
 from panolog.scene.files import Locate, here
+from panolog.workers.device_memory import CONTEXT
 from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import Source, TaskSpec, Value
 from panolog.workers.tasks import CALIBRATE, TaskId
 
 T = TypeVar("T")
 NONE: Set[TaskId] = frozenset()
-_ALLOCATORS = ("DefaultCPUAllocator", "Insufficient memory")  # torch and OpenCV raise no type of their own
+_SHORTAGE = re.compile(  # what says so in words only: torch of the CPU, the driver, CUDA's libraries, OpenCV
+    "out[ _]of[ _]memory|alloc(ation)?_failed|defaultcpuallocator|insufficient memory|cannot allocate memory"
+    "|bad_alloc|memoryallocation",
+    re.IGNORECASE,
+)
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -54,12 +62,13 @@ class Failed:
     @staticmethod
     def of(error: BaseException, detail: str) -> "Failed":
         """That of a worker that has raised an error. Args: detail, its traceback."""
+        text = first_line(str(error))
+        if isinstance(error, InputError):
+            return Failed(text, Failure.INPUT)
+        if isinstance(error, MemoryError | torch.OutOfMemoryError) or _SHORTAGE.search(str(error)):
+            return Failed(f"out of memory: {text or 'on the CPU'}", Failure.MEMORY, detail)
         if isinstance(error, PanologError):
-            kind = Failure.INPUT if isinstance(error, InputError) else Failure.ERROR
-            return Failed(first_line(str(error)), kind)
-        untyped = any(allocator in str(error) for allocator in _ALLOCATORS)
-        if untyped or isinstance(error, MemoryError | torch.OutOfMemoryError):
-            return Failed(f"out of memory: {first_line(str(error)) or 'on the CPU'}", Failure.MEMORY, detail)
+            return Failed(text)
         return Failed(first_line(f"{type(error).__name__}: {error}"), Failure.ERROR, detail)
 
 
@@ -129,6 +138,23 @@ def guarded(task: TaskId, events: Iterator[T]) -> Iterator[T]:
         if cause is not None or (isinstance(error, DeviceError) and task != CALIBRATE):
             raise RunError(str(error)) from error
         raise
+
+
+def on_its_card(spec: TaskSpec, where: Placement) -> TaskSpec:
+    """A spec as the GPU of this process has room for it now; called in the worker, on a task's start.
+
+    Other programs may have taken memory since the driver has seen the machine: that is `TaskSpec.taken`.
+    Of a card that it shares, torch gets the task's part alone, and runs out of memory before others do.
+    """
+    if spec.device != "cuda" or not where.memory:
+        return spec
+    (free, total), part = torch.cuda.mem_get_info(), max(0, where.memory - CONTEXT)
+    if where.gpus < 1:
+        torch.cuda.set_per_process_memory_fraction(min(1.0, part / total))
+    if (taken := max(0, part - free)) == 0:
+        return spec
+    _LOG.info("%s: others have taken %d MiB of its part of the GPU", spec.task, taken // 2**20)
+    return replace(spec, taken=taken)
 
 
 def first_line(text: str) -> str:

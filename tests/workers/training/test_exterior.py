@@ -185,6 +185,9 @@ def test_panoramas_and_what_is_baked_share_the_cache(scene: Scene) -> None:
     assert on_cpu.baked == pytest.approx(10 * baked, abs=2) and on_cpu.host == pytest.approx(10 * view, abs=2)
     assert on_gpu.host == host and on_gpu.device + on_gpu.baked == device
     assert on_gpu.baked == pytest.approx(baked, abs=2)
+    less = Rooms.of(cache, "cuda", panorama, 512, bakes=True, taken=device // 2)
+    assert less.host == host and less.device + less.baked == device - device // 2
+    assert Rooms.of(cache, "cuda", panorama, 512, bakes=True, taken=2 * device) == Rooms(host, 0, 0)
 
 
 def problem(scene: Scene, model: Gaussians, view: View, loss: Loss, around: Baked | None) -> Problem:

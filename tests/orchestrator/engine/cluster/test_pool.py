@@ -223,7 +223,7 @@ def test_a_worker_reports_its_gpu(pool: RayPool) -> None:
     (node,) = pool.nodes()
     assert [gpu.uuid for gpu in node.gpus] == ["GPU-4", "GPU-6"]
     for gpu, uuid in enumerate(("", "GPU-6")):
-        where = Placement(node.id, 0.25, 2**30, gpus=1.0, gpu=gpu, uuid=uuid)
+        where = Placement(node.id, 0.25, memory=0, gpus=1.0, gpu=gpu, uuid=uuid)  # none is known
         hello, notice = islice(scripted.messages(pool, OnGpu(device="cuda"), where), 2)
         assert isinstance(hello, Hello)
         assert isinstance(notice, Notice)
