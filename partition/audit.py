@@ -8,7 +8,6 @@ from panolog.partition.assignment import OVERLAP, overlap
 from panolog.partition.plan import Plan
 
 _UNEVEN = 2.0  # the largest block over the mean, from which on it is reported
-_HARDLY = 100  # Gaussians of a block, fewer than which are reported
 _FEW = 0.05  # of all assignments: where gradients add fewer, the plan is nearly one by position
 TAUS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05, 0.02, 0.01)  # thresholds that are tried, in order
 
@@ -96,10 +95,5 @@ def _unusual(plan: Plan) -> list[str]:
                 f"block {block} has {int(seen)} camera{'s' * int(seen != 1)}, fewer than "
                 f"partition.min_cameras={plan.config.min_cameras}: "
                 f"its {int(count):,} Gaussians stay as they were after Stage I"
-            )
-        elif count < _HARDLY:
-            lines.append(
-                f"block {block} begins with {int(count)} Gaussians of Stage I, which is hardly anything; "
-                "fewer blocks (--blocks) leave more to each"
             )
     return lines

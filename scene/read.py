@@ -35,6 +35,8 @@ from panolog.scene.stores.outline import outline
 from panolog.scene.stores.url import is_url
 
 DEPTHS, SKY_MASKS, MASKS = "depths", "skymasks", "masks"
+# Where the model is in a scene: as COLMAP has it, and those that others make of equirectangular pictures.
+MODELS = ("sparse/0", "sparse", "sparse_equirectangular/0", "colmap/sparse/0")
 MIN_CAMERAS = 2  # one panorama has no parallax
 MIN_POINTS = 4  # a point's initial scale comes from its three nearest neighbours
 FAR = 10  # times the cameras' reach; float32 is then coarser than 1e-6 of it, 1 mm in a kilometre
@@ -80,7 +82,7 @@ def model_folder(root: Path) -> Path:
     if not root.is_dir():
         what = "is a file" if root.exists() else "there is no such folder"
         raise SceneError(f"{root}: {what}; give the folder of a scene: images and a COLMAP model in sparse/0")
-    for folder in (root / "sparse" / "0", root / "sparse"):
+    for folder in (root / name for name in MODELS):
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return folder
     raise SceneError(f"{root}: there is no COLMAP model in sparse/0; `panolog run` makes one of panoramas")

@@ -72,8 +72,8 @@ class SceneCheck:
             )
         if self.black_nadir_degrees is not None:
             found.append(
-                f"all panoramas without a mask are black within {self.black_nadir_degrees:g} degrees of straight "
-                "down: `panolog scene mask SCENE --nadir auto` masks that"
+                f"all panoramas without a mask are black within {self.black_nadir_degrees:g} degrees of "
+                "straight down: `panolog scene mask SCENE --nadir auto` masks that"
             )
         return found
 

@@ -137,13 +137,11 @@ def _change(data: dict[str, Any], path: list[Any], value: Any) -> dict[str, Any]
     ("path", "value", "words"),
     [
         (["version"], 3, "version"),
-        (["cameras", 0, "center", 1], "much", "cameras.0.center.1"),
         (["cameras", 0, "center", 1], float("nan"), "center"),
         (["extra"], 1, "extra"),
         (["grid"], [2, 0, 2], "at least 1"),
         (["aabb", "lower"], [1e9, 0, 0], "lower < upper"),
         (["blocks", 0, "cameras"], [], "'blocks'"),
-        (["blocks", 1, "gaussians"], 3.5, "integer"),
         (["cameras", 2, "block"], 3, "'cameras'"),
         (["cameras", 2, "assigned"], {}, "'blocks'"),
         (["cameras", 2, "assigned", 9], "gradient", "contradicts"),

@@ -95,12 +95,10 @@ class NewRun:
 
 def found(source: Path | str, config: RunConfig, options: Options) -> NewRun:
     """What is at `source`. Raises InputError if nothing of that can be run."""
-    if isinstance(source, str) and is_url(source):
-        if options.given:
-            raise ConfigError("a URL is that of a scene; leave out the options for panoramas and videos")
-        scene = read_scene(source)
-        return NewRun(with_width(scene.width, config), scene, None)
-    settings = settings_of(Path(source), options)
+    remote = isinstance(source, str) and is_url(source)
+    if remote and options.given:
+        raise ConfigError("a URL is that of a scene; leave out the options for panoramas and videos")
+    settings = None if remote else settings_of(Path(source), options)
     if settings is not None:
         return NewRun(with_width(settings.width, config), None, settings)
     scene = read_scene(source)
