@@ -15,7 +15,7 @@ from panolog.prepare.file_kinds import describe_left_out
 from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
-from panolog.scene.files import natural_key, some_of, stem_of
+from panolog.scene.files import file_of, natural_key, some_of, stem_of
 from panolog.scene.image_files import decode, decode_used, decode_with_alpha, read_info
 from panolog.scene.pictures.kinds import require_panorama
 from panolog.scene.read import check_names, image_folder, model_folder
@@ -125,7 +125,7 @@ def list_posed_panoramas(scene: Path) -> list[PanoramaFile]:
     names = [image.name for image in read_panoramas(where).images]
     check_names(where, names)
     folder = image_folder(root)
-    pictures = [PanoramaFile(root, name, folder / name) for name in names]
+    pictures = [PanoramaFile(root, name, file_of(folder, name)) for name in names]
     for picture in pictures:
         if not picture.path.is_file():
             raise SceneError(f"{picture.path}: the model names this image, but it is missing")

@@ -23,6 +23,7 @@ EQUIRECTANGULAR, PINHOLE, SIMPLE_PINHOLE, SPHERE = "EQUIRECTANGULAR", "PINHOLE",
 # COLMAP's id: (name, parameters). SphereSfM gave SPHERE the id of COLMAP's RAD_TAN_THIN_PRISM_FISHEYE.
 _MODELS = {0: (SIMPLE_PINHOLE, 3), 1: (PINHOLE, 4), 11: (SPHERE, 3), 17: (EQUIRECTANGULAR, 2)}
 _PARAMETERS = dict(_MODELS.values())
+_SPHERICAL = (EQUIRECTANGULAR, "SPHERICAL")  # what others write into text models, also without its size again
 NO_POINT = 2**64 - 1  # the id of an observation that belongs to no point
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
 _IMAGE = struct.Struct("<I7dI")  # id, quaternion and translation, camera
@@ -233,9 +234,11 @@ def _text_cameras(path: Path) -> Iterator[ColmapCamera]:
         words = line.split()
         if len(words) < 4:
             raise SceneError(f"{where}: cannot read the camera line `{line[:60]}`; export the model again")
+        number, width, height, *params = _numbers(where, [words[0], *words[2:]])
+        if words[1] in _SPHERICAL and params in ([], [width, height]):
+            words[1], params = EQUIRECTANGULAR, [width, height]
         if words[1] not in _PARAMETERS:
             raise _unknown_camera(f"{where}: `{line[:60]}`", words[1][:40])
-        number, width, height, *params = _numbers(where, [words[0], *words[2:]])
         if len(params) != _PARAMETERS[words[1]]:
             raise SceneError(f"{where}: {words[1]} has {_PARAMETERS[words[1]]} parameters, not {len(params)}")
         yield _camera(where, int(number), words[1], (int(width), int(height)), tuple(params))

@@ -7,6 +7,7 @@ import os
 import re
 import secrets
 import shutil
+import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import FileIO
@@ -23,6 +24,17 @@ def stem_of(name: str) -> str:
     """The name of an image file without its extension. A number after a dot, as in `a.1`, is none."""
     path = Path(name)
     return str(path if path.suffix[1:].isdecimal() else path.with_suffix(""))
+
+
+def spellings(name: str) -> tuple[str, ...]:
+    """A name as it is, and with its accents composed (NFC) and apart (NFD), as file systems have it."""
+    return tuple(dict.fromkeys([name, *(unicodedata.normalize(form, name) for form in ("NFC", "NFD"))]))
+
+
+def file_of(folder: Path, name: str) -> Path:
+    """The file of a name in a folder, also if its accents are spelled otherwise; else FOLDER/NAME."""
+    found = (folder / spelled for spelled in spellings(name))
+    return next((path for path in found if path.is_file()), folder / name)
 
 
 def some_of(names: Sequence[str], kind: str = "file") -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import ImageError, SceneError
-from panolog.scene.pictures.kinds import describe_picture
+from panolog.scene.pictures.kinds import describe_picture, kind_of
 from panolog.scene.pictures.profiles import jpeg_segments, to_srgb
 from panolog.scene.stores.outline import whole
 
@@ -35,6 +35,7 @@ _RECORD = re.compile(rb"tEXtPanoLOG\0([0-9a-f]{64}) ([0-9a-f]{64})")
 _RECORD_SEARCHED = 4096  # bytes; it is the second chunk, editors that keep it move it little
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by colour type
 _PNG_CHUNKS = 1_000  # before the pixels that are searched for transparency: programs write ten
+_BITS = 16  # of a channel of a panorama, at most
 _SHOWN = 2**28  # pixels of a picture that is looked at, to say what it is
 WHITE = 128  # of a mask, from which on a pixel is white
 _NO_ALPHA = b"BM"  # BMP: its fourth channel is undefined in practice
@@ -116,7 +117,13 @@ def _decoded(path: Path, data: bytes, flags: int) -> NDArray[Any]:
         _jpeg(path, BytesIO(data))  # OpenCV fills the missing part of a truncated one with grey
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _chunks_fit(data) else None
     if pixels is None:
-        raise ImageError(f"{path}: cannot be decoded; the image is damaged or of an unknown format")
+        kind = kind_of(data)
+        reason = (
+            f"it is {kind}, whatever its name says; save it as JPEG or PNG"
+            if kind
+            else ("the image is damaged or of an unknown format")
+        )
+        raise ImageError(f"{path}: cannot be decoded; {reason}")
     return pixels
 
 
@@ -275,6 +282,8 @@ def read_infos(paths: Sequence[Path]) -> list[ImageInfo]:
     for path, info in zip(paths, infos, strict=True):
         if info.width != 2 * info.height:
             raise not_a_panorama(path, info.width, info.height)
+        if info.bits > _BITS:
+            raise SceneError(f"{path}: {info.bits} bits a channel; save it with 8 or 16 bits")
         if info.width != width:
             raise SceneError(
                 f"{path}: {info.width} x {info.height} pixels, but {paths[0].name} has {width} x {height}; "

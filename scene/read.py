@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from panolog.scene.colmap import ColmapImage, ColmapModel, read_panoramas
 from panolog.scene.errors import SceneError
-from panolog.scene.files import StrPath, stem_of
+from panolog.scene.files import StrPath, file_of, stem_of
 from panolog.scene.image_files import check_layer, layer_record, read_infos, shows_ends
 from panolog.scene.model import NO_OFFSET, Panorama, Scene, Vector
 from panolog.scene.ply_table import read_table, read_vertices
@@ -212,7 +212,7 @@ def _panoramas(root: Path, folder: Path, images: Sequence[ColmapImage]) -> tuple
     return tuple(
         Panorama(
             name=image.name,
-            image=files / image.name,
+            image=file_of(files, image.name),
             rotation=image.rotation,
             translation=image.translation,
             observed=image.observed,
@@ -242,9 +242,10 @@ def find_layer(root: Path, layer: str, names: Sequence[str]) -> list[Path | None
     older = Counter(str(Path(name).with_suffix("")) for name in names)  # the name in versions before this
     found = []
     for name in names:
-        paths = [folder / f"{stem_of(name)}.png", folder / f"{name}.png"]
+        ways = [f"{stem_of(name)}.png", f"{name}.png"]
         if older[old := str(Path(name).with_suffix(""))] == 1:
-            paths.append(folder / f"{old}.png")
+            ways.append(f"{old}.png")
+        paths = (file_of(folder, way) for way in ways)
         found.append(next((path for path in paths if path.is_file()), None))
     if not any(found):
         expected = f"{stem_of(names[0])}.png"

@@ -16,7 +16,7 @@ from panolog.prepare.importers.json_xml import MEMORY, JsonNode
 from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
-from panolog.scene.files import stem_of
+from panolog.scene.files import file_of, stem_of
 from panolog.scene.write import UNSEEN, Origin, PosedImage
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
@@ -138,8 +138,8 @@ def find_panorama(where: str, folders: Sequence[Path], name: str) -> tuple[str, 
     try:
         for folder in folders:
             for candidate in _spellings(clean):
-                if (folder / candidate).is_file():
-                    return str(candidate), folder / candidate
+                if (found := file_of(folder, str(candidate))).is_file():
+                    return str(candidate), found
     except (ValueError, OSError) as error:  # a name that no file system can have
         raise SceneError(f"{where}: the image name {name[:80]!r} cannot be a file's") from error
     searched = " or ".join(str(folder) for folder in folders)

@@ -120,7 +120,7 @@ def _placed(path: Path, crop: Crop) -> NDArray[np.uint8]:
     right, bottom = min(right, 2 * height), min(bottom, height)
     size = right - left, bottom - top
     if (pixels.shape[1], pixels.shape[0]) != size:  # by a pixel, where the picture was scaled
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_LINEAR)
+        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_LINEAR), np.uint8)
         used = None if used is None else cv2.resize(used.view(np.uint8), size) > 0
     full = np.zeros((height, 2 * height, 4), np.uint8)
     full[top:bottom, left:right, :3] = pixels

@@ -14,13 +14,24 @@ STITCH = (
     f"stitch it in the camera's program, such as Insta360 Studio, RICOH THETA or GoPro Player, and {EXPORT}"
 )
 
+_MAGIC = {  # at the beginning of a file, or behind the length of its first box
+    b"ftyphei": "HEIC",
+    b"ftypmif1": "HEIC",
+    b"ftypavif": "AVIF",
+    b"JXL ": "JPEG XL",
+    b"\xff\x0a": "JPEG XL",
+    b"PK\3\4": "an archive",
+}
 _BAND = (0.72, 0.85)  # rows that are looked at, of the half height of a square, from its middle
 _CORNER = 0.85  # of its half width, from which on columns of these rows are outside of any circle
 _MIDDLE = 0.3  # and up to which they are within a circle of at least 0.9 of the square
 _DARK, _BRIGHT = 20, 40  # of 255: what is outside of a circle, but for stray light, and the mean within it
 _OUTSIDE = 95  # percent of what is outside of it that is dark
 _SIDE = 32  # pixels of the pictures of two eyes that are compared
-_ALIKE = 0.8  # correlation of two eyes, of which 0.87 is the least: front and back of a panorama have 0.35
+_COARSE = 9  # of these pixels: what is larger, such as light and dark sides, is left out
+_ALIKE = (
+    0.8  # correlation of two eyes. Of 85 photographs those have 0.94 or more, front and back at most 0.27
+)
 _PLAIN = 5.0  # standard deviation of a picture that shows too little to compare
 
 
@@ -47,6 +58,11 @@ def describe_picture(grey: NDArray[np.uint8]) -> str | None:
     return None
 
 
+def kind_of(data: bytes) -> str | None:
+    """The format of a file that is not read, by its first bytes; None if it is none of these."""
+    return next((kind for magic, kind in _MAGIC.items() if data[:16].find(magic) in (0, 4)), None)
+
+
 def require_panorama(path: Path, grey: NDArray[np.uint8]) -> None:
     """Raises SceneError if a picture (H, W), the file at `path`, is no panorama: see `describe_picture`."""
     if (what := describe_picture(grey)) is not None:
@@ -64,13 +80,14 @@ def _is_circle(square: NDArray[np.uint8]) -> bool:
 
 
 def _are_eyes(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
-    """Whether two pictures (H, W) show the same, apart from what a row has in common."""
+    """Whether two pictures (H, W) show the same details."""
     a, b = map(_differences, (one, other))
     spread = float(np.sqrt((a * a).mean() * (b * b).mean()))
     return spread > _PLAIN**2 and float((a * b).mean()) > _ALIKE * spread
 
 
 def _differences(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(32, 32) a picture (H, W), small, minus the mean of each row."""
+    """(32, 32) the details of a picture (H, W), without what a row has in common."""
     small: NDArray[Any] = cv2.resize(picture, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA).astype(np.float32)
-    return np.asarray(small - small.mean(axis=1, keepdims=True))
+    details = small - cv2.blur(small, (_COARSE, _COARSE))
+    return np.asarray(details - details.mean(axis=1, keepdims=True), np.float32)

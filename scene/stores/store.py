@@ -18,6 +18,7 @@ from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 from panolog.scene.errors import StoreError, StoreLostError
 from panolog.scene.files import write_bytes
@@ -326,8 +327,21 @@ def _own_disk(error: Exception) -> bool:
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
+def _address(error: BaseException | None) -> str | None:
+    """The server that a connection could not be made to, by the errors of botocore and aiohttp."""
+    while error is not None:
+        url = urlsplit(str(getattr(error, "kwargs", {}).get("endpoint_url", "")))
+        host, port = url.hostname or getattr(error, "host", None), url.port or getattr(error, "port", None)
+        if host:
+            return f"{host}:{port}" if port else str(host)
+        error = error.__cause__ or error.__context__
+    return None
+
+
 def _reason(error: BaseException) -> str:
     """An error in few words. Texts of the providers' libraries may quote requests, which are left out."""
+    if (address := _address(error)) is not None:
+        return f"{address} cannot be reached; check the address of the store (its endpoint) and the network"
     text = (str(error).strip().splitlines() or [""])[0]
     if text and "://" not in text and len(text) <= 120:
         return text

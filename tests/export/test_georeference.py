@@ -40,9 +40,9 @@ def test_projected_coordinates() -> None:
         replace(place, epsg=999_999).to_ecef()
 
 
-def placed(epsg: int, offset: tuple[float, float, float], **fields: float) -> Georeference:
+def placed(epsg: int, offset: tuple[float, float, float], geoid: float | None = None) -> Georeference:
     pytest.importorskip("pyproj", reason="pyproj is not installed")
-    return Georeference(up=(0, 0, 1), offset=offset, epsg=epsg, **fields)
+    return Georeference(up=(0, 0, 1), offset=offset, epsg=epsg, geoid=geoid)
 
 
 def test_feet() -> None:
@@ -86,7 +86,7 @@ def test_heights_above_the_sea() -> None:
         placed(5555, zurich).to_ecef()
     heights = {}
     for geoid in (None, 47.0):
-        place = placed(25832, zurich, **({} if geoid is None else {"geoid": geoid}))
+        place = placed(25832, zurich, geoid)
         ecef = place.to_ecef()
         assert ecef is not None
         assert place.heights_known == (geoid is not None)

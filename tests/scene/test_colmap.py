@@ -178,6 +178,21 @@ def test_colours_from_0_to_1_are_as_bright_as_bytes(folder: Path) -> None:
     assert colors == {n: expected.colors[3 * i : 3 * i + 3] for i, n in enumerate(expected.ids)}
 
 
+@pytest.mark.parametrize(
+    "line", ["SPHERICAL {w} {h} {w} {h}", "SPHERICAL {w} {h}", "EQUIRECTANGULAR {w} {h}"]
+)
+def test_cameras_of_panoramas_as_others_write_them(folder: Path, line: str) -> None:
+    expected = read_panoramas(folder)
+    camera = expected.images[0].camera
+    as_text(folder)
+    (folder / "cameras.txt").write_text(f"{camera.id} {line.format(w=camera.width, h=camera.height)}\n")
+    found = read_panoramas(folder)
+    assert [image.camera for image in found.images] == [image.camera for image in expected.images]
+    (folder / "cameras.txt").write_text(f"{camera.id} SPHERICAL {camera.width} {camera.height} 7\n")
+    with pytest.raises(InputError, match="camera model SPHERICAL is not supported"):
+        read_panoramas(folder)
+
+
 def test_a_byte_order_mark_is_no_part_of_a_model(folder: Path) -> None:
     expected = [image.name for image in read_image_records(folder, observations=False)]
     as_text(folder)

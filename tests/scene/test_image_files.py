@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from panolog.scene.errors import ImageError, InputError
-from panolog.scene.image_files import ImageInfo, decode_panorama, read_info
+from panolog.scene.image_files import ImageInfo, check_images, decode_panorama, read_info
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
 
@@ -75,3 +75,26 @@ def test_a_jpeg_is_reduced_while_it_is_decoded(tmp_path: Path) -> None:
     wanted = cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_8)
     assert wanted is not None
     assert (found == wanted[..., ::-1]).all()
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int32])
+def test_32_bits_are_refused_by_name(kind: type, tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    cv2.imwrite(str(path), PIXELS.astype(kind))
+    with pytest.raises(InputError, match=r"a\.tif: 32 bits a channel; save it with 8 or 16 bits"):
+        check_images([path])
+
+
+@pytest.mark.parametrize(
+    ("data", "kind"),
+    [
+        (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", "HEIC"),
+        (b"\0\0\0\x1cftypavif\0\0\0\0", "AVIF"),
+        (b"\0\0\0\x0cJXL \r\n\x87\n", "JPEG XL"),
+        (b"PK\3\4\x14\0\0\0", "an archive"),
+    ],
+)
+def test_other_formats_are_named_whatever_the_file_is_called(data: bytes, kind: str, tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(data + bytes(200))
+    with pytest.raises(ImageError, match=rf"a\.jpg: cannot be decoded; it is {kind}, whatever its name says"):
+        check_images([tmp_path / "a.jpg"])

@@ -119,6 +119,35 @@ def test_a_sky_mask_of_ones_is_one_of_255(root: Path) -> None:
         load_view(scene.panoramas[2], 2, WIDTH)
 
 
+def _mask(kind: str, keep: NDArray[np.bool_]) -> NDArray[Any]:
+    """What a program saves for pixels to keep."""
+    white = np.where(keep, 255, 0).astype(np.uint8)
+    all_white = np.full((*keep.shape, 3), 255, np.uint8)
+    return {
+        "grey": white,
+        "colours": np.dstack([white] * 3),
+        "one": keep.astype(np.uint8),
+        "classes": np.where(keep, 11, 0).astype(np.uint8),
+        "alpha": np.dstack([all_white, white]),  # the mask is in the alpha channel alone
+        "both": np.dstack([np.dstack([white] * 3), np.full_like(white, 255)]),
+        "red": np.dstack([white * 0, white * 0, white]),
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", ["grey", "colours", "one", "classes", "alpha", "both", "red", "jpeg"])
+def test_a_mask_is_what_is_black_or_transparent(kind: str, root: Path) -> None:
+    """One whose mask is in the alpha channel masked nothing; the noise of a JPEG was used."""
+    keep = np.zeros((HEIGHT, WIDTH), bool)
+    keep[: HEIGHT // 2, 8:] = True
+    path = root / "masks" / "1.png"
+    draw(path, _mask("grey" if kind == "jpeg" else kind, keep))
+    if kind == "jpeg":
+        path.write_bytes(bytes(cv2.imencode(".jpg", _mask("grey", keep), [cv2.IMWRITE_JPEG_QUALITY, 60])[1]))
+    mask = load_view(read_scene(root).panoramas[1], 1, WIDTH).mask
+    assert mask is not None
+    assert np.array_equal(mask.numpy(), keep)
+
+
 def test_an_exif_orientation_does_not_turn_a_panorama(tmp_path: Path) -> None:
     scene = read_scene(write_scene(tmp_path / "scene", names=["a.jpg", "b.jpg", "c.jpg"]))
     data = scene.panoramas[0].image.read_bytes()

@@ -2,9 +2,10 @@ import errno
 import json
 import os
 import shutil
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -135,6 +136,25 @@ def test_a_layer_is_found_by_its_older_name(tmp_path: Path) -> None:
         "a.2.png",
         "b.png",
     ]
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_names_whose_accents_are_spelled_otherwise(form: Literal["NFC", "NFD"], tmp_path: Path) -> None:
+    """macOS takes accents apart, other systems and models do not."""
+    other: Literal["NFC", "NFD"] = "NFD" if form == "NFC" else "NFC"
+    names = [unicodedata.normalize(form, f"Büro/é_{i}.png") for i in range(3)]
+    root = write_scene(tmp_path, names=names)
+    (root / "masks").mkdir()
+    for folder in (root / "images", root / "masks"):
+        (folder / unicodedata.normalize(other, "Büro")).mkdir()
+    for name in names:
+        path = root / "images" / name
+        path.rename(root / "images" / unicodedata.normalize(other, name))
+        add(root, "masks", unicodedata.normalize(other, name), GREY)
+    scene = read_scene(root)
+    assert [panorama.name for panorama in scene.panoramas] == names
+    assert all(panorama.mask is not None for panorama in scene.panoramas)
+    assert [panorama.name for panorama in list_posed_panoramas(root)] == names
 
 
 def test_an_affine_is_not_that_of_a_map_which_panolog_made_later(root: Path) -> None:

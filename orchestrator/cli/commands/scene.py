@@ -5,6 +5,7 @@ from typing import Any
 
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.partition.bounds import baseline
+from panolog.prepare.check.layers import describe_layers
 from panolog.scene.model import Scene
 from panolog.scene.stores.outline import url_of
 
@@ -27,6 +28,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "sky_masks": sum(panorama.sky_mask is not None for panorama in panoramas),
         "depths": sum(panorama.depth is not None for panorama in panoramas),
         "depth_affines": sum(panorama.depth_affine is not None for panorama in panoramas),
+        "layers": describe_layers(scene),
         "points": len(scene.points),
         "observations": sum(len(panorama.observed) for panorama in panoramas),
         "baseline": baseline(centers),
@@ -41,6 +43,7 @@ def lines(info: dict[str, Any]) -> Iterator[str]:
     yield f"split: {len(info['train'])} to train on, {len(info['test'])} held out"
     yield f"sparse cloud: {info['points']:,} points, {info['observations']:,} observations"
     yield f"layers: {info['masks']} masks, {info['sky_masks']} sky masks, {info['depths']} depth maps"
+    yield from info["layers"]
     if info["transparent"]:
         yield f"{info['transparent']} panoramas with an alpha channel: what is transparent in them is ignored"
     yield f"median distance to the nearest camera: {info['baseline']:.4g} world units"

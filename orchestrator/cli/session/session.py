@@ -55,6 +55,7 @@ from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import report_or_notice
 from panolog.orchestrator.watch.views.plan_picture import write_plan_picture
 from panolog.partition.plan import Plan
+from panolog.prepare.check.layers import describe_layers
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import ClusterError, RunFolderError, RunLockedError
 from panolog.scene.files import remove_partial
@@ -267,7 +268,8 @@ class _Beginning:
         done = PreflightSaved(folder.relative(folder.preflight), seconds, settings)
         if budget := self.journal.state.money.budget:
             require_enough(seconds, budget, workers.nodes())
-        self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), done])
+        layers = [Noticed(None, line) for line in describe_layers(self.scene)]
+        self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), *layers, done])
         return found.config
 
     def _measure(self, config: RunConfig) -> None:

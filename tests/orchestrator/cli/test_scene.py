@@ -143,3 +143,29 @@ def test_a_black_nadir_is_found_and_masked(scene: Path) -> None:
     assert result.exit_code == 0
     assert "degrees of straight down is ignored" in result.stdout
     assert "--nadir auto" not in call("check", scene).stdout
+
+
+def test_what_masks_ignore_and_files_that_match_nothing_are_shown(scene: Path) -> None:
+    """Inverted masks, masks of nothing and masks of other names trained without a word."""
+    folder = scene / "masks"
+    folder.mkdir()
+    assert "masks:" not in call("info", scene).stdout.replace("layers: 0 masks", "")
+    mask = np.zeros((32, 64), np.uint8)
+    mask[24:] = 255
+    for name in NAMES[:2]:
+        cv2.imwrite(str(folder / name), mask)
+    for name in NAMES[2:]:
+        cv2.imwrite(str(folder / f"other_{name}"), mask)
+    shown = json.loads(call("info", scene, "--json").stdout)["layers"]
+    assert shown[0].startswith(
+        "masks: 2 of 4 panoramas have one, and 85.4% of the sphere is ignored (85.4% to"
+    )
+    assert shown[0].endswith(
+        "that is most of it: black or transparent is what is ignored, invert them if it is to be used"
+    )
+    lost = ", ".join(f"other_{name}" for name in NAMES[2:])
+    assert shown[1] == f"masks: 2 files ({lost}): not used, as no panorama of the model is called so"
+    assert shown[0] in call("info", scene).stdout
+    for name in NAMES[:2]:
+        cv2.imwrite(str(folder / name), np.full((32, 64), 255, np.uint8))
+    assert "nothing is: black or transparent is what is ignored" in call("info", scene).stdout

@@ -73,3 +73,11 @@ def test_a_panorama_without_its_nadir_or_of_the_night_is_one() -> None:
     night = np.zeros((2 * SIDE, 4 * SIDE), np.uint8)
     night[SIDE - 30 : SIDE + 30] = np.random.default_rng(0).integers(0, 255, (60, 4 * SIDE))
     assert describe_picture(night) is None
+
+
+def test_light_that_rises_and_falls_twice_is_no_pair_of_eyes() -> None:
+    """Front and back are equal but for details."""
+    light = 120 + 90 * np.sin(np.arange(4 * SIDE) * 2 * np.pi / SIDE / 2)
+    plain = np.repeat(light[None], 2 * SIDE, axis=0)
+    noise = np.random.default_rng(0).normal(0, 4, plain.shape)
+    assert describe_picture((plain + noise).clip(0, 255).astype(np.uint8)) is None

@@ -66,7 +66,7 @@ def in_adobe(color: tuple[int, int, int], most: int) -> list[int]:
 def test_eight_bits_in_every_format(kind: str, tmp_path: Path) -> None:
     stored = Image.new("RGB", (64, 32), tuple(in_adobe(SHOWN, 255)))
     path = tmp_path / f"a.{kind}"
-    stored.save(path, icc_profile=profile(), **({"quality": 100} if kind in ("jpg", "webp") else {}))
+    stored.save(path, icc_profile=profile(), quality=100)
     stored.save(plain := tmp_path / f"plain.{kind}")
     assert embedded_profile(plain.read_bytes()) is None
     assert embedded_profile(path.read_bytes()) == profile()

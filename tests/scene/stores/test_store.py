@@ -1,6 +1,7 @@
 """A store with the faults that S3 has; URLs; the cache. tests/orchestrator/runs/storage has all providers."""
 
 import os
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -56,6 +57,21 @@ def test_a_store_that_stays_down_is_an_error_of_the_run(server: ObjectStore) -> 
     server.down = True
     with pytest.raises(StoreLostError, match="the store fails"):
         store.read("a")
+
+
+def test_a_server_that_cannot_be_reached_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An endpoint with a wrong port took minutes, and the message had no address."""
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))  # nothing listens there
+        port = closed.getsockname()[1]
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{port}")
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            monkeypatch.setenv(name, "x")
+        S3FileSystem.clear_instance_cache()  # those of before lead to the server
+        with pytest.raises(
+            StoreLostError, match=rf"127\.0\.0\.1:{port} cannot be reached; check the address of"
+        ):
+            open_store("s3://bucket/scene", patience=0.5).list()
 
 
 @pytest.mark.parametrize(
