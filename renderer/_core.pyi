@@ -27,7 +27,7 @@ def rasterize_backward(
     grad_inverse_depth: Floats, out_means: Floats, out_quats: Floats, out_scales: Floats,
     out_opacities: Floats, out_sh0: Floats, out_shN: Floats, out_screen: Floats,
     exterior: tuple[Floats, Floats, Ints, Floats, Floats, Floats] | None,
-    out_motion: Doubles | None = None,
+    out_motion: Doubles | None = None, out_absolute: Floats | None = None,
 ) -> None: ...
 def bake(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, sh0: Floats, shN: Floats, screen: Floats,

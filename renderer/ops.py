@@ -97,7 +97,7 @@ def rasterize(
     state = torch.empty(len(means), dtype=torch.uint8)
     splats, rays, slots, entries, tiles = _core.rasterize(
         **_arrays(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN),
-        **_arrays(screen=screen, rotation=rotation, translation=translation),
+        **_arrays(screen=screen[:, :2], rotation=rotation, translation=translation),
         width=width,
         height=height,
         sh_degree=sh_degree,
@@ -139,11 +139,14 @@ def rasterize_backward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """The gradients of means, quats, scales, opacities, sh0, shN and screen, from those of the three images.
 
+    That of a screen (N, 4) ends with the absolute gradients (`renderer.render.render`).
+
     Args: those of `rasterize`, its images, and `frame`, the last five tensors that it returned; moving,
     whether the last result holds the sums of the camera's motion, (27,) float64, or is empty.
     """
     parameters = _arrays(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
-    parameters |= _arrays(screen=screen)
+    parameters |= _arrays(screen=screen[:, :2])
+    absolute = torch.empty(len(screen), screen.shape[1] - 2)
     out = {f"out_{name}": torch.empty(array.shape) for name, array in parameters.items()}
     motion = torch.empty(MOTION_SUMS if moving else 0, dtype=torch.float64)
     splats, rays, slots, entries, tiles = frame
@@ -162,9 +165,10 @@ def rasterize_backward(
         **_arrays(**out),
         exterior=_exterior(exterior),
         out_motion=motion.numpy() if moving else None,
+        out_absolute=absolute.numpy() if absolute.shape[1] else None,
     )
     means, quats, scales, opacities, sh0, shN, screen = out.values()
-    return means, quats, scales, opacities, sh0, shN, screen, motion
+    return means, quats, scales, opacities, sh0, shN, torch.cat([screen, absolute], 1), motion
 
 
 _TENSORS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen", "rotation", "translation")

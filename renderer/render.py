@@ -11,6 +11,7 @@ from torch import Tensor
 from panolog.renderer import ops
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
+from panolog.renderer.cuda.parts import SPLAT_FLOATS
 from panolog.renderer.motion import MOTION_SUMS
 from panolog.scene.gaussians import Gaussians
 
@@ -28,6 +29,7 @@ class Render(NamedTuple):
         Tensor  # (N,) bool: its footprint overlaps the image, hidden by others or not (radii > 0 of 3DGS)
     )
     invalid: Tensor  # (N,) bool: not drawn: not finite, out of the range of float32, or without rotation
+    splats: Tensor  # (N, 16) Splat of csrc/formulas.h, where visible
 
 
 def render(
@@ -52,7 +54,9 @@ def render(
         sh_degree: 0 to 3, how many degrees of spherical harmonics take part.
         near: radial distance in world units below which a Gaussian is not drawn.
         screen: (N, 2) zeros that require grad; receives ∂L/∂(u, v) per pixel, which densification needs. With
-            `gaussians.exact` it only receives: values other than 0 do not move them.
+            `gaussians.exact` it only receives: values other than 0 do not move them. Two more columns (N, 4)
+            receive the sums of |∂L/∂(u, v)| over single pixels, absolute gradients (Ye et al. 2024); of affine
+            splats alone.
         exterior: what else the camera sees, baked for it; the image is then empty outside of its tiles.
         motion: (27,) float64 zeros that require grad; receives how the loss changes as the camera moves,
             `motion.Motion.of`.
@@ -66,14 +70,15 @@ def render(
     if screen is None:
         screen = gaussians.means.new_zeros((count, 2))
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
+    columns = 4 if screen.shape[1:] == (4,) and not gaussians.exact else 2
     for name, tensor in {**gaussians.tensors(), "screen": screen}.items():
-        expected = (count, *shapes.get(name, (2,)))
+        expected = (count, *shapes.get(name, (columns,)))
         if tensor.shape != expected or tensor.dtype != torch.float32:
             raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, must be float32 {expected}")
     if motion is not None and (motion.shape != (MOTION_SUMS,) or motion.dtype != torch.float64):
         raise ValueError(f"motion is {motion.dtype} {tuple(motion.shape)}, must be float64 ({MOTION_SUMS},)")
     _check_camera(camera)
-    color, alpha, inverse_depth, state, *_ = ops.rasterize(
+    color, alpha, inverse_depth, state, splats, *_ = ops.rasterize(
         **gaussians.tensors(),
         screen=screen,
         rotation=camera.rotation,
@@ -86,7 +91,8 @@ def render(
         exterior=[] if exterior is None else exterior.arrays(),
         motion=motion,
     )
-    return Render(color, alpha, inverse_depth, visible=state == ops.VISIBLE, invalid=state == ops.INVALID)
+    visible, invalid = state == ops.VISIBLE, state == ops.INVALID
+    return Render(color, alpha, inverse_depth, visible, invalid, splats.view(-1, SPLAT_FLOATS)[:count])
 
 
 def _check_camera(camera: Camera) -> None:

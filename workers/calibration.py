@@ -182,7 +182,13 @@ def _target(spec: CalibrateSpec, trainer: Trainer, share: float, seconds: float)
 def _grow(trainer: Trainer, target: int) -> None:
     """Splits scene Gaussians, chosen at random, until there are `target`."""
     spec = trainer.spec
-    config = spec.config.densify.model_copy(update={"percent_dense": _SPLIT_ALL, "max_gaussians": 0})
+    everything = {
+        "percent_dense": _SPLIT_ALL,
+        "max_gaussians": 0,
+        "split_gradient": 0.0,
+        "least_opacity": 0.0,
+    }
+    config = spec.config.densify.model_copy(update=everything)
     random = generator(spec.seed, str(spec.task), "grow", 0)
     trainer.reset_statistics()
     while (count := len(trainer.statistics.views)) and count < target:

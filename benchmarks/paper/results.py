@@ -31,6 +31,8 @@ class Result:
     seed: int
     iterations: int = 0  # of Stage I, and of each block
     blocks: int = 0  # trained
+    densified: tuple[int, ...] = ()  # how often Gaussians have, in Stage I and in each block
+    resets: tuple[int, ...] = ()  # of opacities, likewise
     metrics: dict[str, float | None] = field(default_factory=dict)  # those of METRICS
     gaussians: int = 0  # sky included
     bytes: int = 0  # of the PLY
@@ -87,7 +89,8 @@ def save(path: Path, result: Result) -> None:
 def from_json(stored: dict[str, Any]) -> Result:
     """The inverse of `dataclasses.asdict`."""
     curve = tuple(Point(**point) for point in stored["curve"])
-    return Result(**{**stored, "curve": curve, "notes": tuple(stored["notes"])})
+    lists = {key: tuple(stored[key]) for key in ("notes", "densified", "resets") if key in stored}
+    return Result(**{**stored, **lists, "curve": curve})
 
 
 def load(path: Path) -> Result | None:

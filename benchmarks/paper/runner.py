@@ -45,6 +45,7 @@ from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import ConfigError, InputError, RunError
 from panolog.scene.ply import read_ply
 from panolog.workers.tasks import Stage, TaskId
+from panolog.workers.training.schedule import Schedule
 
 _OFF = 0.05  # of the seconds that a run was given, from which on its row says what it took
 
@@ -233,6 +234,7 @@ class Bench:
             variant.name,
             self.seed,
             iterations=length,
+            **turns(variant.resolved(self.settings, self.seed, length)),
             blocks=sum(block.train for block in replay(records).plan or ()),
             metrics={name: evaluation["mean"].get(name) for name in results.METRICS},
             gaussians=evaluation["gaussians"],
@@ -337,6 +339,15 @@ def other_settings(stored: dict[str, Any], config: dict[str, Any]) -> str:
     then = flat(RunConfig(recipe="paper")) | stored
     changes = [f"{key} = {then.get(key)}, not {value}" for key, value in differing(then, config).items()]
     return ", ".join(changes)
+
+
+def turns(config: RunConfig) -> dict[str, tuple[int, ...]]:
+    """How often a run densifies and resets opacities: in Stage I and, if it refines, in each block."""
+    stages = [Schedule(config, config.iterations, 1.0, refine) for refine in range(1 + config.refine)]
+    return {
+        "densified": tuple(sum(map(stage.densifies, stage.turns())) for stage in stages),
+        "resets": tuple(sum(map(stage.resets, stage.turns())) for stage in stages),
+    }
 
 
 def equal_plans(a: Plan, b: Plan) -> bool:

@@ -15,7 +15,8 @@ from panolog.partition.plan import Plan
 
 TAUS = (1.0, 0.9, 0.8, 0.7, 0.5, 0.3, 0.1, 0.02)
 _FIELDS = (
-    *("scene", "variant", "seed", "iterations", "blocks", *METRICS, "gaussians", "bytes", "haze"),
+    *("scene", "variant", "seed", "iterations", "densified", "resets", "blocks"),
+    *(*METRICS, "gaussians", "bytes", "haze"),
     *(
         "total",
         "on_workers",
@@ -78,7 +79,7 @@ def _of_group(results: Results, group: Group, scene: Path, *, first: bool) -> Ta
     none = (None,) * 3
     for published in found:
         rows += [
-            (f"{row.method} [1]", None, row.psnr, row.ssim, None, row.lpips, *none, row.size, *(None,) * 5)
+            (f"{row.method} [1]", None, row.psnr, row.ssim, None, row.lpips, *none, row.size, *(None,) * 7)
             for row in published.rows
         ]
         notes.append(
@@ -99,7 +100,7 @@ def _without_empty(table: Table) -> Table:
 _METRICS = ("PSNR", "SSIM", "LPIPS", "LPIPS of 3DGS", "WS-PSNR", "WS-SSIM")  # as METRICS
 HEAD = (
     *("variant", "gain dB", *_METRICS, "Gaussians", "MB"),
-    *("minutes", "on workers", "peak GB", "iterations", "notes"),
+    *("minutes", "on workers", "peak GB", "iterations", "densified", "resets", "notes"),
 )
 
 
@@ -108,7 +109,7 @@ def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ..
     found = results.of(scene, name)
     if not found:
         why = results.failure(scene, name)
-        return (name, *(None,) * 13, f"failed: {why}") if why else None
+        return (name, *(None,) * 15, f"failed: {why}") if why else None
     first = found[0]
     steps = f"{first.iterations:,}" + (f" + {first.blocks} × {first.iterations:,}" if first.blocks else "")
     other = results.first(scene, base)
@@ -125,8 +126,15 @@ def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ..
         spread(r.on_workers / 60 for r in found),
         first.memory and first.memory / 1e9,
         steps,
+        _times(first.densified, first.blocks),
+        _times(first.resets, first.blocks),
         "; ".join([variants()[name].what, *([same] if same else []), *first.notes, *_code(first, results)]),
     )
+
+
+def _times(counts: Sequence[int], blocks: int) -> str | None:
+    """How often, in Stage I and in the blocks; None where that was not recorded."""
+    return " + ".join([str(n) if k == 0 else f"{blocks} × {n}" for k, n in enumerate(counts)]) or None
 
 
 def _code(result: Result, results: Results) -> list[str]:
@@ -179,5 +187,5 @@ def csv_rows(results: Iterable[Result]) -> list[list[object]]:
     rows: list[list[object]] = [list(_FIELDS)]
     for result in results:
         cells = [get(result, name) for name in _FIELDS]
-        rows.append(["; ".join(cell) if isinstance(cell, tuple) else cell for cell in cells])
+        rows.append(["; ".join(map(str, cell)) if isinstance(cell, tuple) else cell for cell in cells])
     return rows

@@ -134,8 +134,12 @@ def groups() -> tuple[Group, ...]:
     """The tables, the most important first: in this order they run and are shown."""
     switches = [variant.name for variant in _switches()]
     return (
-        Group("main", "Recipe against recipe", ("paper", "panolog", "panolog-time")),
-        Group("stage1", "Stage I alone, over its iterations", ("paper-stage1", "panolog-stage1")),
+        Group("main", "Recipe against recipe", ("paper", "authors", "panolog", "panolog-time")),
+        Group(
+            "stage1",
+            "Stage I alone, over its iterations",
+            ("paper-stage1", "authors-stage1", "panolog-stage1"),
+        ),
         Group(
             "length",
             "Blocks against Stage I alone",
@@ -200,6 +204,7 @@ def _recipes() -> list[Variant]:
 
     return [
         Variant("paper", "the recipe of the paper", {"recipe": "paper"}, curve=True, spread=True),
+        Variant("authors", "what the authors' release does", {"recipe": "authors"}, curve=True, spread=True),
         Variant("panolog", "the recipe of PanoLOG", {"recipe": "panolog"}, curve=True, spread=True),
         Variant(
             "panolog-time",

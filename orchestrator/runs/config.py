@@ -114,8 +114,8 @@ class RunConfig(TrainConfig):
 
     recipe: Recipe = Field(
         default="panolog",
-        description="preset of the settings that are not given: paper = as the paper has them, panolog ="
-        " those that measured best (docs/quality.md)",
+        description="preset of the settings that are not given: paper = as the paper has them, authors = as"
+        " the authors' code has them, panolog = those that measured best (docs/quality.md)",
     )
     iterations: int = Field(
         default=30_000, ge=1, description="iterations of Stage I and of every block; app. A"

@@ -174,14 +174,15 @@ NB_MODULE(_core, m) {
          In<float> grad_alpha, In<float> grad_inverse_depth, InOut<float> out_means, InOut<float> out_quats,
          InOut<float> out_scales, InOut<float> out_opacities, InOut<float> out_sh0, InOut<float> out_shN,
          InOut<float> out_screen, const std::optional<ExteriorArrays>& exterior,
-         std::optional<InOut<double>> out_motion) {
+         std::optional<InOut<double>> out_motion, std::optional<InOut<float>> out_absolute) {
         const Model model{means, quats, scales, opacities, sh0, shN, screen};
         const panolog::Camera camera = camera_of(rotation, translation, width, height, near, exact);
         const size_t pixels = size_t(width) * height;
         expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
                    grad_color.size() == 3 * pixels && grad_alpha.size() == pixels &&
                    grad_inverse_depth.size() == pixels && slots.size() == opacities.size() + 1 &&
-                   (!out_motion || out_motion->size() == panolog::kMotionSums),
+                   (!out_motion || out_motion->size() == panolog::kMotionSums) &&
+                   (!out_absolute || (out_absolute->size() == 2 * opacities.size() && !exact)),
                "the images or the frame are not those of the forward pass");
         const std::optional<panolog::Exterior> frozen = view_of(exterior, camera);
         nb::gil_scoped_release release;
@@ -205,15 +206,16 @@ NB_MODULE(_core, m) {
              .sh0 = out_sh0.data(),
              .shN = out_shN.data(),
              .screen = out_screen.data(),
+             .absolute = out_absolute ? out_absolute->data() : nullptr,
              .motion = out_motion ? out_motion->data() : nullptr});
       },
       "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "rotation"_a, "translation"_a,
       "width"_a, "height"_a, "sh_degree"_a, "near"_a, "exact"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a,
       "splats"_a, "rays"_a, "slots"_a, "entries"_a, "tiles"_a, "grad_color"_a, "grad_alpha"_a, "grad_inverse_depth"_a,
       "out_means"_a, "out_quats"_a, "out_scales"_a, "out_opacities"_a, "out_sh0"_a, "out_shN"_a, "out_screen"_a,
-      "exterior"_a.none(), "out_motion"_a = nb::none(),
-      "Writes the gradients of the parameters and, with out_motion, the sums of camera motion (csrc/gradients.h), from "
-      "those of the three images.");
+      "exterior"_a.none(), "out_motion"_a = nb::none(), "out_absolute"_a = nb::none(),
+      "Writes the gradients of the parameters and, with out_motion, the sums of camera motion and, with out_absolute, "
+      "absolute gradients of affine splats (csrc/gradients.h), from those of the three images.");
 
   m.def(
       "bake",

@@ -86,6 +86,15 @@ struct SplatGradientOf {
 using SplatGradient = SplatGradientOf<float>;
 constexpr int kGradientFloats = 10;
 
+// The same and what absolute gradients (Ye et al. 2024) need: sums over pixels of |e·dL/dpower|, and of
+// |(c·dy - slope·a·e)·dL/dpower|.
+template <class T>
+struct AbsoluteGradientOf : SplatGradientOf<T> {
+  T across, down;
+};
+using AbsoluteGradient = AbsoluteGradientOf<float>;
+constexpr int kAbsoluteGradientFloats = 12;
+
 template <class A, class B>
 PANOLOG_HD B dot3(const A* a, const B* b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];

@@ -4,11 +4,12 @@
 
 namespace panolog {
 
-// The gradients of one Gaussian. shN has 15 × 3 floats; only sh_count - 1 rows are written. `motion`, null or 6 values:
-// its part in the gradient of the camera's pose.
+// The gradients of one Gaussian. shN has 15 × 3 floats; only sh_count - 1 rows are written. `absolute`: sums over pixels
+// of the absolute values of the parts that each has in `screen`. `motion`, null or 6 values: its part in the gradient of
+// the camera's pose.
 template <class T>
 struct ParameterGradients {
-  T *mean, *quat, *scale, *opacity, *sh0, *shN, *screen, *motion;
+  T *mean, *quat, *scale, *opacity, *sh0, *shN, *screen, *absolute, *motion;
 };
 
 // Where an affine splat's shape depends on its place as on the tangent of the elevation, a Gaussian near a pole
@@ -140,6 +141,14 @@ PANOLOG_HD void project_backward(const Parameters<T>& p, const Camera& cam, int 
   motion_of(g, cam, point, out.mean, dM, out.motion);
   const MaskOf<T> counts = g.plane >= kMotionPole * kMotionPole * g.square;
   for (int k = 0; k < kMotion; ++k) out.motion[k] = select(counts, out.motion[k], 0);
+}
+
+template <class T>
+PANOLOG_HD void project_backward(const Parameters<T>& p, const Camera& cam, int sh_count, const SplatOf<T>& s,
+                                 const AbsoluteGradientOf<T>& in, const ParameterGradients<T>& out) {
+  const SplatGradientOf<T>& sums = in;
+  project_backward(p, cam, sh_count, s, sums, out);
+  out.absolute[0] = s.a * (-2 / kLog2E) * in.across, out.absolute[1] = 2 / kLog2E * in.down;
 }
 
 }  // namespace panolog

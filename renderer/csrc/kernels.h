@@ -17,7 +17,8 @@ struct GaussianArrays {  // N Gaussians, row-major
 
 struct GradientArrays {  // the same shapes
   float *means, *quats, *scales, *opacities, *sh0, *shN, *screen;
-  double* motion;  // null, or kMotionSums: to which is added
+  float* absolute;  // null, or as `screen`: of ParameterGradients
+  double* motion;   // null, or kMotionSums: to which is added
 };
 
 constexpr int kTileRoom = 4;
@@ -84,6 +85,9 @@ struct Kernels {
   // Gaussians [begin, end): their gradients, sums of what the tiles wrote to their slots; 0 without slots
   void (*project_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, const Splat*,
                            const uint32_t* slots, const SplatGradient* parts, const GradientArrays&);
+  void (*project_absolute_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end,
+                                    const Splat*, const uint32_t* slots, const AbsoluteGradient* parts,
+                                    const GradientArrays&);
   // The same with exact projection
   void (*project_rays)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, Splat*,
                        RaySplat*, uint8_t* state);
@@ -95,6 +99,7 @@ struct Kernels {
   uint32_t (*tiles_of)(const Splat*, const uint8_t* state, int count, const Camera&, uint32_t* tiles, uint32_t* many);
   void (*tile_forward)(const TileInput&, const Images&);
   void (*tile_backward)(const TileInput&, const Images&, const ImageGradients&, SplatGradient* slots);
+  void (*tile_absolute_backward)(const TileInput&, const Images&, const ImageGradients&, AbsoluteGradient* slots);
   // The same with the tiles that the footprints may meet; the grid of tiles.
   uint32_t (*ray_tiles_of)(const Splat*, const RaySplat*, const uint8_t* state, int count, const Camera&, const Grid&,
                            uint32_t* tiles, uint32_t* many);

@@ -377,6 +377,8 @@ void rasterize_backward(const GaussianArrays& gaussians, const Camera& camera, i
   const Kernels& k = kernels();
   if (camera.exact)
     pass(k.ray_tile_backward, k.project_rays_backward, static_cast<RayGradient*>(nullptr));
+  else if (gradients.absolute)
+    pass(k.tile_absolute_backward, k.project_absolute_backward, static_cast<AbsoluteGradient*>(nullptr));
   else
     pass(k.tile_backward, k.project_backward, static_cast<SplatGradient*>(nullptr));
   if (gradients.motion) {

@@ -13,6 +13,7 @@ namespace panolog::PANOLOG_ISA {
 
 void tile_forward(const TileInput&, const Images&);
 void tile_backward(const TileInput&, const Images&, const ImageGradients&, SplatGradient*);
+void tile_absolute_backward(const TileInput&, const Images&, const ImageGradients&, AbsoluteGradient*);
 void ray_tile_forward(const TileInput&, const Images&);
 void ray_tile_backward(const TileInput&, const Images&, const ImageGradients&, RayGradient*);
 
@@ -21,7 +22,7 @@ namespace {
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
 
 struct Sixteen {  // Gaussians, or the gradients of as many
-  F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2], motion[kMotion];
+  F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2], absolute[2], motion[kMotion];
 };
 
 constexpr int64_t kNext = 4 * kLanes;  // rows: those that are fetched while others are computed with
@@ -65,6 +66,7 @@ void write(const Sixteen& from, const Rows& rows, bool streaming, const Gradient
   put(from.mean, 3, out.means), put(from.quat, 4, out.quats), put(from.scale, 3, out.scales);
   put(&from.opacity, 1, out.opacities), put(from.sh0, 3, out.sh0), put(from.shN, 45, out.shN);
   put(from.screen, 2, out.screen);
+  if (out.absolute) put(from.absolute, 2, out.absolute);
 }
 
 void keep_all(Mask drawn, Sixteen& values) {
@@ -74,6 +76,7 @@ void keep_all(Mask drawn, Sixteen& values) {
   for (F& x : values.sh0) x = keep(drawn, x);
   for (F& x : values.shN) x = keep(drawn, x);
   for (F& x : values.screen) x = keep(drawn, x);
+  for (F& x : values.absolute) x = keep(drawn, x);
   values.opacity = keep(drawn, values.opacity);
 }
 
@@ -163,8 +166,9 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
   SplatOf<F> s;
   SumsOf<F> sums;
   MotionSums motion;
-  const ParameterGradients<F> gradients = {to.mean, to.quat, to.scale,  &to.opacity,
-                                           to.sh0,  to.shN,  to.screen, out.motion ? to.motion : nullptr};
+  const ParameterGradients<F> gradients = {
+      to.mean, to.quat, to.scale,  &to.opacity, to.sh0,
+      to.shN,  to.screen, to.absolute, out.motion ? to.motion : nullptr};
   for (int64_t at = begin; at < end; at += kLanes) {
     const Rows rows = rows_from(at, end);
     alignas(64) float met[kLanes];
@@ -327,11 +331,13 @@ void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict
 extern const Kernels kKernels = {PANOLOG_TEXT(PANOLOG_ISA),
                                  project_span,
                                  project_backward_span<SplatGradientOf>,
+                                 project_backward_span<AbsoluteGradientOf>,
                                  project_rays_span,
                                  project_backward_span<RayGradientOf>,
                                  tiles_of,
                                  tile_forward,
                                  tile_backward,
+                                 tile_absolute_backward,
                                  ray_tiles_of,
                                  ray_tile_forward,
                                  ray_tile_backward,

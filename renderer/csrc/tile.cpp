@@ -21,12 +21,17 @@ inline Pair evaluate(const Splat& s, F x, F y, F t, float width) {
   return {e, dy, cover(power, power >= kLog2AlphaMin, t)};
 }
 
-// Adds to the ten sums of SplatGradient, in its order.
-inline void add_sums(const Pair& pair, F power, F weight, const PixelGradients& in, F sum[]) {
+// Adds to the sums of SplatGradient or AbsoluteGradient, in its order.
+template <class Gradient>
+inline void add_sums(const Splat& s, const Pair& pair, F power, F weight, const PixelGradients& in, F sum[]) {
   const F pe = power * pair.e, py = power * pair.dy;
   sum[0] = sum[0] + power, sum[1] = sum[1] + pe, sum[2] = sum[2] + py;
   sum[3] = fma(pe, pair.e, sum[3]), sum[4] = fma(pe, pair.dy, sum[4]), sum[5] = fma(py, pair.dy, sum[5]);
   add_light_sums(weight, in, sum + 6);
+  if constexpr (sizeof(Gradient) == sizeof(AbsoluteGradient)) {
+    sum[10] = sum[10] + magnitude(pe);
+    sum[11] = sum[11] + magnitude(fnma(set(s.slope * s.a), pe, set(s.c) * py));
+  }
 }
 
 constexpr float kSlack = 1e-2f;  // pixels: blocks this close to a footprint are still tested pixel by pixel
@@ -137,10 +142,11 @@ void tile_forward(const TileInput& in, const Images& out) {
 
 namespace {
 
-using Back = BackBatch<Splat, SplatGradient, 160>;
+template <class Gradient>
+using Back = BackBatch<Splat, Gradient, 160>;
 
-template <bool kWrap>
-void block_backward(const TileInput& in, Back& batch, const uint8_t* list, int length, int block,
+template <bool kWrap, class Gradient>
+void block_backward(const TileInput& in, Back<Gradient>& batch, const uint8_t* list, int length, int block,
                     TileGradients& pixels) {
   const int at = block * kLanes;
   const F x = block_x(in, block), y = block_y(in, block);
@@ -155,13 +161,14 @@ void block_backward(const TileInput& in, Back& batch, const uint8_t* list, int l
       continue;
     }
     const F power = power_gradient(s, pair.cover, gradients, behind, weight);
-    add_sums(pair, power, weight, gradients, batch.sums[list[i]]);
+    add_sums<Gradient>(s, pair, power, weight, gradients, batch.sums[list[i]]);
   }
   pixels.advance(behind, at);
 }
 
 // Moves splats to their images that are nearest to the tile; returns whether one reaches around the cylinder.
-bool unwrap(const TileInput& in, Back& batch) {
+template <class Gradient>
+bool unwrap(const TileInput& in, Back<Gradient>& batch) {
   bool found = false;
   for (int i = 0; i < batch.count; ++i) {
     float& u = batch.splats[i].u;
@@ -175,13 +182,11 @@ bool unwrap(const TileInput& in, Back& batch) {
   return found;
 }
 
-}  // namespace
-
 // Front to back: what lies behind a Gaussian is the finished pixel less what has been composited so far.
-void tile_backward(const TileInput& in, const Images& done, const ImageGradients& grad, SplatGradient* slots) {
+template <class Gradient>
+void backward(const TileInput& in, const Images& done, const ImageGradients& grad, Gradient* slots) {
   TileGradients pixels(in, done, grad);
-  static_assert(sizeof(SplatGradient) == kGradientFloats * sizeof(float), "ten floats");
-  Back batch;
+  Back<Gradient> batch;
   uint8_t list[kBatch + 8];
   for (const Entry* entry = in.begin; entry < in.end;) {
     entry = batch.fill(in, in.splats, entry, slots);
@@ -195,6 +200,19 @@ void tile_backward(const TileInput& in, const Images& done, const ImageGradients
     }
     batch.write(slots);
   }
+}
+
+}  // namespace
+
+void tile_backward(const TileInput& in, const Images& done, const ImageGradients& grad, SplatGradient* slots) {
+  static_assert(sizeof(SplatGradient) == kGradientFloats * sizeof(float), "ten floats");
+  backward(in, done, grad, slots);
+}
+
+void tile_absolute_backward(const TileInput& in, const Images& done, const ImageGradients& grad,
+                            AbsoluteGradient* slots) {
+  static_assert(sizeof(AbsoluteGradient) == kAbsoluteGradientFloats * sizeof(float), "twelve floats");
+  backward(in, done, grad, slots);
 }
 
 }  // namespace panolog::PANOLOG_ISA

@@ -42,6 +42,7 @@ class Problem:
     exterior: Baked | None = None  # what else the camera sees, on the device
     exposure: Tensor | None = None  # (2, 3) float32 as `renderer.losses.photometric_loss` has it
     moving: bool = False  # whether the report ends with the sums of the camera's motion
+    absolute: bool = False  # whether there are absolute gradients; not with `exact`
 
     def surroundings(self) -> parts.Exterior | None:
         """The exterior as the parts take it."""
@@ -52,7 +53,8 @@ class Problem:
 class Found(NamedTuple):
     """What an iteration found; on the device."""
 
-    gradients: dict[str, Tensor]  # shaped as the parameters; `screen` (N, 2) per pixel
+    gradients: dict[str, Tensor]  # shaped as the parameters; `screen` (N, 2) per pixel, and `absolute`
+    splats: Tensor  # (16 N,) or more, Splat in csrc/formulas.h
     state: Tensor  # (N,) uint8, State in csrc/formulas.h
     report: Tensor  # (4,) float64, or (4 + 27,)
     color: Tensor  # (H, W, 3) rendered
@@ -88,6 +90,7 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         *size,
         len(screen),
         around,
+        absolute=problem.absolute,
         color=color,
         alpha=alpha,
         inverse_depth=inverse_depth,
@@ -117,7 +120,7 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         report=report,
     )
     whole = with_motion(launch, report, motion)
-    return Found(found, projected.state, whole, color, inverse_depth, by_exposure)
+    return Found(found, splats, projected.state, whole, color, inverse_depth, by_exposure)
 
 
 def _depth_loss(
@@ -139,12 +142,15 @@ def add_statistics(
     gradient: Tensor,
     views: Tensor,
     *,
+    absolute: Tensor | None = None,
+    radius: Tensor | None = None,
     angle: bool = False,
     contribution: bool = False,
 ) -> None:
     """As `workers.training.densify.Statistics.add`: one view on the first S rows; none if status is not 0.
 
-    Args: gradient (S,) and views (S,) float32, changed in place; how lengths and views are measured.
+    Args: gradient, views, absolute and radius (S,) float32, changed in place; how lengths and views are
+    measured.
     """
     count, at = len(gradient), problem.camera
     size = (at.width, at.height)
@@ -154,6 +160,8 @@ def add_statistics(
         parts.THREADS,
         count=count,
         screen=found.gradients["screen"],
+        absolute=found.gradients.get("absolute"),
+        splats=found.splats,
         state=found.state,
         means=problem.model["means"],
         camera=parts.camera_struct(at.rotation, at.translation, *size, problem.near, problem.exact),
@@ -162,4 +170,6 @@ def add_statistics(
         status=status,
         gradient=gradient,
         views=views,
+        absolute_sum=absolute,
+        radius=radius,
     )

@@ -54,7 +54,7 @@ def rasterize(
     camera = camera_struct(*_here(rotation, translation), width, height, near, exact)
     angles = half_pixels(width, height, means.device) if exact else None
     around = Exterior.of(exterior, width, height, exact)
-    projected = project(launch, parameters, screen.contiguous(), camera, sh_degree, angles, around)
+    projected = project(launch, parameters, screen[:, :2].contiguous(), camera, sh_degree, angles, around)
     splats, seen, state, _, tile_counts = projected
     listed = list_pairs(launch, projected, width, height, exterior=around)
     images = composite(launch, splats, seen, listed, width, height, around)
@@ -70,7 +70,7 @@ def rasterize_backward(
     opacities: Tensor,
     sh0: Tensor,
     shN: Tensor,
-    screen: Tensor,  # noqa: ARG001  # given by the dispatcher
+    screen: Tensor,
     rotation: Tensor,
     translation: Tensor,
     width: int,
@@ -100,6 +100,7 @@ def rasterize_backward(
         height,
         len(means),
         Exterior.of(exterior, width, height, exact),
+        absolute=screen.shape[1] == 4,
         **contiguous(color=color, alpha=alpha, inverse_depth=inverse_depth, grad_color=grad_color),
         **contiguous(grad_alpha=grad_alpha, grad_inverse_depth=grad_inverse_depth),
     )
@@ -107,6 +108,8 @@ def rasterize_backward(
     camera = camera_struct(*_here(rotation, translation), width, height, near, exact)
     motion = room_for(means, moving)
     out = project_backward(launch, parameters, camera, sh_degree, splats, tile_counts, sums, motion=motion)
+    if screen.shape[1] == 4:
+        out["screen"] = torch.cat([out["screen"], out.pop("absolute")], 1)
     found = means.new_empty(0, dtype=torch.float64) if motion is None else motion_sums(launch, motion)
     return *out.values(), found
 

@@ -21,7 +21,9 @@ THREADS = 256  # in a block of all other kernels
 LANES = 8  # threads that share a splat in bin.cu
 SPLAT_FLOATS = 16  # sizeof(Splat) / 4 in csrc/formulas.h, and of RaySplat in csrc/rays.h
 GRADIENT_FLOATS = 10  # kGradientFloats in csrc/formulas.h
+ABSOLUTE_GRADIENT_FLOATS = 12  # kAbsoluteGradientFloats in csrc/formulas.h
 RAY_GRADIENT_FLOATS = 13  # kRayGradientFloats in csrc/rays.h
+_FLOATS = {"": GRADIENT_FLOATS, "_absolute": ABSOLUTE_GRADIENT_FLOATS, "_ray": RAY_GRADIENT_FLOATS}
 MAX_PAIRS = 2**31 - 1  # of splats and tiles, counted in int32
 NARROW_TILES = 2**16  # below so many their numbers fit int16, which sorts in half the time
 NARROW_FIRST = -(2**15)  # the number of the first of them
@@ -265,16 +267,18 @@ def composite_backward(
     height: int,
     own: int,
     exterior: Exterior | None = None,
+    *,
+    absolute: bool = False,
     **images: Tensor,
 ) -> Tensor:
-    """(N, 10) or, exact, (N, 13) the gradients of the first N = `own` splats.
+    """(N, 10), with absolute gradients (N, 12) or, exact, (N, 13): gradients of the first N = `own` splats.
 
     Args: images, contiguous: the three and their gradients.
     """
-    floats = GRADIENT_FLOATS if rays is None else RAY_GRADIENT_FLOATS
-    sums = splats.new_zeros(own, floats)
+    kind = "_ray" if rays is not None else "_absolute" if absolute else ""
+    sums = splats.new_zeros(own, _FLOATS[kind])
     launch(
-        "composite_backward" if rays is None else "composite_ray_backward",
+        f"composite{kind}_backward",
         tiles_of(width, height),
         THREADS,
         **({"splats": splats} if rays is None else rays._asdict()),
@@ -301,16 +305,18 @@ def project_backward(
     status: Tensor | None = None,
     motion: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """The gradients of the parameters and of `screen`; `status` (1,) int32 notes one that is not finite.
+    """The gradients of the parameters, of `screen` and, if summed, `absolute` ones, both (N, 2).
 
-    Args: sums, by `composite_backward`, whose columns say whether the projection is exact; motion (N, 6),
-    receives the parts of the Gaussians in the gradient of the camera's pose.
+    Args: sums, by `composite_backward`, whose columns say of what; status (1,) int32, notes a gradient that
+    is not finite; motion (N, 6), receives the parts of the Gaussians in the gradient of the camera's pose.
     """
     count = len(sums)
+    (kind,) = (kind for kind, floats in _FLOATS.items() if floats == sums.shape[1])
     out = {name: torch.empty_like(tensor) for name, tensor in parameters.items()}
-    out["screen"] = splats.new_empty(count, 2)
+    for name in ("screen", "absolute") if kind == "_absolute" else ("screen",):
+        out[name] = splats.new_empty(count, 2)
     launch(
-        "project_backward" if sums.shape[1] == GRADIENT_FLOATS else "project_ray_backward",
+        f"project{kind}_backward",
         (math.ceil(count / SPAN), 1),
         SPAN,
         **parameters,

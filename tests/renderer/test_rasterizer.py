@@ -49,6 +49,30 @@ def test_degrees_of_colour_between(degree: int, exact: bool, device: str) -> Non
     check_definition(replace(cloud(60), exact=exact), at, degree, device)
 
 
+def screen_gradient(scene: Gaussians, at: Camera, weight: Tensor, columns: int) -> Tensor:
+    """(N, columns) what `screen` receives, from the gradient (H, W, 3) of the colours."""
+    screen = torch.zeros(len(scene), columns, requires_grad=True)
+    made = render(as_leaves(scene, torch.float32), at, near=NEAR, screen=screen)
+    made.color.backward(weight)  # type: ignore[no-untyped-call]
+    assert screen.grad is not None
+    return screen.grad
+
+
+@pytest.mark.parametrize("name", scenes(camera(), False))
+def test_absolute_gradients_are_sums_over_single_pixels(name: str, instruction_set: str) -> None:
+    at = camera(16)
+    scene = scenes(at, False)[name]
+    weight = torch.randn(at.height, at.width, 3, generator=torch.Generator().manual_seed(0))
+    found, total = screen_gradient(scene, at, weight, 4), torch.zeros(len(scene), 2)
+    assert torch.equal(found[:, :2], screen_gradient(scene, at, weight, 2))
+    for pixel in range(at.height * at.width):
+        one = torch.zeros_like(weight).view(-1, 3)
+        one[pixel] = weight.view(-1, 3)[pixel]
+        total += screen_gradient(scene, at, one.view_as(weight), 2).abs()
+    assert torch.allclose(found[:, 2:], total, rtol=1e-4, atol=1e-5)
+    assert float(total.sum()) > 1.1 * float(found[:, :2].abs().sum())  # signs cancel
+
+
 @needs_a_card
 @pytest.mark.parametrize(("name", "exact"), SCENES)
 def test_a_card_agrees_with_the_definition(name: str, exact: bool) -> None:
@@ -243,6 +267,7 @@ def test_the_reference_differentiates_itself_correctly() -> None:
     [
         {"sh_degree": 4},
         {"screen": torch.zeros(3, 3)},
+        {"screen": torch.zeros(3, 4), "gaussians": replace(cloud(3), exact=True)},
         {"motion": torch.zeros(MOTION_SUMS)},
         {"camera": Camera(torch.eye(4), torch.zeros(3), 64, 32)},
         {"camera": Camera(torch.eye(3), torch.zeros(3, dtype=torch.float64), 64, 32)},

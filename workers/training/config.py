@@ -10,7 +10,7 @@ field has "as they are". "3DGS" is Kerbl et al. 2023; "eq." and "app." are those
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from panolog.workers.capture.config import CaptureConfig
 from panolog.workers.settings import Group
@@ -83,6 +83,9 @@ class SkyConfig(Group):
         description="initial opacity; with neighbours one sigma apart the sphere is closed from the start, so"
         " that scene Gaussians need not fill the sky",
     )
+    size: float = Field(
+        default=1.0, gt=0, description="sigma in distances of neighbours; with 1 the sky can be sharp"
+    )
     views: int = Field(
         default=16, ge=1, description="training panoramas, evenly chosen, whose mean colours the sky"
     )
@@ -113,6 +116,15 @@ class DensifyConfig(Group):
         gt=0,
         description="mean screen gradient in units of half the image size that densifies; 3DGS, app. A",
     )
+    split_gradient: float = Field(
+        default=0.0,
+        ge=0,
+        description="the same of absolute gradients, of single pixels and without their signs, above which large"
+        " Gaussians are split; 4e-4 by AbsGS (Ye et al. 2024); 0 = by `gradient`, 3DGS",
+    )
+    least_opacity: float = Field(
+        default=0.0, ge=0, lt=1, description="opacity below which none are cloned or split; 0 = all may, 3DGS"
+    )
     percent_dense: float = Field(
         default=0.01,
         gt=0,
@@ -127,6 +139,11 @@ class DensifyConfig(Group):
         default=0.005, ge=0, lt=1, description="opacity below which they are removed, o_min of eq. 12; 3DGS"
     )
     prune_scale: float = Field(default=0.1, ge=0, description="largest scale, in extents, 0 = any; 3DGS")
+    prune_footprint: float = Field(
+        default=0.0,
+        ge=0,
+        description="largest radius in a panorama since the last densification, three sigma, pixels; 0 = any",
+    )
     max_gaussians: int = Field(
         default=0,
         ge=0,
@@ -211,6 +228,9 @@ class ResetConfig(Group):
         description="ceiling that a reset sets, o_reset of sec. 3.2; what is not above it at the end is"
         " removed; 3DGS, app. D",
     )
+    unrisen: Literal["removed", "kept"] = Field(
+        default="removed", description="what is not above `opacity` at the end; app. D removes it"
+    )
 
 
 class OptimizerConfig(Group):
@@ -257,6 +277,9 @@ class Stage2Config(Group):
         le=1,
         description="factor of all rates but that of means, whose Adam starts without statistics; 1 = those"
         " of Stage I, the paper",
+    )
+    scale: float = Field(
+        default=1.0, gt=0, le=1, description="factor of the rate of scales, besides `rate`; 1 = as the paper"
     )
     reset: Literal["all", "cell", "none"] = Field(
         default="all",
@@ -323,6 +346,7 @@ class TrainConfig(CaptureConfig):
     projection: Literal["affine", "exact"] = Field(
         default="affine", description="an affine splat (eq. 2), or along each pixel's ray (csrc/rays.h)"
     )
+    initial_opacity: float = Field(default=0.1, gt=0, lt=1, description="of what sparse points become; 3DGS")
     loss: LossConfig = LossConfig()
     depth: DepthConfig = DepthConfig()
     sky: SkyConfig = SkyConfig()
@@ -335,3 +359,12 @@ class TrainConfig(CaptureConfig):
     preview: PreviewConfig = PreviewConfig()
     cache: CacheConfig = CacheConfig()
     images: ImagesConfig = ImagesConfig()
+
+    @model_validator(mode="after")
+    def _measurable(self) -> "TrainConfig":
+        if self.projection == "exact" and (self.densify.split_gradient or self.densify.prune_footprint):
+            raise ValueError(
+                "densify.split_gradient and densify.prune_footprint measure affine splats:"
+                " set them to 0, or projection to affine"
+            )
+        return self

@@ -1,6 +1,7 @@
 """Adaptive density control of 3DGS: clone, split, prune, reset opacities. The sky is not densified."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.optimizer import ModelState
 from panolog.workers.training.schedule import Schedule
 
+STATISTICS = "statistics."  # before the names of `Statistics.tensors`
 SPLIT_SHRINK = 1.6  # both parts of a split Gaussian are smaller by this factor; 3DGS
 _EPSILON = 1e-6  # distance of opacities from 0 and 1 that are computed with
 
@@ -26,13 +28,35 @@ class Statistics:
     gradient: Tensor  # (S,) weighted sum of their lengths
     views: Tensor  # (S,) sum of the weights of the views that saw each
     config: DensifyConfig  # how lengths and weights are measured
+    absolute: Tensor | None = None  # (S,) as `gradient`, of absolute gradients; where the config needs them
+    radius: Tensor | None = None  # (S,) the largest, pixels; where the config needs it
 
     @staticmethod
     def zeros(count: int, device: torch.device | str, config: DensifyConfig) -> "Statistics":
         """Before the first view."""
-        return Statistics(torch.zeros(count, device=device), torch.zeros(count, device=device), config)
+        made = {
+            "gradient": True,
+            "views": True,
+            "absolute": config.split_gradient,
+            "radius": config.prune_footprint,
+        }
+        return Statistics(
+            **{n: torch.zeros(count, device=device) for n, used in made.items() if used}, config=config
+        )
 
-    def add(self, screen_gradient: Tensor, visible: Tensor, means: Tensor, camera: Camera) -> None:
+    @staticmethod
+    def from_tensors(tensors: Mapping[str, Tensor], config: DensifyConfig) -> "Statistics":
+        """The inverse of `tensors`."""
+        found = {n.removeprefix(STATISTICS): it for n, it in tensors.items() if n.startswith(STATISTICS)}
+        return Statistics(**found, config=config)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """By name, for checkpoints, sharing memory."""
+        return {f"{STATISTICS}{name}": it for name, it in vars(self).items() if isinstance(it, Tensor)}
+
+    def add(
+        self, screen_gradient: Tensor, visible: Tensor, means: Tensor, camera: Camera, splats: Tensor
+    ) -> None:
         """Add one view; sky rows are ignored. A card does it in `iteration_statistics` of csrc/cuda.
 
         The length is that of (∂L/∂u · W/2, ∂L/∂v · H/2), as 3DGS has it in normalised device coordinates.
@@ -40,29 +64,51 @@ class Statistics:
         (W / 2π cos φ, H / π) pixels, and a pixel, which the loss counts, the solid angle cos φ. A view's
         weight is 1, or by contribution 1 / r², as its solid angle, and 0 where nothing of it is seen.
 
-        Args: screen_gradient (N, 2) ∂L/∂(u, v) per pixel, visible (N,), means (N, 3).
+        Args: screen_gradient (N, 2) ∂L/∂(u, v) per pixel, and absolute gradients in two columns more, where
+        these count; visible (N,), means (N, 3); splats (N, 16) as rendered.
         """
         count = len(self.gradient)
-        du, dv = screen_gradient[:count].unbind(1)
         vertical: Tensor | float = camera.height / 2
         angle, contribution = self.config.measure == "angle", self.config.views == "contribution"
         if angle or contribution:
             y, squared = _from_camera(means[:count], camera)
             if angle:
                 vertical = camera.height * torch.sqrt((1 - y * y / squared).clamp(min=0))
-        length = torch.sqrt((du * (camera.width / 2)) ** 2 + (dv * vertical) ** 2)
-        seen = visible[:count]
-        if contribution:
-            weight = torch.where(seen & (length > 0), 1 / squared, 0)
-            self.gradient += torch.where(weight > 0, length * weight, 0)
-            self.views += weight
-        else:
-            self.gradient += torch.where(seen, length, 0)
-            self.views += seen
+        seen, horizontal = visible[:count], camera.width / 2
+        lengths = [
+            torch.sqrt((pair[:, 0] * horizontal) ** 2 + (pair[:, 1] * vertical) ** 2)
+            for pair in screen_gradient[:count].split(2, 1)
+        ]
+        weight = torch.where(seen & (lengths[0] > 0), 1 / squared, 0) if contribution else seen
+        for total, length in zip((self.gradient, self.absolute), lengths, strict=False):
+            if total is not None:
+                total += torch.where(weight > 0, length * weight, 0)
+        self.views += weight
+        if self.radius is not None:
+            self.radius = torch.where(seen, torch.maximum(self.radius, radii(splats[:count])), self.radius)
 
     def mean(self) -> Tensor:
         """(S,) mean over the views that saw the Gaussian, 0 for none."""
-        return self.gradient / self.views.clamp(min=torch.finfo(torch.float32).tiny)
+        return self._mean(self.gradient)
+
+    def splitting(self) -> tuple[Tensor, float]:
+        """(S,) mean by which large Gaussians are split, and the least that is."""
+        if self.absolute is None:
+            return self.mean(), self.config.gradient
+        return self._mean(self.absolute), self.config.split_gradient
+
+    def _mean(self, total: Tensor) -> Tensor:
+        return total / self.views.clamp(min=torch.finfo(torch.float32).tiny)
+
+
+def radii(splats: Tensor) -> Tensor:
+    """(S,) three deviations of affine splats (S, 16) along their longest axes, pixels (3DGS)."""
+    a, slope, c = splats[:, 2], splats[:, 3], splats[:, 4]  # Splat of csrc/formulas.h
+    var_v, narrow = (-0.5 * math.log2(math.e) / of for of in (c, a))
+    covariance = slope * var_v
+    var_u = narrow + slope * covariance
+    apart = torch.sqrt(((var_u - var_v) / 2) ** 2 + covariance**2)
+    return 3 * torch.sqrt((var_u + var_v) / 2 + apart)
 
 
 def _from_camera(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -82,15 +128,17 @@ def densify(
     config: DensifyConfig,
     extent: float | NDArray[np.float64],
     random: np.random.Generator,
+    footprint: float = 0,
 ) -> None:
     """Clone small and split large Gaussians with large screen gradients, prune transparent ones (3DGS).
 
-    New Gaussians start with zero moments. The rows of the statistics no longer match afterwards.
+    Both are measured by the config of the statistics. New Gaussians start with zero moments. The rows of the statistics no longer match afterwards.
 
     Args: statistics of the scene Gaussians; extent in world units, or (S,) one for each of them, that
-    `percent_dense` is a fraction of; random for the split positions.
+    `percent_dense` is a fraction of; random for the split positions; footprint, the largest radius in pixels,
+    0 = any.
     """
-    kept, clones, splits, sky = _sources(state.gaussians, statistics, config, extent)
+    kept, clones, splits, sky = _sources(state.gaussians, statistics, config, extent, footprint)
     source = torch.cat([kept, clones, splits, sky])
     new = torch.zeros(len(source), dtype=torch.bool, device=kept.device)
     new[len(kept) : len(source) - len(sky)] = True
@@ -127,17 +175,26 @@ def rate_units(
 
 
 def _sources(
-    gaussians: Gaussians, statistics: Statistics, config: DensifyConfig, extent: float | NDArray[np.float64]
+    gaussians: Gaussians,
+    statistics: Statistics,
+    config: DensifyConfig,
+    extent: float | NDArray[np.float64],
+    footprint: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rows int64 that stay, that are cloned, that are split (twice each), and of the sky."""
     scene = gaussians.scene
     # compared as logits: the rounding of a vectorised sigmoid depends on how threads divide the rows
-    transparent = gaussians.opacities[scene] < logit(config.prune_opacity)
-    selected = (statistics.mean() >= config.gradient) & ~transparent
-    selected = _within_cap(selected, statistics.mean(), config.max_gaussians, int((~transparent).sum()))
+    removed = gaussians.opacities[scene] < logit(config.prune_opacity)
+    if footprint > 0 and statistics.radius is not None:
+        removed |= statistics.radius > footprint
     bound = np.log(config.percent_dense * np.asarray(extent, np.float64)).astype(np.float32)
     large = gaussians.scales[scene].amax(1) > torch.from_numpy(np.asarray(bound)).to(gaussians.scales.device)
-    kept = (~transparent & ~(selected & large)).nonzero()[:, 0]
+    gradient, (split, least) = statistics.mean(), statistics.splitting()
+    selected = torch.where(large, split >= least, gradient >= config.gradient) & ~removed
+    if config.least_opacity > 0:
+        selected &= gaussians.opacities[scene] > logit(config.least_opacity)
+    selected = _within_cap(selected, gradient, config.max_gaussians, int((~removed).sum()))
+    kept = (~removed & ~(selected & large)).nonzero()[:, 0]
     clones = (selected & ~large).nonzero()[:, 0]
     splits = (selected & large).nonzero()[:, 0].repeat(2)
     return kept, clones, splits, torch.arange(scene.stop, len(gaussians), device=kept.device)

@@ -23,7 +23,6 @@ from panolog.workers.training.surfaces import NO_POINTS, Points
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 DARKEST = 0.25 / 255  # initial: colours are clamped at 0, where they have no gradient and would stay black
-OPACITY = 0.1  # initial, 3DGS
 NEIGHBOURS = 3  # whose distances set the size of a Gaussian, 3DGS
 # Initial sizes as fractions of the distance to the nearest camera. A lone point, far from its neighbours, may
 # not cover more than a fifth of a radian; a duplicate point may not vanish (a pixel is about 3e-3 radians).
@@ -80,13 +79,17 @@ def isotropic(
 
 
 def scene_gaussians(
-    scene: Scene, chosen: NDArray[np.int64] | None = None, more: Points = NO_POINTS
+    scene: Scene,
+    chosen: NDArray[np.int64] | None = None,
+    more: Points = NO_POINTS,
+    opacity: float = 0.1,
 ) -> Gaussians:
     """One Gaussian for each point of the sparse cloud, its size the distance of its neighbours (3DGS).
 
     Its bounds come from the training cameras: no pose that is held out has an influence.
 
-    Args: chosen, rows of the cloud as of `points_of`, None = all; more, points beyond the cloud.
+    Args: chosen, rows of the cloud as of `points_of`, None = all; more, points beyond the cloud; opacity in
+    (0, 1).
     """
     chosen = np.arange(len(scene.points)) if chosen is None else chosen
     points = np.concatenate([scene.points[chosen], more.points])
@@ -95,7 +98,7 @@ def scene_gaussians(
     camera, _ = cKDTree(scene.centers[list(scene.train)]).query(points)
     tiny = np.finfo(np.float32).tiny  # a point in a camera
     scales = np.clip(spacing, SCALE_MIN * camera, SCALE_MAX * camera).clip(min=tiny)
-    return isotropic(points, scales, colors, OPACITY)
+    return isotropic(points, scales, colors, opacity)
 
 
 def points_of(
@@ -123,7 +126,7 @@ def points_of(
 
 def first_model(
     scene: Scene,
-    config: SkyConfig,
+    config: TrainConfig,
     chosen: NDArray[np.int64],
     more: Points,
     views: Sequence[int],
@@ -131,8 +134,8 @@ def first_model(
     view: Callable[[int], View | None],
 ) -> Gaussians:
     """What Stage I starts with: `scene_gaussians` and `sky_gaussians`. Args: pixels of a panorama."""
-    points, count = scene_gaussians(scene, chosen, more), config.number(pixels)
-    return concatenate(points, sky_gaussians(scene, config, count, views, view)) if count else points
+    points, count = scene_gaussians(scene, chosen, more, config.initial_opacity), config.sky.number(pixels)
+    return concatenate(points, sky_gaussians(scene, config.sky, count, views, view)) if count else points
 
 
 def _neighbour_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -157,7 +160,7 @@ def sky_gaussians(
     centroid = scene.centers[list(scene.train)].mean(axis=0)
     radius = config.kappa * float(np.linalg.norm(scene.points - centroid, axis=1).max())
     means = centroid + radius * fibonacci_sphere(count)
-    spacing = radius * math.sqrt(4 * math.pi / count)
+    spacing = config.size * radius * math.sqrt(4 * math.pi / count)
     evenly = np.linspace(0, len(views) - 1, min(config.views, len(views))).astype(int)
     colors = _colors(scene, means, [views[i] for i in evenly], view)
     gaussians = isotropic(means, np.full(count, spacing), colors, config.opacity)

@@ -63,7 +63,8 @@ class Direct:
         problem = plan.problem
         leaves: Gaussians = plan.state.leaves(problem.sh_degree)
         counts = plan.statistics is not None
-        screen = torch.zeros(len(leaves), 2, requires_grad=True) if counts else None
+        columns = 4 if problem.absolute else 2
+        screen = torch.zeros(len(leaves), columns, requires_grad=True) if counts else None
         motion = torch.zeros(MOTION_SUMS, dtype=torch.float64, requires_grad=True) if problem.moving else None
         rendered = render(
             leaves,
@@ -83,7 +84,8 @@ class Direct:
         except FloatingPointError as error:
             raise self._broken(str(error), plan) from error
         if plan.statistics is not None and screen is not None and screen.grad is not None:
-            plan.statistics.add(screen.grad, rendered.visible, leaves.means.detach(), problem.camera)
+            means, splats = leaves.means.detach(), rendered.splats
+            plan.statistics.add(screen.grad, rendered.visible, means, problem.camera, splats)
         if plan.learning is not None:
             observed = Observed(
                 view=plan.view,
@@ -182,6 +184,8 @@ class Pipeline:
                 plan.problem,
                 into.gradient,
                 into.views,
+                absolute=into.absolute,
+                radius=into.radius,
                 angle=into.config.measure == "angle",
                 contribution=into.config.views == "contribution",
             )

@@ -76,8 +76,8 @@ class Schedule:
 
     def prunes_large(self, iteration: int) -> bool:
         """Whether densification removes large Gaussians: when the first reset has been due (3DGS)."""
-        reset, scale = self.config.reset, self.config.densify.prune_scale
-        return scale > 0 and iteration > self.interval(reset.every, reset.every_floor)
+        reset = self.config.reset
+        return iteration > self.interval(reset.every, reset.every_floor)
 
     def turns(self) -> list[int]:
         """The iterations after which Gaussians may densify or opacities be reset, and no others."""
@@ -109,10 +109,10 @@ class Schedule:
         return left < span and left % max(1, int(span / AVERAGED)) == 0
 
     @property
-    def ever_resets(self) -> bool:
-        """Whether opacities are reset at all: the first time that one is due, if ever."""
+    def drops_unrisen(self) -> bool:
+        """Whether what no view has raised since the last reset is removed at the end, if there was one."""
         reset = self.config.reset
-        return self.resets(self.interval(reset.every, reset.every_floor))
+        return reset.unrisen == "removed" and self.resets(self.interval(reset.every, reset.every_floor))
 
     def budget(self, iteration: int, start: int, pixels: int) -> int:
         """How many Gaussians there are after this iteration where they are relocated: rising evenly.
@@ -176,7 +176,7 @@ class Schedule:
         return {
             "means": self.length**2 * self.position(iteration) * unit,
             "quats": shapes * rates.rotation,
-            "scales": shapes * rates.scale,
+            "scales": shapes * rates.scale * (self.config.stage2.scale if self.refine else 1.0),
             "opacities": rates.opacity * rate,
             "sh0": colors * rates.sh0,
             "shN": colors * rates.shN,

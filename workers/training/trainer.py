@@ -177,7 +177,7 @@ class Trainer:
             if self.meter.due():
                 yield self.meter.progress(0, self.start)
         more = surfaces.points(scene.points[chosen], self.centers, missing)
-        return first_model(scene, spec.config.sky, chosen, more, spec.views, pixels, self.views.get)
+        return first_model(scene, spec.config, chosen, more, spec.views, pixels, self.views.get)
 
     def _block(self, initial: Source[Gaussians]) -> Gaussians:
         """What a block trains with, of the Stage I model."""
@@ -214,8 +214,7 @@ class Trainer:
         self.state = ModelState.from_tensors(tensors)
         if self.spec.initial is not None and self.spec.bakes:
             self._block(self.spec.initial)
-        found = (tensors["statistics.gradient"], tensors["statistics.views"])
-        self.statistics = Statistics(*found, self.spec.config.densify)
+        self.statistics = Statistics.from_tensors(tensors, self.spec.config.densify)
         self.average = Average.from_tensors(checkpoint.tensors)
         self.learning.restore(tensors)
         self.views.restore(tensors)
@@ -227,9 +226,8 @@ class Trainer:
         """All of the state, copied to the CPU: steps change it in place."""
         self.settle()
         tensors = self.state.tensors() | {
-            "statistics.gradient": self.statistics.gradient,
-            "statistics.views": self.statistics.views,
             _START: torch.tensor(self.start),
+            **self.statistics.tensors(),
             **self.average.tensors(),
             **self.learning.tensors(),
             **self.views.tensors(),
@@ -338,6 +336,7 @@ class Trainer:
             exterior=around,
             exposure=view.exposure,
             moving=self.learning.moving(iteration),
+            absolute=self.statistics.absolute is not None and self.schedule.collects(iteration),
         )
         return Plan(
             iteration=iteration,
@@ -374,7 +373,7 @@ class Trainer:
             self.average.clear()
             cell = self.spec.cell if self.spec.config.stage2.reset == "cell" else None
             reset_opacities(self.state, self.spec.config.reset.opacity, inside(self.state.gaussians, cell))
-        if last and self.schedule.ever_resets:
+        if last and self.schedule.drops_unrisen:
             drop_unrisen(self.state, self.spec.config.reset.opacity)
             self.reset_statistics()
 

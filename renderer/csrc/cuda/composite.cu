@@ -142,7 +142,7 @@ __device__ __forceinline__ void forward(const View& view, Batch<Local>& batch, c
 template <class View, class Local>
 __device__ __forceinline__ void backward(const View& view, Batch<Local>& batch, const Layers& layers,
                                          const Gradients& in, int64_t own, float* sums) {
-  constexpr int kSums = View::kSums;
+  constexpr int kSums = View::kSums, kLight = View::kLight;
   float t = 0, behind = 0, gr = 0, gg = 0, gb = 0, ga = 0, gd = 0;
   if (const int64_t at = view.pixel.at; at >= 0) {
     const Light front = light_of(layers.front, layers.places, view.pixel);
@@ -164,9 +164,9 @@ __device__ __forceinline__ void backward(const View& view, Batch<Local>& batch, 
     // a capped alpha does not move with the exponent
     const float power = pair.alpha > 0 && pair.alpha < kAlphaMax ? slope * pair.alpha : 0.0f;
     float values[kSums];
-    View::sums_of(pair, power, values);
-    values[kSums - 4] = weight * gr, values[kSums - 3] = weight * gg, values[kSums - 2] = weight * gb;
-    values[kSums - 1] = weight * gd;
+    View::sums_of(s, pair, power, values);
+    values[kLight] = weight * gr, values[kLight + 1] = weight * gg, values[kLight + 2] = weight * gb;
+    values[kLight + 3] = weight * gd;
     add_sums<kSums>(values, sums + int64_t(kSums) * s.row);
   });
 }
@@ -196,6 +196,21 @@ extern "C" __global__ void __launch_bounds__(256)
   static_assert(sizeof(SplatGradient) == kGradientFloats * sizeof(float), "ten floats");
   __shared__ Batch<AffineView::Local> batch;
   const AffineView view = affine_view(splats, tile_of_block(entries, starts, width, height));
+  backward(view, batch, {places, front, nullptr},
+           {color, alpha, inverse_depth, grad_color, grad_alpha, grad_inverse_depth}, own, sums);
+}
+
+// The same with absolute gradients.
+extern "C" __global__ void __launch_bounds__(256)
+    composite_absolute_backward(const panolog::Splat* splats, const int32_t* entries, const int32_t* starts,
+                                int64_t width, int64_t height, const int32_t* places, const float* front,
+                                const float* color, const float* alpha, const float* inverse_depth,
+                                const float* grad_color, const float* grad_alpha, const float* grad_inverse_depth,
+                                int64_t own, float* sums) {
+  using namespace panolog;
+  static_assert(sizeof(AbsoluteGradient) == kAbsoluteGradientFloats * sizeof(float), "twelve floats");
+  __shared__ Batch<AffineView::Local> batch;
+  const AbsoluteView view = {affine_view(splats, tile_of_block(entries, starts, width, height))};
   backward(view, batch, {places, front, nullptr},
            {color, alpha, inverse_depth, grad_color, grad_alpha, grad_inverse_depth}, own, sums);
 }

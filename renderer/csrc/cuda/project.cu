@@ -77,10 +77,15 @@ __device__ __forceinline__ void write_gradients(const Model& model, const float*
   __syncthreads();
   const bool drawn = i < count && tile_counts[i] > 0;
   if (drawn) {
-    const ParameterGradients<float> out = {all.mean + 3 * i,   all.quat + 4 * i,
-                                           all.scale + 3 * i,  all.opacity + i,
-                                           all.sh0 + 3 * i,    own,
-                                           all.screen + 2 * i, all.motion ? all.motion + kMotion * i : nullptr};
+    const ParameterGradients<float> out = {all.mean + 3 * i,
+                                           all.quat + 4 * i,
+                                           all.scale + 3 * i,
+                                           all.opacity + i,
+                                           all.sh0 + 3 * i,
+                                           own,
+                                           all.screen + 2 * i,
+                                           all.absolute ? all.absolute + 2 * i : nullptr,
+                                           all.motion ? all.motion + kMotion * i : nullptr};
     project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
     const bool sound = finite(out.mean, 3) && finite(out.quat, 4) && finite(out.scale, 3) && finite(out.opacity, 1) &&
                        finite(out.sh0, 3) && finite(own, 3 * (int(sh_count) - 1)) && finite(out.screen, 2);
@@ -89,6 +94,7 @@ __device__ __forceinline__ void write_gradients(const Model& model, const float*
     for (int k = 0; k < 3; ++k) all.mean[3 * i + k] = all.scale[3 * i + k] = all.sh0[3 * i + k] = 0;
     for (int k = 0; k < 4; ++k) all.quat[4 * i + k] = 0;
     all.opacity[i] = all.screen[2 * i] = all.screen[2 * i + 1] = 0;
+    if (all.absolute) all.absolute[2 * i] = all.absolute[2 * i + 1] = 0;
     for (int k = 0; all.motion && k < kMotion; ++k) all.motion[kMotion * i + k] = 0;
   }
   for (int k = drawn ? 3 * (int(sh_count) - 1) : 0; k < kRest; ++k) own[k] = 0;
@@ -178,8 +184,24 @@ extern "C" __global__ void __launch_bounds__(128)
                      float* out_shN, float* out_screen, float* out_motion, int32_t* status) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];
-  const ParameterGradients<float> out = {out_means, out_quats, out_scales, out_opacities,
-                                         out_sh0,   out_shN,   out_screen, out_motion};
+  const ParameterGradients<float> out = {out_means, out_quats,  out_scales, out_opacities, out_sh0,
+                                         out_shN,   out_screen, nullptr,    out_motion};
+  write_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums, out,
+                  rest, status);
+}
+
+// The same with absolute gradients, out_absolute (N, 2).
+extern "C" __global__ void __launch_bounds__(128)
+    project_absolute_backward(const float* means, const float* quats, const float* scales, const float* opacities,
+                              const float* sh0, const float* shN, panolog::Camera camera, int64_t sh_count,
+                              int64_t count, const panolog::Splat* splats, const int32_t* tile_counts,
+                              const panolog::AbsoluteGradient* sums, float* out_means, float* out_quats,
+                              float* out_scales, float* out_opacities, float* out_sh0, float* out_shN,
+                              float* out_screen, float* out_absolute, float* out_motion, int32_t* status) {
+  using namespace panolog;
+  __shared__ float rest[kSpan * kRest];
+  const ParameterGradients<float> out = {out_means, out_quats,  out_scales,   out_opacities, out_sh0,
+                                         out_shN,   out_screen, out_absolute, out_motion};
   write_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums, out,
                   rest, status);
 }
@@ -192,8 +214,8 @@ extern "C" __global__ void __launch_bounds__(128)
                          float* out_shN, float* out_screen, float* out_motion, int32_t* status) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];
-  const ParameterGradients<float> out = {out_means, out_quats, out_scales, out_opacities,
-                                         out_sh0,   out_shN,   out_screen, out_motion};
+  const ParameterGradients<float> out = {out_means, out_quats,  out_scales, out_opacities, out_sh0,
+                                         out_shN,   out_screen, nullptr,    out_motion};
   write_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums, out,
                   rest, status);
 }

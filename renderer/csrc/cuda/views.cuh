@@ -57,7 +57,7 @@ struct AffineView {
     float alpha;  // 0 where the pair does not count
   };
   static constexpr bool kWraps = true;  // a tile may see two images of a splat
-  static constexpr int kSums = kGradientFloats;
+  static constexpr int kSums = kGradientFloats, kLight = 6;  // the first of the colours in them
 
   const Splat* splats;
   Tile tile;
@@ -114,9 +114,19 @@ struct AffineView {
   }
 
   // What SplatGradient sums of the exponent, from dL/dpower.
-  static __device__ __forceinline__ void sums_of(const Pair& pair, float power, float* to) {
+  static __device__ __forceinline__ void sums_of(const Local&, const Pair& pair, float power, float* to) {
     const float e = power * pair.e, y = power * pair.dy;
     to[0] = power, to[1] = e, to[2] = y, to[3] = e * pair.e, to[4] = e * pair.dy, to[5] = y * pair.dy;
+  }
+};
+
+// The same with absolute gradients.
+struct AbsoluteView : AffineView {
+  static constexpr int kSums = kAbsoluteGradientFloats;
+
+  static __device__ __forceinline__ void sums_of(const Local& s, const Pair& pair, float power, float* to) {
+    AffineView::sums_of(s, pair, power, to);
+    to[10] = fabsf(to[1]), to[11] = fabsf(s.c * to[2] - s.slope * s.a * to[1]);
   }
 };
 
@@ -139,7 +149,7 @@ struct RayView {
     float alpha;
   };
   static constexpr bool kWraps = false;
-  static constexpr int kSums = kRayGradientFloats;
+  static constexpr int kSums = kRayGradientFloats, kLight = 9;
 
   const RaySplat* rays;
   Tile tile;
@@ -185,7 +195,7 @@ struct RayView {
   }
 
   // What RayGradient sums of the exponent, from dL/dpower.
-  static __device__ __forceinline__ void sums_of(const Pair& pair, float power, float* to) {
+  static __device__ __forceinline__ void sums_of(const Local&, const Pair& pair, float power, float* to) {
     const float a = power * pair.inverse * pair.inverse, al = a * pair.l, lp = al * pair.square, shared = al * pair.l;
     const float hx = shared * pair.x, hy = shared * pair.y;
     to[0] = power, to[1] = hx * pair.x, to[2] = hx * pair.y, to[3] = hy * pair.y, to[4] = hx * pair.l;

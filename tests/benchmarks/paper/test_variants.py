@@ -51,7 +51,7 @@ def test_what_a_variant_needs_runs_before_it() -> None:
     assert [v.name for v in stages(["tau"])[0]] == ["paper", "tau-0.7", "tau-0.8", "tau-0.9"]
     both = stages(["tau", "main"])  # the most important table first, nothing twice
     assert [[v.name for v in stage] for stage in both] == [
-        ["paper", "panolog", "panolog-time"],
+        ["paper", "authors", "panolog", "panolog-time"],
         ["tau-0.7", "tau-0.8", "tau-0.9"],
     ]
 

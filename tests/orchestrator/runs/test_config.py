@@ -43,7 +43,7 @@ def test_flags_win_over_settings_and_settings_over_the_file(tmp_path: Path) -> N
         ("seed=2020-13-45", "not YAML"),
         ("loss=3", "setting loss = 3"),
         ("device=tpu", 'setting device = "tpu"'),
-        ("recipe=best", "setting recipe = \"best\": Input should be 'paper' or 'panolog'"),
+        ("recipe=best", "setting recipe = \"best\": Input should be 'paper', 'authors' or 'panolog'"),
         *((f"memory={text}", "setting memory = ") for text in ("0", "-1", "8MB", "much")),
     ],
 )

@@ -102,6 +102,7 @@ def every_kernel(launch: Checked) -> None:
     moments = [torch.zeros_like(scene.means) for _ in range(2)]
     variants = ((None, True, 0), (50, False, 9999), (60, True, 0), (70, True, 9999))
     for (room, full, narrow), exact in itertools.product(variants, (False, True)):
+        absolute = full and not exact
         problem = Problem(
             model=scene.tensors(),
             camera=at,
@@ -118,12 +119,15 @@ def every_kernel(launch: Checked) -> None:
             depth_share=torch.ones((), dtype=torch.float64) if full else None,
             exterior=surrounded(exact, at) if full else None,
             moving=full,
+            absolute=absolute,
             exposure=torch.ones(2, 3) if full else None,
         )
         with mock.patch.object(parts, "NARROW_TILES", narrow):
             found = iteration.gradients(launch, problem, status, room)
-        into = [torch.zeros(30), torch.zeros(30)]
-        iteration.add_statistics(launch, found, status, problem, *into, angle=full)
+        into, more = [torch.zeros(30), torch.zeros(30)], [torch.zeros(30) if absolute else None] * 2
+        iteration.add_statistics(
+            launch, found, status, problem, *into, absolute=more[0], radius=more[1], angle=full
+        )
         gradient = found.gradients["means"]
         updates = [parts.Update(gradient, scene.means, moments[0], moments[1], 30, 0.125)]
         parts.adam_step(launch, updates * (1 + full), 0.9, 0.999, 1e-15, 3, status if full else None)

@@ -1,6 +1,7 @@
 """What the emulation is for: kernels broken on purpose are found, each by name."""
 
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -109,6 +110,13 @@ def adam(launch: EmulatedLaunch) -> None:
     assert torch.equal(parameter, before)  # no step after a fault
 
 
+def round_splats(count: int) -> torch.Tensor:
+    """Of two pixels' deviation."""
+    splats = torch.zeros(count, parts.SPLAT_FLOATS)
+    splats[:, [2, 4]] = -0.5 * math.log2(math.e) / 2**2
+    return splats
+
+
 def iteration(launch: EmulatedLaunch) -> None:
     one, status = torch.ones((), dtype=torch.float64), torch.zeros(1, dtype=torch.int32)
     report = torch.zeros(4, dtype=torch.float64)
@@ -130,7 +138,7 @@ def iteration(launch: EmulatedLaunch) -> None:
         report=report,
     )
     assert torch.allclose(report, torch.tensor([1.3, 1, 7, 0], dtype=torch.float64))
-    gradient, views = torch.zeros(300), torch.zeros(300)
+    gradient, views, absolute, radius = torch.zeros(4, 300)
     for broken in (0, 1):  # nothing is added after a fault
         launch(
             "iteration_statistics",
@@ -138,6 +146,8 @@ def iteration(launch: EmulatedLaunch) -> None:
             256,
             count=300,
             screen=torch.ones(300, 2),
+            absolute=2 * torch.ones(300, 2),
+            splats=round_splats(300),
             state=torch.full((300,), ops.VISIBLE, dtype=torch.uint8),
             means=torch.ones(300, 3),
             camera=parts.camera_struct(torch.eye(3), torch.zeros(3), 6, 8, 0.0, False),
@@ -146,8 +156,11 @@ def iteration(launch: EmulatedLaunch) -> None:
             status=status.fill_(broken),
             gradient=gradient,
             views=views,
+            absolute_sum=absolute,
+            radius=radius,
         )
         assert (gradient == 5).all() and (views == 1).all()
+        assert (absolute == 10).all() and torch.allclose(radius, torch.full((300,), 6.0))
 
 
 EXERCISES: dict[str, Callable[[EmulatedLaunch], None]] = {
