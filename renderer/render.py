@@ -54,9 +54,8 @@ def render(
         sh_degree: 0 to 3, how many degrees of spherical harmonics take part.
         near: radial distance in world units below which a Gaussian is not drawn.
         screen: (N, 2) zeros that require grad; receives ∂L/∂(u, v) per pixel, which densification needs. With
-            `gaussians.exact` it only receives: values other than 0 do not move them. Two more columns (N, 4)
-            receive the sums of |∂L/∂(u, v)| over single pixels, absolute gradients (Ye et al. 2024); of affine
-            splats alone.
+            `gaussians.exact` it only receives: values other than 0 do not move them. Without it two more
+            columns may receive sums of |∂L/∂(u, v)| over pixels: absolute gradients (Ye et al. 2024).
         exterior: what else the camera sees, baked for it; the image is then empty outside of its tiles.
         motion: (27,) float64 zeros that require grad; receives how the loss changes as the camera moves,
             `motion.Motion.of`.
@@ -91,8 +90,8 @@ def render(
         exterior=[] if exterior is None else exterior.arrays(),
         motion=motion,
     )
-    visible, invalid = state == ops.VISIBLE, state == ops.INVALID
-    return Render(color, alpha, inverse_depth, visible, invalid, splats.view(-1, SPLAT_FLOATS)[:count])
+    seen = state == ops.VISIBLE, state == ops.INVALID
+    return Render(color, alpha, inverse_depth, *seen, splats.view(-1, SPLAT_FLOATS)[:count])
 
 
 def _check_camera(camera: Camera) -> None:

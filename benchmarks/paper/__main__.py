@@ -34,9 +34,10 @@ from panolog.renderer.process import prepare
 from panolog.scene.errors import InputError
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
+from panolog.workers.training.recipes import RECIPES
 
-_SHOWN = ("paper", "panolog", "panolog-time", "panolog-stage1")  # in crops
-_PLANS = ("paper", "panolog")  # whose overlap is shown
+_SHOWN = ("paper", "authors", "panolog", "panolog-time", "panolog-stage1")  # in crops
+_PLANS = ("paper", "authors", "panolog")  # whose overlap is shown
 
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
@@ -94,7 +95,7 @@ def checked(options: argparse.Namespace) -> Settings:
         options.width, options.iterations, options.blocks, options.device, tuple(options.sets)
     )
     known = variants()
-    for recipe in ("paper", "panolog"):  # a switch alone may be refused: then its row says why
+    for recipe in RECIPES:  # a switch alone may be refused: then its row says why
         load_config(None, known[recipe].sets(settings, 0, settings.iterations))
     for folder in options.also:
         study.load(folder)

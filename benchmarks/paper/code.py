@@ -4,16 +4,12 @@ Neither the commit nor the package's version would do alone: most commits change
 sources may have changes that are in no commit.
 """
 
-import json
 import subprocess
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 
 import panolog
-from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.info import fingerprint
-from panolog.workers.training.recipes import RECIPES
 
 _ROOT = Path(panolog.__file__).parent
 _PACKAGES = ("scene", "renderer", "partition", "workers", "orchestrator/engine/driver")
@@ -31,12 +27,6 @@ def present(root: Path = _ROOT) -> Code:
     """The code that a run would be trained with now. Args: root, the folder of the package."""
     sources = fingerprint(_PACKAGES, root)
     return Code(sources, _commit(root, sources))
-
-
-def recipes() -> str:
-    """A fingerprint of all settings of the recipes, hexadecimal: it changes with any of them."""
-    settings = {name: RunConfig.model_validate({"recipe": name}).model_dump(mode="json") for name in RECIPES}
-    return sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def _commit(root: Path, sources: str) -> str:

@@ -7,16 +7,23 @@ from pathlib import Path
 
 import jinja2
 
-from benchmarks.paper.code import recipes
 from benchmarks.paper.crops import Comparison
 from benchmarks.paper.curves import overlap_curve, quality_curve, standalone
 from benchmarks.paper.goals import table as goal_table
+from benchmarks.paper.runner import other_settings
 from benchmarks.paper.study import Study
 from benchmarks.paper.tables import csv_rows
+from benchmarks.paper.variants import flat, variants
 from benchmarks.report import cell
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.folder import write_json
+from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
+from panolog.workers.training.recipes import Recipe
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
+RECIPES_FILE = "recipes.json"
+FIRST_LINE = "<!-- Written by `python -m benchmarks.paper … --docs`: do not edit. -->"
 _METHOD = (
     "**Runs.** All are those of one command, on the same machine, one after another."
     " Metrics are means over the held-out panoramas, which no run trains on. Minutes are wall clock from the"
@@ -24,7 +31,9 @@ _METHOD = (
     " and without evaluation. Tasks run one at a time, each with all cores of the machine, so that seconds of"
     " Stage I and of a block compare. `on workers` has the longest block in place of Stage II: a simulation"
     " of as many such machines as blocks. Runs with the same Stage I share it, and count its seconds. A gain"
-    " is in WS-PSNR against the first row; what follows ± is the standard deviation over seeds."
+    " is in WS-PSNR against the first row; what follows ± is the standard deviation over seeds. `densified`"
+    " and `resets` say how often Gaussians were densified and opacities reset: their schedules scale with the"
+    " length of a run, down to least intervals."
 )
 _CURVES = (
     "**Curves.** All points of a line are states of one run on its way: its own checkpoints, evaluated after"
@@ -70,21 +79,36 @@ def markdown(studies: Sequence[Study], links: dict[str, str]) -> str:
 
 
 def write_docs(path: Path, studies: Sequence[Study]) -> None:
-    """Writes a page of the documentation from several studies, with its pictures in a folder next to it."""
+    """Writes a page of the documentation from several studies, with its pictures in a folder next to it.
+
+    That also has the settings of the recipes in them, recipes.json. Raises InputError if a result is of other
+    settings than its variant has now.
+    """
     folder = path.with_suffix("")
+    recipes = measured_recipes(studies)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / RECIPES_FILE, {name: flat(RunConfig(recipe=name)) for name in recipes})
     links = {}
     for number, study in enumerate(studies):
         for name, svg in pictures(study).items():
             own = f"{number}-{name}" if len(studies) > 1 else name
-            folder.mkdir(parents=True, exist_ok=True)
             write_bytes(folder / own, standalone(svg).encode())
             links[own] = f"{folder.name}/{own}"
-    write_bytes(path, (first_line() + "\n\n" + markdown(studies, links)).encode())
+    write_bytes(path, (FIRST_LINE + "\n\n" + markdown(studies, links)).encode())
 
 
-def first_line() -> str:
-    """The first line of docs/quality.md, which has the fingerprint of the recipes of today."""
-    return f"<!-- Written by `python -m benchmarks.paper … --docs` of recipes {recipes()}: do not edit. -->"
+def measured_recipes(studies: Sequence[Study]) -> list[Recipe]:
+    """The recipes of all results, in the order of the tables. Raises InputError as `write_docs`."""
+    found: dict[Recipe, None] = {}
+    for study in studies:
+        for result in study.results.all:
+            if result.failed:
+                continue
+            now = variants()[result.variant].config(study.settings, result.seed, result.iterations)
+            if changes := other_settings(result.settings, now):
+                raise InputError(f"{result.variant} of {result.scene} has {changes}: measure it again")
+            found[now["recipe"]] = None
+    return list(found)
 
 
 def page(study: Study, drawn: dict[str, str], comparisons: Sequence[Comparison]) -> str:

@@ -229,12 +229,14 @@ class Bench:
             notes.append(f"resumed ({drivers - 1}): work done twice counts twice")
         plan = read_plan(RunFolder(root).plan) if RunFolder(root).plan.exists() else None
         overlap, added = overlap_of(plan.assignment) if plan else (None, None)
+        densified, resets = turns(variant.resolved(self.settings, self.seed, length))
         result = Result(
             self.scene.name,
             variant.name,
             self.seed,
             iterations=length,
-            **turns(variant.resolved(self.settings, self.seed, length)),
+            densified=densified,
+            resets=resets,
             blocks=sum(block.train for block in replay(records).plan or ()),
             metrics={name: evaluation["mean"].get(name) for name in results.METRICS},
             gaussians=evaluation["gaussians"],
@@ -341,13 +343,11 @@ def other_settings(stored: dict[str, Any], config: dict[str, Any]) -> str:
     return ", ".join(changes)
 
 
-def turns(config: RunConfig) -> dict[str, tuple[int, ...]]:
-    """How often a run densifies and resets opacities: in Stage I and, if it refines, in each block."""
-    stages = [Schedule(config, config.iterations, 1.0, refine) for refine in range(1 + config.refine)]
-    return {
-        "densified": tuple(sum(map(stage.densifies, stage.turns())) for stage in stages),
-        "resets": tuple(sum(map(stage.resets, stage.turns())) for stage in stages),
-    }
+def turns(config: RunConfig) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """How often a run densifies, and how often it resets: in Stage I and, if it refines, in each block."""
+    stages = [Schedule(config, config.iterations, 1.0, bool(refine)) for refine in range(1 + config.refine)]
+    densified = tuple(sum(map(stage.densifies, stage.turns())) for stage in stages)
+    return densified, tuple(sum(map(stage.resets, stage.turns())) for stage in stages)
 
 
 def equal_plans(a: Plan, b: Plan) -> bool:

@@ -145,7 +145,8 @@ def groups() -> tuple[Group, ...]:
             "Blocks against Stage I alone",
             (
                 *("panolog-stage1", "blocks-2", "stage1-all-2", "stage1-time-2"),
-                *("blocks-4", "stage1-all-4", "stage1-time-4", "paper-stage1", "paper"),
+                *("blocks-4", "stage1-all-4", "stage1-time-4"),
+                *("paper-stage1", "paper", "authors-stage1", "authors"),
             ),
             note="`stage1-all` trains Stage I alone for as many iterations as Stage I and all blocks"
             " together, `stage1-time` for as long as Stage I, scoring and the longest block take on as many"

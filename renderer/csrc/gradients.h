@@ -4,9 +4,9 @@
 
 namespace panolog {
 
-// The gradients of one Gaussian. shN has 15 × 3 floats; only sh_count - 1 rows are written. `absolute`: sums over pixels
-// of the absolute values of the parts that each has in `screen`. `motion`, null or 6 values: its part in the gradient of
-// the camera's pose.
+// The gradients of one Gaussian. shN has 15 × 3 floats; only sh_count - 1 rows are written. `absolute`: sums over
+// pixels of the absolute values of the parts that each has in `screen`. `motion`, null or 6 values: its part in the
+// gradient of the camera's pose.
 template <class T>
 struct ParameterGradients {
   T *mean, *quat, *scale, *opacity, *sh0, *shN, *screen, *absolute, *motion;

@@ -166,9 +166,9 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
   SplatOf<F> s;
   SumsOf<F> sums;
   MotionSums motion;
-  const ParameterGradients<F> gradients = {
-      to.mean, to.quat, to.scale,  &to.opacity, to.sh0,
-      to.shN,  to.screen, to.absolute, out.motion ? to.motion : nullptr};
+  const ParameterGradients<F> gradients = {to.mean,     to.quat,     to.scale,
+                                           &to.opacity, to.sh0,      to.shN,
+                                           to.screen,   to.absolute, out.motion ? to.motion : nullptr};
   for (int64_t at = begin; at < end; at += kLanes) {
     const Rows rows = rows_from(at, end);
     alignas(64) float met[kLanes];

@@ -20,10 +20,7 @@ SPAN = 128  # Gaussians in a block of project.cu
 THREADS = 256  # in a block of all other kernels
 LANES = 8  # threads that share a splat in bin.cu
 SPLAT_FLOATS = 16  # sizeof(Splat) / 4 in csrc/formulas.h, and of RaySplat in csrc/rays.h
-GRADIENT_FLOATS = 10  # kGradientFloats in csrc/formulas.h
-ABSOLUTE_GRADIENT_FLOATS = 12  # kAbsoluteGradientFloats in csrc/formulas.h
-RAY_GRADIENT_FLOATS = 13  # kRayGradientFloats in csrc/rays.h
-_FLOATS = {"": GRADIENT_FLOATS, "_absolute": ABSOLUTE_GRADIENT_FLOATS, "_ray": RAY_GRADIENT_FLOATS}
+SUMS = {"": 10, "_absolute": 12, "_ray": 13}  # k…GradientFloats in csrc, by names of kernels
 MAX_PAIRS = 2**31 - 1  # of splats and tiles, counted in int32
 NARROW_TILES = 2**16  # below so many their numbers fit int16, which sorts in half the time
 NARROW_FIRST = -(2**15)  # the number of the first of them
@@ -267,7 +264,6 @@ def composite_backward(
     height: int,
     own: int,
     exterior: Exterior | None = None,
-    *,
     absolute: bool = False,
     **images: Tensor,
 ) -> Tensor:
@@ -276,7 +272,7 @@ def composite_backward(
     Args: images, contiguous: the three and their gradients.
     """
     kind = "_ray" if rays is not None else "_absolute" if absolute else ""
-    sums = splats.new_zeros(own, _FLOATS[kind])
+    sums = splats.new_zeros(own, SUMS[kind])
     launch(
         f"composite{kind}_backward",
         tiles_of(width, height),
@@ -311,10 +307,9 @@ def project_backward(
     is not finite; motion (N, 6), receives the parts of the Gaussians in the gradient of the camera's pose.
     """
     count = len(sums)
-    (kind,) = (kind for kind, floats in _FLOATS.items() if floats == sums.shape[1])
+    (kind,) = (kind for kind, floats in SUMS.items() if floats == sums.shape[1])
     out = {name: torch.empty_like(tensor) for name, tensor in parameters.items()}
-    for name in ("screen", "absolute") if kind == "_absolute" else ("screen",):
-        out[name] = splats.new_empty(count, 2)
+    out |= {name: splats.new_empty(count, 2) for name in ("screen", "absolute")[: 1 + (kind == "_absolute")]}
     launch(
         f"project{kind}_backward",
         (math.ceil(count / SPAN), 1),

@@ -119,8 +119,8 @@ class DensifyConfig(Group):
     split_gradient: float = Field(
         default=0.0,
         ge=0,
-        description="the same of absolute gradients, of single pixels and without their signs, above which large"
-        " Gaussians are split; 4e-4 by AbsGS (Ye et al. 2024); 0 = by `gradient`, 3DGS",
+        description="the same of absolute gradients, sums over pixels without their signs, above which large"
+        " Gaussians are split; AbsGS (Ye et al. 2024) has 4e-4; 0 = by `gradient`, 3DGS",
     )
     least_opacity: float = Field(
         default=0.0, ge=0, lt=1, description="opacity below which none are cloned or split; 0 = all may, 3DGS"

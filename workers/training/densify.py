@@ -34,21 +34,17 @@ class Statistics:
     @staticmethod
     def zeros(count: int, device: torch.device | str, config: DensifyConfig) -> "Statistics":
         """Before the first view."""
-        made = {
-            "gradient": True,
-            "views": True,
-            "absolute": config.split_gradient,
-            "radius": config.prune_footprint,
-        }
-        return Statistics(
-            **{n: torch.zeros(count, device=device) for n, used in made.items() if used}, config=config
-        )
+        gradient, views = (torch.zeros(count, device=device) for _ in range(2))
+        needed = config.split_gradient > 0, config.prune_footprint > 0
+        absolute, radius = (torch.zeros(count, device=device) if need else None for need in needed)
+        return Statistics(gradient, views, config, absolute, radius)
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor], config: DensifyConfig) -> "Statistics":
         """The inverse of `tensors`."""
-        found = {n.removeprefix(STATISTICS): it for n, it in tensors.items() if n.startswith(STATISTICS)}
-        return Statistics(**found, config=config)
+        gradient, views = (tensors[f"{STATISTICS}{name}"] for name in ("gradient", "views"))
+        absolute, radius = (tensors.get(f"{STATISTICS}{name}") for name in ("absolute", "radius"))
+        return Statistics(gradient, views, config, absolute, radius)
 
     def tensors(self) -> dict[str, Tensor]:
         """By name, for checkpoints, sharing memory."""
@@ -82,7 +78,7 @@ class Statistics:
         weight = torch.where(seen & (lengths[0] > 0), 1 / squared, 0) if contribution else seen
         for total, length in zip((self.gradient, self.absolute), lengths, strict=False):
             if total is not None:
-                total += torch.where(weight > 0, length * weight, 0)
+                total.add_(torch.where(weight > 0, length * weight, 0))
         self.views += weight
         if self.radius is not None:
             self.radius = torch.where(seen, torch.maximum(self.radius, radii(splats[:count])), self.radius)
@@ -91,11 +87,10 @@ class Statistics:
         """(S,) mean over the views that saw the Gaussian, 0 for none."""
         return self._mean(self.gradient)
 
-    def splitting(self) -> tuple[Tensor, float]:
-        """(S,) mean by which large Gaussians are split, and the least that is."""
-        if self.absolute is None:
-            return self.mean(), self.config.gradient
-        return self._mean(self.absolute), self.config.split_gradient
+    def mean_absolute(self) -> Tensor:
+        """(S,) the same of absolute gradients; the config must need them."""
+        assert self.absolute is not None
+        return self._mean(self.absolute)
 
     def _mean(self, total: Tensor) -> Tensor:
         return total / self.views.clamp(min=torch.finfo(torch.float32).tiny)
@@ -132,7 +127,7 @@ def densify(
 ) -> None:
     """Clone small and split large Gaussians with large screen gradients, prune transparent ones (3DGS).
 
-    Both are measured by the config of the statistics. New Gaussians start with zero moments. The rows of the statistics no longer match afterwards.
+    New Gaussians start with zero moments. The rows of the statistics no longer match afterwards.
 
     Args: statistics of the scene Gaussians; extent in world units, or (S,) one for each of them, that
     `percent_dense` is a fraction of; random for the split positions; footprint, the largest radius in pixels,
@@ -189,8 +184,11 @@ def _sources(
         removed |= statistics.radius > footprint
     bound = np.log(config.percent_dense * np.asarray(extent, np.float64)).astype(np.float32)
     large = gaussians.scales[scene].amax(1) > torch.from_numpy(np.asarray(bound)).to(gaussians.scales.device)
-    gradient, (split, least) = statistics.mean(), statistics.splitting()
-    selected = torch.where(large, split >= least, gradient >= config.gradient) & ~removed
+    gradient = statistics.mean()
+    chosen = gradient >= config.gradient
+    if config.split_gradient > 0:
+        chosen = torch.where(large, statistics.mean_absolute() >= config.split_gradient, chosen)
+    selected = chosen & ~removed
     if config.least_opacity > 0:
         selected &= gaussians.opacities[scene] > logit(config.least_opacity)
     selected = _within_cap(selected, gradient, config.max_gaussians, int((~removed).sum()))

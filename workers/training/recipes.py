@@ -1,8 +1,8 @@
 """Recipes: presets of ordinary settings. A run's own settings win over those of its recipe.
 
 `paper` is the paper to the letter, and 3DGS where it is silent: each setting's own default. `authors` is what
-the authors' public code does, which differs from their text (docs/fidelity.md). `panolog` changes what has proven better: `python -m benchmarks.paper` measures each change alone
-and with the rest (docs/quality.md).
+the authors' public code does, which differs from their text (docs/fidelity.md). `panolog` changes what has
+proven better: `python -m benchmarks.paper` measures each change alone and with the rest (docs/quality.md).
 They are separate from the settings because they cover those of the whole run.
 """
 

@@ -56,7 +56,7 @@ struct AffineView {
     float e, dy;
     float alpha;  // 0 where the pair does not count
   };
-  static constexpr bool kWraps = true;  // a tile may see two images of a splat
+  static constexpr bool kWraps = true;                       // a tile may see two images of a splat
   static constexpr int kSums = kGradientFloats, kLight = 6;  // the first of the colours in them
 
   const Splat* splats;

@@ -1,6 +1,8 @@
 """Tables, goals and pages as functions of results."""
 
 import csv
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +13,16 @@ from benchmarks.paper import goals, pages
 from benchmarks.paper.crops import Comparison, Crop
 from benchmarks.paper.reference import published
 from benchmarks.paper.results import Point, Result, Results, load, save
+from benchmarks.paper.runner import other_settings, turns
 from benchmarks.paper.study import Study
 from benchmarks.paper.study import load as load_study
 from benchmarks.paper.tables import HEAD, TAUS, Overlap, Table, main_tables, overlap_of, overlap_table
-from benchmarks.paper.variants import Settings
+from benchmarks.paper.variants import Settings, flat, variants
 from benchmarks.report import markdown
+from panolog.orchestrator.runs.config import RunConfig
 from panolog.partition.assignment import Assignment
 from panolog.scene.errors import InputError
+from panolog.workers.training.recipes import RECIPES
 from tests.benchmarks.paper.made import result
 
 RUNS = (
@@ -118,8 +123,9 @@ def test_the_time_at_a_level_is_between_two_states() -> None:
 
 
 def test_results_survive_the_disk(tmp_path: Path) -> None:
-    save(tmp_path / "a.json", RUNS[0])
-    assert (load(tmp_path / "a.json"), load(tmp_path / "b.json")) == (RUNS[0], None)
+    counted = replace(RUNS[0], densified=(28, 28), resets=(2, 2))
+    save(tmp_path / "a.json", counted)
+    assert (load(tmp_path / "a.json"), load(tmp_path / "b.json")) == (counted, None)
     study().save(tmp_path)
     assert load_study(tmp_path).results.all == list(RUNS)
     with pytest.raises(InputError, match="holds no results"):
@@ -156,5 +162,45 @@ def test_markdown_keeps_columns_aligned() -> None:
 
 def test_the_page_of_the_documentation_has_measured_the_recipes_of_today() -> None:
     """Else `python -m benchmarks.paper` has to measure them again: the page says with which options."""
-    page = Path(__file__).parents[3] / "docs" / "quality.md"
-    assert page.read_text().partition("\n")[0] == pages.first_line()
+    docs = Path(__file__).parents[3] / "docs"
+    page = (docs / "quality.md").read_text()
+    stored = json.loads((docs / "quality" / pages.RECIPES_FILE).read_bytes())
+    assert page.partition("\n")[0] == pages.FIRST_LINE
+    assert [name for name in RECIPES if f"\n| {name} " in page] == list(stored)
+    assert {
+        name: other_settings(stored[name], flat(RunConfig(recipe=name))) for name in stored
+    } == dict.fromkeys(stored, "")
+
+
+def test_a_page_has_the_settings_of_its_recipes_and_no_results_of_others(tmp_path: Path) -> None:
+    settings = study().settings
+    runs = [
+        result(name, 24.0, settings=variants()[name].config(settings, 0, 600))
+        for name in ("paper", "authors-stage1")
+    ]
+    pages.write_docs(tmp_path / "quality.md", [replace(study(), results=Results(runs))])
+    stored = json.loads((tmp_path / "quality" / pages.RECIPES_FILE).read_bytes())
+    assert {name: found["stage2.scale"] for name, found in stored.items()} == {"paper": 1.0, "authors": 0.4}
+    older = replace(runs[0], settings=runs[0].settings | {"densify.gradient": 1e-4})
+    with pytest.raises(
+        InputError, match=r"paper of street has densify.gradient = 0.0001, not 0.0002: measure"
+    ):
+        pages.write_docs(tmp_path / "quality.md", [replace(study(), results=Results([older]))])
+
+
+def test_rows_say_how_often_a_run_densified_and_reset() -> None:
+    settings = study().settings
+    rows = {}
+    for name in ("paper", "panolog", "paper-stage1"):
+        densified, resets = turns(variants()[name].resolved(settings, 0, 30_000))
+        blocks = 0 if "stage1" in name else 2
+        found = result(name, 24.0, blocks=blocks, densified=densified, resets=resets)
+        (shown,) = main_tables(Results([found]), ["stage1" if "stage1" in name else "main"], [Path("street")])
+        rows[name] = tuple(row(shown, name)[key] for key in ("densified", "resets"))
+    assert rows == {
+        "paper": ("144 + 2 × 144", "4 + 2 × 4"),
+        "panolog": ("234 + 2 × 234", "0 + 2 × 0"),
+        "paper-stage1": ("144", "4"),
+    }
+    (main,) = main_tables(Results([result("paper", 24.0)]), ["main"], [Path("street")])
+    assert row(main, "paper")["resets"] is None  # of a result of before it was recorded

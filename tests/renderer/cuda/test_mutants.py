@@ -84,8 +84,7 @@ def one_projection(launch: EmulatedLaunch, exact: bool) -> None:
         projected = parts.project(launch, parameters, torch.zeros(len(gaussians), 2), pose, 3, angles)
         pairs = parts.list_pairs(launch, projected, at.width, at.height)
         parts.list_pairs(launch, projected, at.width, at.height, room=len(pairs.entries) // 2)
-        floats = parts.RAY_GRADIENT_FLOATS if exact else parts.GRADIENT_FLOATS
-        sums = torch.full((len(gaussians), floats), torch.inf)
+        sums = torch.full((len(gaussians), parts.SUMS["_ray" if exact else ""]), torch.inf)
         status = torch.zeros(1, dtype=torch.int32)
         counts = projected.tile_counts
         parts.project_backward(launch, parameters, pose, 3, projected.splats, counts, sums, status)

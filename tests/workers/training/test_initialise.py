@@ -21,12 +21,14 @@ from panolog.workers.training.initialise import (
     SCALE_MAX,
     SH_C0,
     camera_extent,
+    first_model,
     near_distance,
     points_of,
     scene_gaussians,
     scene_length,
     sky_gaussians,
 )
+from panolog.workers.training.surfaces import NO_POINTS
 from tests.on_device import view_on_device
 from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH
 
@@ -123,6 +125,19 @@ def test_sky_lies_on_its_sphere_without_holes(scene: Scene) -> None:
     nearest = np.arccos(cosines.max(1))
     assert nearest.min() > 0.5 * math.sqrt(4 * math.pi / 500)
     assert np.allclose(directions.mean(0), 0, atol=1e-3)
+
+
+def test_what_training_begins_with_may_be_fainter_and_its_sky_blurred(scene: Scene) -> None:
+    config = TrainConfig.model_validate({"initial_opacity": 0.01, "sky": {"count": 60, "size": 3.0}})
+    usual, found = (
+        first_model(scene, given, np.arange(len(scene.points)), NO_POINTS, scene.train, 10**6, lambda _: None)
+        for given in (TrainConfig(sky=SkyConfig(count=60)), config)
+    )
+    at = usual.scene
+    assert torch.allclose(usual.opacities[at].sigmoid(), torch.tensor(0.1))
+    assert torch.allclose(found.opacities[at].sigmoid(), torch.tensor(0.01))
+    larger = found.scales.exp() / usual.scales.exp()
+    assert torch.allclose(larger[at], torch.tensor(1.0)) and torch.allclose(larger[-60:], torch.tensor(3.0))
 
 
 def test_the_exposures_of_panoramas_are_not_in_the_sky(scene: Scene) -> None:

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from panolog.orchestrator.runs.config import RunConfig
 from panolog.scene.random_streams import generator
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.schedule import Schedule, epoch
@@ -91,6 +92,16 @@ def test_a_block_may_continue_at_the_rates_at_which_stage_one_ended() -> None:
     others = ("quats", "scales", "opacities", "sh0", "shN")
     assert all(block.rates(7)[name] == coarse.rates(7)[name] / 2 for name in others)
     assert schedule(1_500, refine=True).rates(7) == coarse.rates(7)
+
+
+def test_the_authors_refine_at_rates_of_their_own() -> None:
+    """Of positions and scales; what is not raised at the end stays."""
+    config = RunConfig(recipe="authors")
+    coarse, block = (Schedule(config, 30_000, 1.0, refine) for refine in (False, True))
+    assert (coarse.rates(0)["means"], block.rates(0)["means"]) == pytest.approx((1.6e-4, 6.4e-5))
+    assert block.rates(1) | {"means": 0} == coarse.rates(1) | {"means": 0, "scales": pytest.approx(2e-3)}
+    assert coarse.resets(3000) and not coarse.drops_unrisen
+    assert coarse.depth_weight(1) == 0
 
 
 def test_a_block_may_have_a_budget_and_a_decay_of_its_own() -> None:
