@@ -89,7 +89,9 @@ def save(path: Path, result: Result) -> None:
 def from_json(stored: dict[str, Any]) -> Result:
     """The inverse of `dataclasses.asdict`."""
     curve = tuple(Point(**point) for point in stored["curve"])
-    lists = {key: tuple(stored[key]) for key in ("notes", "densified", "resets") if key in stored}
+    lists: dict[str, Any] = {
+        key: tuple(stored[key]) for key in ("notes", "densified", "resets") if key in stored
+    }
     return Result(**{**stored, **lists, "curve": curve})
 
 

@@ -70,10 +70,10 @@ class Statistics:
             y, squared = _from_camera(means[:count], camera)
             if angle:
                 vertical = camera.height * torch.sqrt((1 - y * y / squared).clamp(min=0))
-        seen, horizontal = visible[:count], camera.width / 2
+        seen, horizontal, columns = visible[:count], camera.width / 2, screen_gradient[:count].unbind(1)
         lengths = [
-            torch.sqrt((pair[:, 0] * horizontal) ** 2 + (pair[:, 1] * vertical) ** 2)
-            for pair in screen_gradient[:count].split(2, 1)
+            torch.sqrt((du * horizontal) ** 2 + (dv * vertical) ** 2)
+            for du, dv in zip(columns[::2], columns[1::2], strict=True)
         ]
         weight = torch.where(seen & (lengths[0] > 0), 1 / squared, 0) if contribution else seen
         for total, length in zip((self.gradient, self.absolute), lengths, strict=False):
