@@ -11,7 +11,6 @@ from torch import Tensor
 from panolog.renderer import ops
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
-from panolog.renderer.cuda.parts import SPLAT_FLOATS
 from panolog.renderer.motion import MOTION_SUMS
 from panolog.scene.gaussians import Gaussians
 
@@ -29,7 +28,6 @@ class Render(NamedTuple):
         Tensor  # (N,) bool: its footprint overlaps the image, hidden by others or not (radii > 0 of 3DGS)
     )
     invalid: Tensor  # (N,) bool: not drawn: not finite, out of the range of float32, or without rotation
-    splats: Tensor  # (N, 16) Splat of csrc/formulas.h, where visible
 
 
 def render(
@@ -77,7 +75,7 @@ def render(
     if motion is not None and (motion.shape != (MOTION_SUMS,) or motion.dtype != torch.float64):
         raise ValueError(f"motion is {motion.dtype} {tuple(motion.shape)}, must be float64 ({MOTION_SUMS},)")
     _check_camera(camera)
-    color, alpha, inverse_depth, state, splats, *_ = ops.rasterize(
+    color, alpha, inverse_depth, state, *_ = ops.rasterize(
         **gaussians.tensors(),
         screen=screen,
         rotation=camera.rotation,
@@ -90,8 +88,7 @@ def render(
         exterior=[] if exterior is None else exterior.arrays(),
         motion=motion,
     )
-    seen = state == ops.VISIBLE, state == ops.INVALID
-    return Render(color, alpha, inverse_depth, *seen, splats.view(-1, SPLAT_FLOATS)[:count])
+    return Render(color, alpha, inverse_depth, visible=state == ops.VISIBLE, invalid=state == ops.INVALID)
 
 
 def _check_camera(camera: Camera) -> None:

@@ -54,7 +54,6 @@ class Found(NamedTuple):
     """What an iteration found; on the device."""
 
     gradients: dict[str, Tensor]  # shaped as the parameters; `screen` (N, 2) per pixel, and `absolute`
-    splats: Tensor  # (16 N,) or more, Splat in csrc/formulas.h
     state: Tensor  # (N,) uint8, State in csrc/formulas.h
     report: Tensor  # (4,) float64, or (4 + 27,)
     color: Tensor  # (H, W, 3) rendered
@@ -120,7 +119,7 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         report=report,
     )
     whole = with_motion(launch, report, motion)
-    return Found(found, splats, projected.state, whole, color, inverse_depth, by_exposure)
+    return Found(found, projected.state, whole, color, inverse_depth, by_exposure)
 
 
 def _depth_loss(
@@ -143,14 +142,12 @@ def add_statistics(
     views: Tensor,
     *,
     absolute: Tensor | None = None,
-    radius: Tensor | None = None,
     angle: bool = False,
     contribution: bool = False,
 ) -> None:
     """As `workers.training.densify.Statistics.add`: one view on the first S rows; none if status is not 0.
 
-    Args: gradient, views, absolute and radius (S,) float32, changed in place; how lengths and views are
-    measured.
+    Args: gradient, views and absolute (S,) float32, changed in place; how lengths and views are measured.
     """
     count, at = len(gradient), problem.camera
     size = (at.width, at.height)
@@ -161,7 +158,6 @@ def add_statistics(
         count=count,
         screen=found.gradients["screen"],
         absolute=found.gradients.get("absolute"),
-        splats=found.splats,
         state=found.state,
         means=problem.model["means"],
         camera=parts.camera_struct(at.rotation, at.translation, *size, problem.near, problem.exact),
@@ -171,5 +167,4 @@ def add_statistics(
         gradient=gradient,
         views=views,
         absolute_sum=absolute,
-        radius=radius,
     )

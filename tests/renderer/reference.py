@@ -213,7 +213,6 @@ def blended(projected: Projected, alpha: Tensor, rows: Tensor, invalid: Tensor) 
         torch.einsum("nhw,n->hw", weight, 1 / projected.distance),
         visible,
         invalid,
-        torch.empty(0),
     )
 
 

@@ -58,7 +58,7 @@ def test_where_nothing_would_grow_nothing_does(tmp_path: Path) -> None:
 
 def test_growth_does_not_depend_on_who_would_densify(tmp_path: Path) -> None:
     """Opaque ones, or those with large absolute gradients: here none."""
-    densify = DensifyConfig(least_opacity=0.9, split_gradient=1e9, prune_footprint=20)
+    densify = DensifyConfig(least_opacity=0.9, split_gradient=1e9)
     config = TrainConfig(sky=SkyConfig(count=50), densify=densify)
     *_, found = calibrate(spec_of(small_scene(tmp_path), config=config, seconds=10.0))
     assert isinstance(found, Calibration) and found.grown.gaussians > 400

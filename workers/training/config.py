@@ -139,11 +139,6 @@ class DensifyConfig(Group):
         default=0.005, ge=0, lt=1, description="opacity below which they are removed, o_min of eq. 12; 3DGS"
     )
     prune_scale: float = Field(default=0.1, ge=0, description="largest scale, in extents, 0 = any; 3DGS")
-    prune_footprint: float = Field(
-        default=0.0,
-        ge=0,
-        description="largest radius in a panorama since the last densification, three sigma, pixels; 0 = any",
-    )
     max_gaussians: int = Field(
         default=0,
         ge=0,
@@ -362,9 +357,8 @@ class TrainConfig(CaptureConfig):
 
     @model_validator(mode="after")
     def _measurable(self) -> "TrainConfig":
-        if self.projection == "exact" and (self.densify.split_gradient or self.densify.prune_footprint):
+        if self.projection == "exact" and self.densify.split_gradient > 0:
             raise ValueError(
-                "densify.split_gradient and densify.prune_footprint measure affine splats:"
-                " set them to 0, or projection to affine"
+                "densify.split_gradient is of affine splats: set it to 0, or projection to affine"
             )
         return self

@@ -29,30 +29,24 @@ class Statistics:
     views: Tensor  # (S,) sum of the weights of the views that saw each
     config: DensifyConfig  # how lengths and weights are measured
     absolute: Tensor | None = None  # (S,) as `gradient`, of absolute gradients; where the config needs them
-    radius: Tensor | None = None  # (S,) the largest, pixels; where the config needs it
 
     @staticmethod
     def zeros(count: int, device: torch.device | str, config: DensifyConfig) -> "Statistics":
         """Before the first view."""
-        gradient, views = (torch.zeros(count, device=device) for _ in range(2))
-        needed = config.split_gradient > 0, config.prune_footprint > 0
-        absolute, radius = (torch.zeros(count, device=device) if need else None for need in needed)
-        return Statistics(gradient, views, config, absolute, radius)
+        gradient, views, absolute = (torch.zeros(count, device=device) for _ in range(3))
+        return Statistics(gradient, views, config, absolute if config.split_gradient > 0 else None)
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor], config: DensifyConfig) -> "Statistics":
         """The inverse of `tensors`."""
         gradient, views = (tensors[f"{STATISTICS}{name}"] for name in ("gradient", "views"))
-        absolute, radius = (tensors.get(f"{STATISTICS}{name}") for name in ("absolute", "radius"))
-        return Statistics(gradient, views, config, absolute, radius)
+        return Statistics(gradient, views, config, tensors.get(f"{STATISTICS}absolute"))
 
     def tensors(self) -> dict[str, Tensor]:
         """By name, for checkpoints, sharing memory."""
         return {f"{STATISTICS}{name}": it for name, it in vars(self).items() if isinstance(it, Tensor)}
 
-    def add(
-        self, screen_gradient: Tensor, visible: Tensor, means: Tensor, camera: Camera, splats: Tensor
-    ) -> None:
+    def add(self, screen_gradient: Tensor, visible: Tensor, means: Tensor, camera: Camera) -> None:
         """Add one view; sky rows are ignored. A card does it in `iteration_statistics` of csrc/cuda.
 
         The length is that of (∂L/∂u · W/2, ∂L/∂v · H/2), as 3DGS has it in normalised device coordinates.
@@ -61,7 +55,7 @@ class Statistics:
         weight is 1, or by contribution 1 / r², as its solid angle, and 0 where nothing of it is seen.
 
         Args: screen_gradient (N, 2) ∂L/∂(u, v) per pixel, and absolute gradients in two columns more, where
-        these count; visible (N,), means (N, 3); splats (N, 16) as rendered.
+        these count; visible (N,), means (N, 3).
         """
         count = len(self.gradient)
         vertical: Tensor | float = camera.height / 2
@@ -80,8 +74,6 @@ class Statistics:
             if total is not None:
                 total.add_(torch.where(weight > 0, length * weight, 0))
         self.views += weight
-        if self.radius is not None:
-            self.radius = torch.where(seen, torch.maximum(self.radius, radii(splats[:count])), self.radius)
 
     def mean(self) -> Tensor:
         """(S,) mean over the views that saw the Gaussian, 0 for none."""
@@ -94,16 +86,6 @@ class Statistics:
 
     def _mean(self, total: Tensor) -> Tensor:
         return total / self.views.clamp(min=torch.finfo(torch.float32).tiny)
-
-
-def radii(splats: Tensor) -> Tensor:
-    """(S,) three deviations of affine splats (S, 16) along their longest axes, pixels (3DGS)."""
-    a, slope, c = splats[:, 2], splats[:, 3], splats[:, 4]  # Splat of csrc/formulas.h
-    var_v, narrow = (-0.5 * math.log2(math.e) / of for of in (c, a))
-    covariance = slope * var_v
-    var_u = narrow + slope * covariance
-    apart = torch.sqrt(((var_u - var_v) / 2) ** 2 + covariance**2)
-    return 3 * torch.sqrt((var_u + var_v) / 2 + apart)
 
 
 def _from_camera(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -123,17 +105,15 @@ def densify(
     config: DensifyConfig,
     extent: float | NDArray[np.float64],
     random: np.random.Generator,
-    footprint: float = 0,
 ) -> None:
     """Clone small and split large Gaussians with large screen gradients, prune transparent ones (3DGS).
 
     New Gaussians start with zero moments. The rows of the statistics no longer match afterwards.
 
     Args: statistics of the scene Gaussians; extent in world units, or (S,) one for each of them, that
-    `percent_dense` is a fraction of; random for the split positions; footprint, the largest radius in pixels,
-    0 = any.
+    `percent_dense` is a fraction of; random for the split positions.
     """
-    kept, clones, splits, sky = _sources(state.gaussians, statistics, config, extent, footprint)
+    kept, clones, splits, sky = _sources(state.gaussians, statistics, config, extent)
     source = torch.cat([kept, clones, splits, sky])
     new = torch.zeros(len(source), dtype=torch.bool, device=kept.device)
     new[len(kept) : len(source) - len(sky)] = True
@@ -174,14 +154,11 @@ def _sources(
     statistics: Statistics,
     config: DensifyConfig,
     extent: float | NDArray[np.float64],
-    footprint: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rows int64 that stay, that are cloned, that are split (twice each), and of the sky."""
     scene = gaussians.scene
     # compared as logits: the rounding of a vectorised sigmoid depends on how threads divide the rows
     removed = gaussians.opacities[scene] < logit(config.prune_opacity)
-    if footprint > 0 and statistics.radius is not None:
-        removed |= statistics.radius > footprint
     bound = np.log(config.percent_dense * np.asarray(extent, np.float64)).astype(np.float32)
     large = gaussians.scales[scene].amax(1) > torch.from_numpy(np.asarray(bound)).to(gaussians.scales.device)
     gradient = statistics.mean()

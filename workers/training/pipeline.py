@@ -84,8 +84,7 @@ class Direct:
         except FloatingPointError as error:
             raise self._broken(str(error), plan) from error
         if plan.statistics is not None and screen is not None and screen.grad is not None:
-            means, splats = leaves.means.detach(), rendered.splats
-            plan.statistics.add(screen.grad, rendered.visible, means, problem.camera, splats)
+            plan.statistics.add(screen.grad, rendered.visible, leaves.means.detach(), problem.camera)
         if plan.learning is not None:
             observed = Observed(
                 view=plan.view,
@@ -185,7 +184,6 @@ class Pipeline:
                 into.gradient,
                 into.views,
                 absolute=into.absolute,
-                radius=into.radius,
                 angle=into.config.measure == "angle",
                 contribution=into.config.views == "contribution",
             )

@@ -24,7 +24,6 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "densify.split_gradient": 4e-4,
         "densify.least_opacity": 0.15,
         "densify.prune_scale": 0.0,
-        "densify.prune_footprint": 20.0,
         "reset.unrisen": "kept",
         "stage2.position": 0.4,  # 6.4e-5
         "stage2.scale": 0.4,  # 2e-3

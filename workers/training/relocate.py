@@ -77,9 +77,8 @@ def grow(
             means = state.gaussians.means[state.gaussians.scene]
             apart = config.large == "distance"
             extent = camera_distances(means, place.centers) if apart else schedule.extent
-            prunes = schedule.prunes_large(iteration)
-            densify(state, statistics, config, extent, random, config.prune_footprint if prunes else 0)
-            if prunes and config.prune_scale > 0:
+            densify(state, statistics, config, extent, random)
+            if schedule.prunes_large(iteration):
                 drop_large(state, config.prune_scale * schedule.extent)
         case "relocate":
             target = schedule.budget(iteration, place.start, place.pixels)

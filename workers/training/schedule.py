@@ -76,8 +76,8 @@ class Schedule:
 
     def prunes_large(self, iteration: int) -> bool:
         """Whether densification removes large Gaussians: when the first reset has been due (3DGS)."""
-        reset = self.config.reset
-        return iteration > self.interval(reset.every, reset.every_floor)
+        reset, scale = self.config.reset, self.config.densify.prune_scale
+        return scale > 0 and iteration > self.interval(reset.every, reset.every_floor)
 
     def turns(self) -> list[int]:
         """The iterations after which Gaussians may densify or opacities be reset, and no others."""

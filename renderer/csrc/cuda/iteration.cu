@@ -7,13 +7,6 @@ namespace {
 
 __device__ __forceinline__ bool is_finite(double value) { return 0 * value == 0; }
 
-// Three deviations of an affine splat along its longest axis, pixels (3DGS).
-__device__ __forceinline__ float radius_of(const Splat& s) {
-  const float var_v = -0.5f * kLog2E / s.c, narrow = -0.5f * kLog2E / s.a, cov = s.slope * var_v;
-  const float var_u = narrow + s.slope * cov, mean = 0.5f * (var_u + var_v), apart = 0.5f * (var_u - var_v);
-  return 3 * sqrtf(mean + sqrtf(apart * apart + cov * cov));
-}
-
 }  // namespace
 }  // namespace panolog
 
@@ -41,13 +34,12 @@ extern "C" __global__ void __launch_bounds__(32)
 }
 
 // Adds one view to the first `count` rows of the statistics, unless status (1) is not 0. `angle`: lengths in half turns
-// on the sphere, not in half images; `contribution`: views weigh as the solid angle of what they see. The sums of
-// `absolute` gradients (N, 2) and the largest radii of affine splats may be null.
+// on the sphere, not in half images; `contribution`: views weigh as the solid angle of what they see.
+// `absolute` gradients (N, 2) and their sums may be null.
 extern "C" __global__ void __launch_bounds__(256)
-    iteration_statistics(int64_t count, const float* screen, const float* absolute, const panolog::Splat* splats,
-                         const uint8_t* state, const float* means, panolog::Camera camera, int64_t angle,
-                         int64_t contribution, const int32_t* status, float* gradient, float* views,
-                         float* absolute_sum, float* radius) {
+    iteration_statistics(int64_t count, const float* screen, const float* absolute, const uint8_t* state,
+                         const float* means, panolog::Camera camera, int64_t angle, int64_t contribution,
+                         const int32_t* status, float* gradient, float* views, float* absolute_sum) {
   const int64_t i = panolog::thread_of_grid();
   if (i >= count || *status || state[i] != panolog::kVisible) return;
   float vertical = 0.5f * camera.height, weight = 1;
@@ -65,7 +57,6 @@ extern "C" __global__ void __launch_bounds__(256)
     const float du = at[2 * i] * (0.5f * camera.width), dv = at[2 * i + 1] * vertical;
     return sqrtf(du * du + dv * dv);
   };
-  if (radius) radius[i] = fmaxf(radius[i], panolog::radius_of(splats[i]));
   const float length = length_of(screen);
   if (contribution && !(length > 0)) return;
   gradient[i] += weight * length;

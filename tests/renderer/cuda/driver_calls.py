@@ -124,10 +124,8 @@ def every_kernel(launch: Checked) -> None:
         )
         with mock.patch.object(parts, "NARROW_TILES", narrow):
             found = iteration.gradients(launch, problem, status, room)
-        into, more = [torch.zeros(30), torch.zeros(30)], [torch.zeros(30) if absolute else None] * 2
-        iteration.add_statistics(
-            launch, found, status, problem, *into, absolute=more[0], radius=more[1], angle=full
-        )
+        into, more = [torch.zeros(30), torch.zeros(30)], torch.zeros(30) if absolute else None
+        iteration.add_statistics(launch, found, status, problem, *into, absolute=more, angle=full)
         gradient = found.gradients["means"]
         updates = [parts.Update(gradient, scene.means, moments[0], moments[1], 30, 0.125)]
         parts.adam_step(launch, updates * (1 + full), 0.9, 0.999, 1e-15, 3, status if full else None)

@@ -1,7 +1,6 @@
 """What the emulation is for: kernels broken on purpose are found, each by name."""
 
 import functools
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -109,13 +108,6 @@ def adam(launch: EmulatedLaunch) -> None:
     assert torch.equal(parameter, before)  # no step after a fault
 
 
-def round_splats(count: int) -> torch.Tensor:
-    """Of two pixels' deviation."""
-    splats = torch.zeros(count, parts.SPLAT_FLOATS)
-    splats[:, [2, 4]] = -0.5 * math.log2(math.e) / 2**2
-    return splats
-
-
 def iteration(launch: EmulatedLaunch) -> None:
     one, status = torch.ones((), dtype=torch.float64), torch.zeros(1, dtype=torch.int32)
     report = torch.zeros(4, dtype=torch.float64)
@@ -137,7 +129,7 @@ def iteration(launch: EmulatedLaunch) -> None:
         report=report,
     )
     assert torch.allclose(report, torch.tensor([1.3, 1, 7, 0], dtype=torch.float64))
-    gradient, views, absolute, radius = torch.zeros(4, 300)
+    gradient, views, absolute = torch.zeros(3, 300)
     for broken in (0, 1):  # nothing is added after a fault
         launch(
             "iteration_statistics",
@@ -146,7 +138,6 @@ def iteration(launch: EmulatedLaunch) -> None:
             count=300,
             screen=torch.ones(300, 2),
             absolute=2 * torch.ones(300, 2),
-            splats=round_splats(300),
             state=torch.full((300,), ops.VISIBLE, dtype=torch.uint8),
             means=torch.ones(300, 3),
             camera=parts.camera_struct(torch.eye(3), torch.zeros(3), 6, 8, 0.0, False),
@@ -156,10 +147,9 @@ def iteration(launch: EmulatedLaunch) -> None:
             gradient=gradient,
             views=views,
             absolute_sum=absolute,
-            radius=radius,
         )
         assert (gradient == 5).all() and (views == 1).all()
-        assert (absolute == 10).all() and torch.allclose(radius, torch.full((300,), 6.0))
+        assert (absolute == 10).all()
 
 
 EXERCISES: dict[str, Callable[[EmulatedLaunch], None]] = {

@@ -18,12 +18,9 @@ def test_unknown_and_impossible_settings_are_refused(wrong: dict[str, object]) -
         TrainConfig.model_validate(wrong)
 
 
-@pytest.mark.parametrize("name", ["split_gradient", "prune_footprint"])
-def test_what_measures_affine_splats_needs_them(name: str) -> None:
-    with pytest.raises(
-        ValidationError, match="measure affine splats: set them to 0, or projection to affine"
-    ):
-        TrainConfig.model_validate({"projection": "exact", "densify": {name: 20}})
+def test_absolute_gradients_are_of_affine_splats() -> None:
+    with pytest.raises(ValidationError, match="of affine splats: set it to 0, or projection to affine"):
+        TrainConfig.model_validate({"projection": "exact", "densify": {"split_gradient": 4e-4}})
 
 
 def test_every_field_is_described() -> None:

@@ -10,7 +10,7 @@ import torch
 
 from panolog.renderer import ops
 from panolog.renderer.camera import Camera
-from panolog.renderer.cuda import iteration, parts
+from panolog.renderer.cuda import iteration
 from panolog.renderer.cuda.iteration import Found, Problem
 from panolog.renderer.render import render
 from panolog.scene.gaussians import logit
@@ -20,17 +20,13 @@ from panolog.workers.training.densify import (
     camera_distances,
     densify,
     drop_large,
-    radii,
     rate_units,
     reset_opacities,
 )
 from panolog.workers.training.initialise import isotropic
 from panolog.workers.training.optimizer import ModelState, finite_loss
 from panolog.workers.training.schedule import FULL_RUN, Schedule
-from tests.renderer.agreement import NEAR
 from tests.renderer.cuda.emulation import EmulatedLaunch
-from tests.renderer.hard_scenes import camera, scenes
-from tests.renderer.reference import project
 from tests.workers.trainings import settings
 
 EXTENT = 10.0  # so that scales above 0.1 split
@@ -93,35 +89,6 @@ def test_large_ones_may_split_by_absolute_gradients() -> None:
     sizes = state.gaussians.scales[:, 0].exp().tolist()
     assert sizes == pytest.approx([0.05, 0.05, 0.5, 0.5, 0.05, 0.05, 0.5 / 1.6, 0.5 / 1.6])
     assert state.gaussians.means[[0, 5], 0].tolist() == [0, 0]  # the clone
-
-
-def test_large_footprints_may_go() -> None:
-    config = DensifyConfig(prune_footprint=20)
-    radius = torch.tensor([19.0, 21.0])
-    for footprint, left in ((0.0, [0, 100, 200]), (20.0, [0, 200])):
-        state = state_of([0.05] * 3, [0.5] * 3, sky=1)
-        statistics = Statistics(torch.zeros(2), torch.ones(2), config, radius=radius)
-        densify(state, statistics, config, EXTENT, np.random.default_rng(0), footprint)
-        assert state.gaussians.means[:, 0].tolist() == left
-
-
-def test_radii_are_the_largest_of_all_views_that_see_it() -> None:
-    config = DensifyConfig(prune_footprint=20)
-    statistics, splats = Statistics.zeros(3, "cpu", config), torch.zeros(3, 16)
-    camera = Camera(torch.eye(3), torch.zeros(3), 2000, 1000)
-    for deviation, seen in ((2.0, [True, True, False]), (5.0, [False, True, False]), (1.0, [True] * 3)):
-        splats[:, [2, 4]] = -0.5 * math.log2(math.e) / deviation**2  # round
-        statistics.add(torch.zeros(3, 2), torch.tensor(seen), torch.ones(3, 3), camera, splats)
-    assert statistics.radius is not None and statistics.radius.tolist() == pytest.approx([6, 15, 3])
-
-
-def test_the_radius_is_that_of_the_longest_axis() -> None:
-    at = camera(256)
-    for scene in scenes(at, False).values():
-        seen = render(scene, at, near=NEAR)
-        projected = project(scene, at, 3, NEAR, torch.zeros(len(scene), 2))
-        variance = torch.linalg.eigvalsh(projected.covariance[seen.visible].double())[:, 1]
-        assert torch.allclose(radii(seen.splats)[seen.visible].double(), 3 * variance.sqrt(), rtol=1e-5)
 
 
 def schedule_of(iterations: int = FULL_RUN, **groups: Any) -> Schedule:
@@ -206,7 +173,7 @@ def test_halves_are_drawn_from_the_gaussian_that_they_were() -> None:
 def test_statistics_are_means_over_the_views_that_saw_it() -> None:
     statistics = Statistics.zeros(3, "cpu", DensifyConfig())
     gradient = torch.tensor([[3e-3, 0], [3e-3, 8e-3], [1, 1], [1, 1]])
-    at = torch.ones(4, 3), Camera(torch.eye(3), torch.zeros(3), 2000, 1000), torch.zeros(4, 16)
+    at = torch.ones(4, 3), Camera(torch.eye(3), torch.zeros(3), 2000, 1000)
     statistics.add(gradient, torch.tensor([True, True, False, True]), *at)
     statistics.add(torch.zeros(4, 2), torch.tensor([False, True, False, True]), *at)
     assert statistics.mean().tolist() == pytest.approx([3, 2.5, 0])
@@ -229,7 +196,7 @@ def measured(latitude: float, shift: tuple[float, float, float], measure: str) -
     config = DensifyConfig.model_validate({"measure": measure})
     statistics = Statistics.zeros(1, "cpu", config)
     assert screen.grad is not None
-    statistics.add(screen.grad, seen.visible, state.gaussians.means, camera, seen.splats)
+    statistics.add(screen.grad, seen.visible, state.gaussians.means, camera)
     return float(statistics.mean())
 
 
@@ -250,7 +217,7 @@ def test_views_weigh_as_they_see_it() -> None:
     for distance, gradient in ((1.0, 1.0), (2.0, 5.0), (1.0, 0.0)):
         camera = Camera(torch.eye(3), torch.tensor([0, 0, distance]), 2, 2)
         arguments = torch.tensor([[gradient, 0]]), torch.tensor([True])
-        statistics.add(*arguments, torch.zeros(1, 3), camera, torch.zeros(1, 16))
+        statistics.add(*arguments, torch.zeros(1, 3), camera)
     assert statistics.mean().tolist() == pytest.approx([(1 + 5 / 4) / (1 + 1 / 4)])
 
 
@@ -258,36 +225,32 @@ def test_views_weigh_as_they_see_it() -> None:
 @pytest.mark.parametrize("views", ["all", "contribution"])
 @pytest.mark.parametrize("more", [False, True])
 def test_a_card_measures_the_same(measure: str, views: str, more: bool) -> None:
-    """With `more` also absolute gradients and radii."""
+    """With `more` also absolute gradients."""
     random = np.random.default_rng(0)
     count = 300
     means, screen = (torch.from_numpy(random.normal(size=(count, k)).astype(np.float32)) for k in (3, 4))
     screen[::5] = 0
     state = torch.from_numpy(random.integers(0, 3, count).astype(np.uint8))
-    splats = torch.from_numpy(-random.uniform(0.1, 2, (count, parts.SPLAT_FLOATS)).astype(np.float32)).clone()
     turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
     camera = Camera.of(turn, random.normal(size=3), 64, 32)
-    needed = {"split_gradient": 1.0, "prune_footprint": 1.0} if more else {}
+    needed = {"split_gradient": 1.0} if more else {}
     config = DensifyConfig.model_validate({"measure": measure, "views": views, **needed})
     ours, theirs = Statistics.zeros(count - 20, "cpu", config), Statistics.zeros(count - 20, "cpu", config)
-    theirs.add(screen[:, : 4 if more else 2], state == ops.VISIBLE, means, camera, splats)
+    theirs.add(screen[:, : 4 if more else 2], state == ops.VISIBLE, means, camera)
     zero = torch.zeros(0)
     layers: dict[str, Any] = {"image": zero, "mask": None, "depth": None, "rows": None}
     unused = layers | dict.fromkeys(("depth_weight", "lambda_ssim", "sh_degree", "near"), 0)
     gradients = {"screen": screen[:, :2].contiguous(), "absolute": screen[:, 2:].contiguous()}
-    found = Found(
-        gradients if more else {"screen": gradients["screen"]}, splats, state, zero, zero, zero, None
-    )
+    found = Found(gradients if more else {"screen": gradients["screen"]}, state, zero, zero, zero, None)
     problem = Problem(model={"means": means}, camera=camera, **unused)
     given = EmulatedLaunch(), found, torch.zeros(1, dtype=torch.int32), problem, ours.gradient, ours.views
     iteration.add_statistics(
         *given,
         absolute=ours.absolute,
-        radius=ours.radius,
         angle=measure == "angle",
         contribution=views == "contribution",
     )
-    assert theirs.tensors().keys() == ours.tensors().keys() and len(ours.tensors()) == (4 if more else 2)
+    assert theirs.tensors().keys() == ours.tensors().keys() and len(ours.tensors()) == (3 if more else 2)
     for name, expected in theirs.tensors().items():
         assert float(expected.sum()) > 0
         assert torch.allclose(ours.tensors()[name], expected, rtol=1e-4), name

@@ -37,7 +37,7 @@ CAPTURED: Groups = {
 COARSE: dict[str, Groups] = {
     "usual": {},
     "distance": {"densify": {"large": "distance", "percent_dense": 0.2}},
-    "absolute": {"densify": {"split_gradient": 3e-3, "prune_footprint": 20}},
+    "absolute": {"densify": {"split_gradient": 3e-3}},
     "averaged": {"optimizer": {"average": 0.25}},
     "relocated": {"densify": RELOCATED, "depth": {"points": 0.8}},
     "relocated, exact": {"densify": RELOCATED, "projection": "exact", "optimizer": {"unit": "distance"}},

@@ -20,6 +20,7 @@ def test_a_full_run_is_that_of_3dgs() -> None:
     assert densified == list(range(600, 15_000, 100))
     assert [i for i in range(1, 30_001) if full.resets(i)] == [3000, 6000, 9000, 12_000]
     assert [full.prunes_large(i) for i in (3000, 3100)] == [False, True]
+    assert not schedule(30_000, densify={"prune_scale": 0}).prunes_large(3100)
     assert [full.sh_degree(i) for i in (999, 1000, 2000, 3000, 30_000)] == [0, 1, 2, 3, 3]
 
 
