@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from panolog.orchestrator.runs.money.limits import Wanted
     from panolog.orchestrator.runs.preparation.settings import Options
 
+# Panels of the help, besides that of the basic options.
+_SETTINGS, _MACHINES, _TOLD = "Settings", "Machines and the driver", "Notifications and logs"
+BUDGET = "Cost and time (docs/money.md)"
+_MADE = "Panoramas or a video instead of a scene"
+
 SceneArg = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Pano360 scene.")]
 AnySceneArg = Annotated[
     str, typer.Argument(metavar="SCENE", help="Folder or URL of a COLMAP or Pano360 scene.")
@@ -23,8 +28,7 @@ SourceArg = Annotated[
     str,
     typer.Argument(
         metavar="SCENE|IMAGES|VIDEO",
-        help="Folder or URL (s3://, gs://, az://) of a COLMAP or Pano360 scene; of panoramas to make one of,"
-        " or a 360° video.",
+        help="Scene (folder, s3://, gs://, az://), folder of panoramas, or 360° video.",
     ),
 ]
 AnyRunArg = Annotated[str, typer.Argument(metavar="RUN", help="Folder or URL of a run.")]
@@ -42,6 +46,7 @@ LocalOption = Annotated[
         "--local",
         metavar="DIR",
         help="Folder on this machine of a run with a URL. Default: in the cache.",
+        rich_help_panel=_MACHINES,
     ),
 ]
 NewSceneOption = Annotated[
@@ -56,7 +61,12 @@ PortOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 LinkOption = Annotated[bool, typer.Option("--link", help="Link the panoramas instead of copying them.")]
 AddressOption = Annotated[
-    str | None, typer.Option(metavar="auto|HOST:PORT", help="Ray cluster to run on. Default: this machine.")
+    str | None,
+    typer.Option(
+        metavar="HOST:PORT|auto",
+        help="Ray cluster to run on. Default: this machine.",
+        rich_help_panel=_MACHINES,
+    ),
 ]
 NiceOption = Annotated[
     int | None,
@@ -64,44 +74,52 @@ NiceOption = Annotated[
         metavar="N",
         min=0,
         max=19,
-        help="Yield to other processes: by how much workers on this machine are nicer. Default: 0.",
+        help="Let other programs go first: 0 to 19. Default: 0.",
+        rich_help_panel=_MACHINES,
     ),
 ]
 DashboardOption = Annotated[
-    bool, typer.Option("--dashboard", help="Serve the run's dashboard on this machine while it runs.")
+    bool,
+    typer.Option("--dashboard", help="Show the run in the browser while it runs.", rich_help_panel=_MACHINES),
 ]
 SuperviseOption = Annotated[
     bool,
     typer.Option(
-        "--supervise", help="Resume the run when its driver dies: killed, crashed, or its cluster was lost."
+        "--supervise",
+        help="Resume the run when its driver is killed or crashes, or its cluster is lost.",
+        rich_help_panel=_MACHINES,
     ),
 ]
 ResumesOption = Annotated[
     int | None,
     typer.Option(
-        metavar="N", min=1, help="With --supervise: resumes in a row without progress. Default: 10."
+        metavar="N",
+        min=1,
+        help="With --supervise: resumes in a row without progress. Default: 10.",
+        rich_help_panel=_MACHINES,
     ),
 ]
 NotifyOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="KIND:URL",
-        help="Notify when the run is done, fails or stalls: webhook, slack, ntfy or mail, with @FILE or"
-        " env:NAME for a URL that is a secret. May be given several times.",
+        help="Notify by webhook, slack, ntfy or mail (docs/notifications.md); repeatable.",
+        rich_help_panel=_TOLD,
     ),
 ]
 LogOption = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="mlflow|tensorboard|wandb", help="Pass the curves on to a sink; may be given several times."
+        metavar="SINK",
+        help="Curves also to mlflow, tensorboard or wandb; repeatable.",
+        rich_help_panel=_TOLD,
     ),
 ]
-BUDGET = "Cost and time (docs/money.md)"  # the panel of these options in the help
 PricesOption = Annotated[
     str | None,
     typer.Option(
         metavar="FILE",
-        help="Prices of machines. Default: ~/.config/panolog/prices.toml, if there is one.",
+        help="Prices of machines. Default: ~/.config/panolog/prices.toml.",
         rich_help_panel=BUDGET,
     ),
 ]
@@ -109,7 +127,7 @@ MaxCostOption = Annotated[
     str | None,
     typer.Option(
         metavar="AMOUNT|none",
-        help="End the training in time for the whole run to cost at most so much, and deliver what there is.",
+        help="End the training before the run costs more, and deliver what there is.",
         rich_help_panel=BUDGET,
     ),
 ]
@@ -117,7 +135,7 @@ DeadlineOption = Annotated[
     str | None,
     typer.Option(
         metavar="6h|08:00|none",
-        help="The same, so that all is done at a time, or so long from now.",
+        help="The same, so that all is done by then.",
         rich_help_panel=BUDGET,
     ),
 ]
@@ -133,20 +151,19 @@ AtEndOption = Annotated[
     typer.Option(
         "--at-end",
         metavar="COMMAND",
-        help="Carried out when the run has ended for good, however, but not if it is stopped: ends a machine"
-        " that is paid (docs/money.md).",
+        help="Carried out when the run has ended for good, but not if it is stopped.",
         rich_help_panel=BUDGET,
     ),
 ]
 DeviceOption = Annotated[
     str | None,
-    typer.Option(metavar="auto|cpu|cuda", help="Device to compute on. Default: as in the settings, or auto."),
+    typer.Option(metavar="auto|cpu|cuda", help="Device to compute on. Default: auto."),
 ]
 BlocksOption = Annotated[
     str | None,
     typer.Option(
         metavar="2x1x1|8|auto",
-        help="Blocks along x, y and z; a number of balanced ones; or as many balanced ones as it takes.",
+        help="Blocks along x, y, z; so many balanced ones; or as many as it takes.",
     ),
 ]
 FrameOption = Annotated[
@@ -157,10 +174,9 @@ FrameOption = Annotated[
     ),
 ]
 WidthOption = Annotated[
-    int | None, typer.Option(metavar="W", help="Width of the panoramas in pixels. Default: as in the scene.")
+    int | None, typer.Option(metavar="W", help="Of the panoramas in pixels. Default: as they are.")
 ]
 
-_MADE = "Panoramas or a video instead of a scene"  # the panel of these options in the help
 PairsOption = Annotated[
     Literal["auto", "exhaustive", "sequential"],
     typer.Option("--pairs", metavar="HOW", help="Pairs to match: auto, exhaustive or sequential."),
@@ -182,7 +198,7 @@ DistanceOption = Annotated[
     tuple[str, str, float] | None,
     typer.Option(
         metavar="NAME NAME METRES",
-        help="Distance between two panoramas; sets the scale.",
+        help="Distance between two of them; sets the scale.",
         rich_help_panel=_MADE,
     ),
 ]
@@ -190,18 +206,21 @@ TrajectoryOption = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="Known trajectory of the camera: TUM or CSV (docs/sfm.md).",
+        help="Known trajectory, TUM or CSV (docs/sfm.md).",
         rich_help_panel=_MADE,
     ),
 ]
 GpsOption = Annotated[
-    bool, typer.Option(help="Take scale and north from the GPS data in EXIF.", rich_help_panel=_MADE)
+    bool,
+    typer.Option(
+        "--gps/--no-gps", help="Scale and north from GPS in EXIF.", show_default=False, rich_help_panel=_MADE
+    ),
 ]
 PartialOption = Annotated[
     bool,
     typer.Option(
         "--partial",
-        help="Accept a partial reconstruction: of half of the panoramas or fewer.",
+        help="Accept poses of half of the panoramas or fewer.",
         rich_help_panel=_MADE,
     ),
 ]
@@ -223,25 +242,37 @@ def axes_of(frame: str) -> Literal["export", "model"]:
 
 
 def run_config(
-    config: Annotated[Path | None, typer.Option(metavar="F.yaml", help="Settings, as a YAML file.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="F.yaml", help="Settings in YAML.", rich_help_panel=_SETTINGS)
+    ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="One setting; may be given several times."),
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="One setting; repeatable.", rich_help_panel=_SETTINGS
+        ),
     ] = None,
     blocks: BlocksOption = None,
     iterations: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Iterations of Stage I and of each block. Default: 30,000."),
+        typer.Option(metavar="N", help="Of Stage I and of each block. Default: 30,000."),
     ] = None,
     width: WidthOption = None,
     device: DeviceOption = None,
     memory: Annotated[
         str | None,
-        typer.Option(metavar="GIB", help="Memory that a task may take; Gaussians grow to what fits."),
+        typer.Option(
+            metavar="GIB",
+            help="Memory that a task may take; Gaussians grow to what fits.",
+            rich_help_panel=_SETTINGS,
+        ),
     ] = None,
     recipe: Annotated[
         str | None,
-        typer.Option(metavar="paper|authors|panolog", help="Preset of settings not given. Default: panolog."),
+        typer.Option(
+            metavar="paper|authors|panolog",
+            help="Preset of what is not given. Default: panolog.",
+            rich_help_panel=_SETTINGS,
+        ),
     ] = None,
 ) -> "RunConfig":
     """The options that set up a run, as its settings."""
@@ -264,8 +295,7 @@ def preparation(
             metavar="DEGREES",
             min=0,
             max=90,
-            help="Mask everything within this angle of straight down; 0 = nothing. Default: 10 where there"
-            " are no masks.",
+            help="Mask so much around straight down. Default: 10, unless there are masks.",
             rich_help_panel=_MADE,
         ),
     ] = None,
@@ -273,7 +303,7 @@ def preparation(
         bool | None,
         typer.Option(
             "--static/--no-static",
-            help="Mask what looks the same in all panoramas: the operator. Default: if there are no masks.",
+            help="Mask what all panoramas show. Default: yes, unless there are masks.",
             show_default=False,
             rich_help_panel=_MADE,
         ),
@@ -282,7 +312,7 @@ def preparation(
         Path | None,
         typer.Option(
             metavar="M.onnx",
-            help="Estimate depth maps with this network; its manifest M.yaml is next to it.",
+            help="Estimate depth with this network.",
             rich_help_panel=_MADE,
         ),
     ] = None,

@@ -8,11 +8,11 @@ import pytest
 
 import panolog
 from benchmarks.paper import __main__ as command
-from benchmarks.paper.code import Code, present
-from benchmarks.paper.results import Result, Results, save
-from benchmarks.paper.runner import Bench, Done, run_all
+from benchmarks.paper.code import present
+from benchmarks.paper.results import Results, save
+from benchmarks.paper.runner import Bench
 from benchmarks.paper.tables import main_tables
-from benchmarks.paper.variants import Settings, Variant, stages, variants
+from benchmarks.paper.variants import Settings, Variant, variants
 from tests.benchmarks.paper.made import result
 from tests.scenes import write_scene
 
@@ -127,20 +127,6 @@ def test_a_result_of_other_code_says_so(
     assert bench.code.name in str(table.rows[1][-1])
 
 
-@pytest.mark.parametrize(
-    ("settings", "code", "kept"), [({"a": 0}, None, True), ({"a": 1}, None, False), ({"a": 0}, "0123", False)]
-)
-def test_an_unfinished_run_of_other_settings_or_code_begins_anew(
-    settings: dict[str, int], code: str | None, kept: bool, bench: Bench
-) -> None:
-    bench.begin(KNOWN["tau-0.7"], {"a": 0})
-    root = bench.folder / "tau-0.7@0"
-    root.mkdir()
-    later = Code(code, "") if code else bench.code
-    Bench(bench.folder.parent, bench.scene, 0, SETTINGS, later).begin(KNOWN["tau-0.7"], settings)
-    assert root.exists() == kept
-
-
 def test_code_is_what_decides_a_training(tmp_path: Path) -> None:
     for package in ("scene", "renderer", "partition", "workers", "orchestrator/engine/driver", "prepare"):
         (tmp_path / package).mkdir(parents=True)
@@ -151,35 +137,3 @@ def test_code_is_what_decides_a_training(tmp_path: Path) -> None:
     assert present(tmp_path) == before
     (tmp_path / "workers" / "a.py").write_text("x = 2")
     assert present(tmp_path).sources != before.sources
-
-
-class Recorded(Bench):
-    """One that runs nothing."""
-
-    def known(self, variant: Variant) -> bool:
-        return variant.name == "tau-0.7"
-
-    def result(self, variant: Variant) -> Result:
-        return result(variant.name, 24.0, scene=self.scene.name, seed=self.seed)
-
-
-def test_what_matters_most_runs_first(tmp_path: Path) -> None:
-    benches = [Recorded(tmp_path, Path(name), seed, SETTINGS) for name in "ab" for seed in (0, 1)]
-    found = [(r.seed, r.variant, r.scene) for r in run_all(benches, stages(["tau", "main"]))]
-    recipes, tau = ("paper", "authors", "panolog"), ("tau-0.7", "tau-0.8", "tau-0.9")
-    tables = [
-        (0, variant, scene)
-        for table in ((*recipes, "panolog-time"), tau)
-        for scene in "ab"
-        for variant in table
-    ]
-    assert found == tables + [(1, variant, scene) for scene in "ab" for variant in recipes]
-    only = [r.variant for r in run_all(benches, stages(["tau", "main"]), finished=True)]
-    assert only == ["tau-0.7", "tau-0.7"]
-
-
-@pytest.mark.parametrize(("share", "said"), [(93.0, ["took 93 % of the seconds it was given"]), (96.0, [])])
-def test_a_run_that_misses_its_time_says_so(share: float, said: list[str], bench: Bench) -> None:
-    bench.done = {"paper": Done({}, result("paper", 24.0), bench.folder)}  # 100 s
-    timed = result("panolog-time", 25.0, seconds={"coarse": share})
-    assert list(bench.off(KNOWN["panolog-time"], timed)) == said

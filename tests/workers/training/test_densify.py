@@ -33,16 +33,15 @@ EXTENT = 10.0  # so that scales above 0.1 split
 QUIET, LOUD = 0.0, 1.0  # screen gradients
 
 
-def state_of(scales: list[float], opacities: list[float], sky: int) -> ModelState:
-    """Gaussians identified by their x; all moments are 7."""
+def state_of(scales: list[float], opacities: list[float], sky: int, moments: float = 7.0) -> ModelState:
+    """Gaussians identified by their x; all moments have one value."""
     means = np.arange(len(scales))[:, None] * np.array([100.0, 0, 0])
     colors = np.random.default_rng(0).uniform(0.5, 0.8, means.shape)
     gaussians = isotropic(means, np.array(scales), colors, 0.5)
     gaussians.opacities[:] = torch.tensor([logit(opacity) for opacity in opacities])
     state = ModelState.start(replace(gaussians, sky=sky))
-    for moments in (state.exp_avg, state.exp_avg_sq):
-        for moment in moments.values():
-            moment.fill_(7)
+    for moment in (*state.exp_avg.values(), *state.exp_avg_sq.values()):
+        moment.fill_(moments)
     return state
 
 
@@ -97,7 +96,7 @@ def schedule_of(iterations: int = FULL_RUN, **groups: Any) -> Schedule:
 
 def test_a_step_may_be_a_part_of_the_distance() -> None:
     """From the nearest camera; what is divided keeps it."""
-    state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0)  # at x = 0, 100 and 200
+    state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0, moments=0)  # at x = 0, 100 and 200
     centers, given = np.array([[1.0, 0, 0], [210, 0, 0]]), schedule_of(optimizer={"unit": "distance"})
     state.units = rate_units(state.gaussians.means, centers, given, 5.0)
     assert {name: units.tolist() for name, units in state.units.items()} == {"means": [1, 99, 10]}
@@ -107,8 +106,6 @@ def test_a_step_may_be_a_part_of_the_distance() -> None:
     state = ModelState.from_tensors(saved)
     saved["units.means"] = saved["units.means"][:, None].repeat(1, 3)  # as checkpoints once had them
     assert torch.equal(ModelState.from_tensors(saved).units["means"], state.units["means"])
-    for moments in (state.exp_avg, state.exp_avg_sq):
-        moments["means"].zero_()
     state.step(gradient, {"means": 0.01}, {"means": 2}, step=1)
     moved = (before - state.gaussians.means)[:, 0].tolist()
     assert moved == pytest.approx([0.01 * 1, 0.01 * 99, 0], rel=1e-4)
@@ -117,7 +114,7 @@ def test_a_step_may_be_a_part_of_the_distance() -> None:
 
 
 def test_what_is_near_may_be_slow_to_depend_on_the_direction() -> None:
-    state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0)  # at x = 0, 100 and 200
+    state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0, moments=0)  # at x = 0, 100 and 200
     centers, full = np.array([[1.0, 0, 0], [210, 0, 0]]), schedule_of(sh={"near": 4})
     state.units = rate_units(state.gaussians.means, centers, full, 5.0)
     assert state.units["shN"].tolist() == pytest.approx([0.05, 1, 0.5])
@@ -128,9 +125,6 @@ def test_what_is_near_may_be_slow_to_depend_on_the_direction() -> None:
     )
     gradient = {name: torch.ones_like(tensor) for name, tensor in state.gaussians.tensors().items()}
     before = {name: tensor.clone() for name, tensor in state.gaussians.tensors().items()}
-    for moments in (state.exp_avg, state.exp_avg_sq):
-        for moment in moments.values():
-            moment.zero_()
     state.step(gradient, dict.fromkeys(gradient, 0.01), dict.fromkeys(gradient, 3), step=1)
     moved = {name: before[name] - tensor for name, tensor in state.gaussians.tensors().items()}
     assert moved["shN"][:, 7, 2].tolist() == pytest.approx([0.0005, 0.01, 0.005], rel=1e-3)
