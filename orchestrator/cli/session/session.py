@@ -47,7 +47,6 @@ from panolog.orchestrator.runs.records import (
     RunBegan,
     RunContinued,
     RunWaiting,
-    Stored,
 )
 from panolog.orchestrator.runs.retention.clean import remove_models
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore
@@ -249,7 +248,9 @@ class _Beginning:
             self.journal.record([Preparing("connecting to the cluster" if self.address else "starting Ray")])
         with _workers(self.address, self.folder.root, self.pool, self.nice) as workers:
             if self.pool is None:
-                self.journal.on_change = _exported(self.folder.root, self.journal.on_change)
+                from panolog.orchestrator.engine.cluster.run_metrics import RunMetrics
+
+                self.journal.on_change = RunMetrics(self.folder.root, self.journal.on_change).show
             yield workers
 
     def preflight(self, workers: Pool, info: RunInfo) -> RunConfig:
@@ -350,19 +351,6 @@ def _workers(address: str | None, root: Path, pool: Pool | None, nice: int | Non
 
     with connect(address, root, nice) as ray_pool:
         yield ray_pool
-
-
-def _exported(root: Path, on_change: OnChange) -> OnChange:
-    """`on_change`, which also exports the state as metrics of Ray."""
-    from panolog.orchestrator.engine.cluster.run_metrics import RunMetrics
-
-    metrics = RunMetrics(root)
-
-    def both(state: RunState, news: Sequence[Stored]) -> None:
-        metrics.show(state, news)
-        on_change(state, news)
-
-    return both
 
 
 def _report(folder: RunFolder, journal: Journal) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from ray.util.metrics import Counter, Gauge
 
 from panolog.orchestrator.runs.records import Record, Stored, TaskFailed, Transferred
-from panolog.orchestrator.runs.state import RunState, Status, TaskState
+from panolog.orchestrator.runs.state import OnChange, RunState, Status, TaskState, ignore
 from panolog.workers.tasks import TaskId
 
 GAUGES = {
@@ -85,7 +85,9 @@ def counts(state: RunState, record: Record) -> Iterator[MetricSample]:
 class RunMetrics:
     """Exports the metrics of one run. Needs Ray to be initialised."""
 
-    def __init__(self, run: Path) -> None:
+    def __init__(self, run: Path, on_change: OnChange = ignore) -> None:
+        """Args: on_change, called after each state that is shown."""
+        self._on_change = on_change
         self._run = str(run.absolute())
         self._gauges = {name: Gauge(name, text, TAGS) for name, text in GAUGES.items()}
         self._counters = {name: Counter(name, text, TAGS) for name, text in COUNTERS.items()}
@@ -101,6 +103,7 @@ class RunMetrics:
             self._exported = now
             for sample in gauges(state):
                 self._gauges[sample.metric].set(sample.value, self._tags(sample))
+        self._on_change(state, news)
 
     def _tags(self, sample: MetricSample) -> dict[str, str]:
         values = (self._run, sample.task, sample.node)
