@@ -91,7 +91,7 @@ class Kernels:
     def _prepare(self, kernel: str, arguments: Mapping[str, Argument]) -> "Prepared":
         module = nvrtc.module_of(kernel)
         if module not in self.libraries:
-            code = nvrtc.cubin(module, self.arch)
+            code = nvrtc.code(module, self.arch)
             loaded = driver.cuLibraryLoadData(code, [], [], 0, [], [], 0)
             self.libraries[module] = _checked(loaded, f"loading {module}")
         handle = _checked(driver.cuLibraryGetKernel(self.libraries[module], kernel.encode()), kernel)
@@ -176,9 +176,7 @@ def check(index: int) -> None:
     """Raises DeviceError if this card, its driver or NVRTC is not supported: called before work begins."""
     name, capability = torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index)
     check_driver()
-    arch = architecture(name, capability)
-    if arch not in nvrtc.nvrtc_version()[2]:
-        raise DeviceError(f"NVRTC does not know {name} ({arch}): pip install -U nvidia-cuda-nvrtc")
+    nvrtc.target(architecture(name, capability))
 
 
 def check_driver() -> None:

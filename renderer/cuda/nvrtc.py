@@ -4,6 +4,7 @@ Needs the wheels cuda-core and nvidia-cuda-nvrtc: no CUDA toolkit, no driver, no
 """
 
 import contextlib
+import ctypes
 import functools
 import hashlib
 import logging
@@ -12,8 +13,11 @@ import re
 import stat
 import tempfile
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
 
 from panolog.scene.errors import DeviceError
 from panolog.scene.files import user_folder, write_bytes
@@ -40,24 +44,48 @@ DIGEST = 32  # bytes of SHA-256 at the end of a file of the cache
 _LOG = logging.getLogger(__name__)
 
 
-def cubin(module: str, arch: str) -> bytes:
-    """Code of csrc/cuda/{module}.cu for an architecture such as "sm_89", from the cache on disk if it has it.
+def code(module: str, arch: str) -> bytes:
+    """csrc/cuda/{module}.cu for the driver of a card such as "sm_89", from the cache on disk if it has it.
+
+    That is machine code, or, for a card that is newer than NVRTC, PTX which the driver compiles.
 
     Raises:
-        DeviceError: cuda-core or NVRTC is missing, or this NVRTC does not know the architecture.
+        DeviceError: cuda-core or NVRTC is missing, or all architectures that this NVRTC knows are newer.
     """
+    known, kind = target(arch)
     folder = cache_folder()
-    path = folder / f"{module}-{arch}-{_key(module, arch)}.cubin" if folder else None
+    path = folder / f"{module}-{known}-{_key(module, known)}.{kind}" if folder else None
     if path and (cached := _cached(path)):
         _LOG.info("CUDA kernels: %s read from %s", module, path)
         return cached
-    _LOG.info("CUDA kernels: compiling %s for %s", module, arch)
-    code = compile_module(module, arch)
+    _LOG.info("CUDA kernels: compiling %s to %s of %s, for %s", module, kind, known, arch)
+    made = compile_module(module, known, kind)
     if path:
         with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(path, code + hashlib.sha256(code).digest())
-    return code
+            write_bytes(path, made + hashlib.sha256(made).digest())
+    return made
+
+
+def target(arch: str) -> tuple[str, str]:
+    """What to compile for a card: an architecture that NVRTC knows, and whether to "cubin" or "ptx".
+
+    Raises DeviceError as `code`.
+    """
+    major, minor, architectures = nvrtc_version()
+    if arch in architectures:
+        return arch, "cubin"
+    if older := [known for known in architectures if _number(known) < _number(arch)]:
+        return max(older, key=_number), "ptx"
+    known = ", ".join(architectures)
+    raise DeviceError(
+        f"NVRTC {major}.{minor} compiles for {known}, not for {arch}: pip install -U nvidia-cuda-nvrtc"
+    )
+
+
+def _number(arch: str) -> int:
+    """Of an architecture: 89 of "sm_89"."""
+    return int(arch.removeprefix("sm_"))
 
 
 def _cached(path: Path) -> bytes | None:
@@ -73,22 +101,19 @@ def _cached(path: Path) -> bytes | None:
     return None
 
 
-def compile_module(module: str, arch: str) -> bytes:
-    """As `cubin`, without the cache."""
-    return bytes(program(module, arch).compile("cubin").code)
+def compile_module(module: str, arch: str, kind: str = "cubin") -> bytes:
+    """csrc/cuda/{module}.cu for an architecture that NVRTC knows. Args: kind, "cubin" or "ptx"."""
+    made = bytes(program(module, arch).compile(kind).code)
+    return made if kind == "cubin" else made.rstrip(b"\0") + b"\0"  # the driver reads PTX up to there
 
 
 def program(module: str, arch: str, **options: Any) -> "Program":
     """csrc/cuda/{module}.cu to be compiled for an architecture; `options` of `cuda.core.ProgramOptions`.
 
-    Raises DeviceError as `cubin`.
+    Raises DeviceError if NVRTC does not know the architecture, or as `nvrtc_version`.
     """
-    major, minor, architectures = nvrtc_version()
-    if arch not in architectures:
-        known = ", ".join(architectures)
-        raise DeviceError(
-            f"NVRTC {major}.{minor} compiles for {known}, not for {arch}: pip install -U nvidia-cuda-nvrtc"
-        )
+    if target(arch)[0] != arch:
+        raise DeviceError(f"NVRTC does not know {arch}: pip install -U nvidia-cuda-nvrtc")
     from cuda.core import Program, ProgramOptions  # noqa: PLC0415  # optional: only rendering on a GPU needs it
 
     settings = ProgramOptions(
@@ -109,6 +134,7 @@ def nvrtc_version() -> tuple[int, int, tuple[str, ...]]:
     Raises:
         DeviceError: cuda-core or NVRTC is missing.
     """
+    _load_that_of_torch()
     try:
         from cuda.bindings import nvrtc  # noqa: PLC0415  # optional: only rendering on a GPU needs it
         from cuda.core import Program  # noqa: F401, PLC0415
@@ -126,6 +152,19 @@ def nvrtc_version() -> tuple[int, int, tuple[str, ...]]:
         ) from error
     _, architectures = nvrtc.nvrtcGetSupportedArchs()
     return major, minor, tuple(f"sm_{number}" for number in architectures)
+
+
+def _load_that_of_torch() -> None:
+    """Loads the NVRTC of torch's CUDA, if pip has installed it: cuda-bindings takes what is loaded.
+
+    Of several it would take the newest, whose code a driver that is new enough for torch may not load.
+    """
+    spec, major = find_spec("nvidia"), (torch.version.cuda or "").partition(".")[0]
+    for folder in (spec.submodule_search_locations or []) if spec and major else []:
+        for library in (f"libnvrtc-builtins.so.{major}.*", f"libnvrtc.so.{major}"):
+            for path in Path(folder).glob(f"*/lib/{library}"):
+                with contextlib.suppress(OSError):  # a damaged one: cuda-bindings looks for another
+                    ctypes.CDLL(str(path), os.RTLD_NOW | os.RTLD_GLOBAL)
 
 
 def module_of(kernel: str) -> str:

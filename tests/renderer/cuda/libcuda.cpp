@@ -22,12 +22,14 @@ int cuDriverGetVersion(int* version) {
 }
 
 int cuLibraryLoadData(void** library, const void* code, void*, void*, unsigned, void*, void*, unsigned) {
-  if (memcmp(code, "\177ELF", 4)) return 200;  // CUDA_ERROR_INVALID_IMAGE
-  *library = const_cast<void*>(code);
+  const bool cubin = !memcmp(code, "\177ELF", 4);
+  if (!cubin && !strstr(static_cast<const char*>(code), "\n.target sm_")) return 200;  // CUDA_ERROR_INVALID_IMAGE
+  *library = cubin ? nullptr : strdup(static_cast<const char*>(code));
   return 0;
 }
 
-int cuLibraryGetKernel(void** kernel, void*, const char* name) {
+int cuLibraryGetKernel(void** kernel, void* library, const char* name) {
+  if (library && !strstr(static_cast<const char*>(library), name)) return 500;  // CUDA_ERROR_NOT_FOUND
   *kernel = strncpy(names[kernels++], name, sizeof(names[0]) - 1);
   return 0;
 }

@@ -38,7 +38,7 @@ class Compiled:
 
 @functools.cache
 def compiled(module: str, arch: str) -> Compiled:
-    """csrc/cuda/{module}.cu. Raises DeviceError as `nvrtc.cubin`."""
+    """csrc/cuda/{module}.cu. Raises DeviceError as `nvrtc.program`."""
     from cuda.bindings import nvrtc as library  # noqa: PLC0415  # optional, as in renderer.cuda.nvrtc
 
     log = io.StringIO()
@@ -51,7 +51,7 @@ def compiled(module: str, arch: str) -> Compiled:
 
 
 def measure(module: str, arch: str) -> list[Kernel]:
-    """The kernels of csrc/cuda/{module}.cu. Raises DeviceError as `nvrtc.cubin`."""
+    """The kernels of csrc/cuda/{module}.cu. Raises DeviceError as `nvrtc.program`."""
     made = compiled(module, arch)
     _, *reports = _ENTRY.split(made.log)
     return [

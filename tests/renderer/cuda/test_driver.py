@@ -11,12 +11,13 @@ import pytest
 
 from panolog.renderer.cuda import nvrtc
 
+pytest.importorskip("cuda.core", reason="CUDA: no cuda-core")
+from cuda.bindings import driver
+
 pytestmark = pytest.mark.system
 
-pytest.importorskip("cuda.core", reason="CUDA: no cuda-core")
-
 HERE = Path(__file__).parent
-ARCH = "sm_89"
+ARCH, UNKNOWN = "sm_89", "sm_999"  # the second is newer than every NVRTC
 KPARAM_INFO, SIZED = 0x17, 0x04  # EIATTR_KPARAM_INFO of a cubin's .nv.info, and the format of its entry
 
 
@@ -58,16 +59,20 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return os.environ | {"LD_LIBRARY_PATH": ":".join(paths), "XDG_CACHE_HOME": str(folder)}
 
 
+@pytest.mark.parametrize("arch", [ARCH, UNKNOWN])
 def test_the_driver_copies_what_each_kernel_takes(
-    environment: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    arch: str, environment: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Also on a card that NVRTC does not know, which compiles PTX."""
     monkeypatch.setenv("XDG_CACHE_HOME", environment["XDG_CACHE_HOME"])
+    monkeypatch.setattr(driver, "cuDriverGetVersion", lambda: (driver.CUresult.CUDA_SUCCESS, 13000))
     sizes: dict[str, list[int]] = {}
     for module in nvrtc.MODULES:
-        sizes |= parameters(nvrtc.cubin(module, ARCH))
+        sizes |= parameters(nvrtc.code(module, ARCH))
+        nvrtc.code(module, arch)  # the driver of the other process cannot be asked for all that NVRTC asks
     assert sizes["project_forward"] == [8] * 7 + [64] + [8] * 6
     assert sizes["adam_step"] == [6 * 64, 4, 4, 4, 4, 8]
-    command = [sys.executable, "-m", "tests.renderer.cuda.driver_calls", ARCH, repr(sizes)]
+    command = [sys.executable, "-m", "tests.renderer.cuda.driver_calls", arch, repr(sizes)]
     done = subprocess.run(
         command, env=environment, cwd=HERE.parents[2], check=False, capture_output=True, text=True
     )
@@ -75,10 +80,42 @@ def test_the_driver_copies_what_each_kernel_takes(
     assert set(done.stdout.split()) == sizes.keys()
 
 
+NVRTC_12 = """
+extern "C" {
+int nvrtcVersion(int* major, int* minor) { *major = 12, *minor = 6; return 0; }
+int nvrtcGetNumSupportedArchs(int* count) { *count = 1; return 0; }
+int nvrtcGetSupportedArchs(int* archs) { *archs = 90; return 0; }
+}
+"""
+
+
+@pytest.mark.parametrize("cuda", ["12.6", "13.0"])
+def test_of_two_nvrtc_that_of_torchs_cuda_is_taken(cuda: str, tmp_path: Path) -> None:
+    """A driver of CUDA 12 cannot load what NVRTC 13 makes."""
+    folder = tmp_path / "nvidia" / "cuda_nvrtc" / "lib"
+    folder.mkdir(parents=True)
+    library = folder / "libnvrtc.so.12"
+    options = ("-shared", "-fPIC", "-x", "c++", "-", f"-Wl,-soname,{library.name}", "-o", str(library))
+    subprocess.run([os.environ.get("CXX", "c++"), *options], input=NVRTC_12, text=True, check=True)
+    code = (
+        f"import torch; torch.version.cuda = '{cuda}'\n"
+        "from panolog.renderer.cuda import nvrtc\n"
+        "print(*nvrtc.nvrtc_version()[:2], sep='.')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.strip().startswith(cuda if cuda == "12.6" else "13.")
+
+
 def test_a_driver_that_refuses_is_named(environment: dict[str, str]) -> None:
     code = (
         "from panolog.renderer.cuda import card, nvrtc\n"
-        "nvrtc.cubin = lambda module, arch: b'no code'\n"
+        "nvrtc.code = lambda module, arch: b'no code'\n"
         "card.Kernels('sm_89').launch(1, 'adam_step', (1, 1), 256, {})"
     )
     done = subprocess.run(

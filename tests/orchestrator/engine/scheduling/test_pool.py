@@ -78,7 +78,7 @@ class Card:
 
     def patched(self) -> Any:
         """A context in which torch has this card."""
-        functions = {
+        functions: dict[str, Any] = {
             "mem_get_info": lambda: (self.free, self.total),
             "set_per_process_memory_fraction": self.fractions.append,
         }
@@ -160,7 +160,7 @@ def process(pipe: Any, turns: Barrier, used: Any) -> None:
     """A worker on half of the card."""
     global here  # noqa: PLW0603  # as the card of a process is
     here = SimulatedCard(turns, used)
-    functions = {"mem_get_info": here.info, "set_per_process_memory_fraction": here.limit_to}
+    functions: dict[str, Any] = {"mem_get_info": here.info, "set_per_process_memory_fraction": here.limit_to}
     with mock.patch.multiple(torch.cuda, **functions):
         _work(Placement("a", 1.0, 12 * GIB, gpus=0.5), pipe, {})
 
