@@ -90,7 +90,10 @@ class Pace:
         return seconds * self.slowdown(together) * max(1.0, self.pixels / pixels)
 
     def slowdown(self, together: int) -> float:
-        """An iteration on a task's part of the cores over one on all: a power of the threads, from two."""
+        """An iteration on a task's part of the cores over one on all: a power of the threads, from two.
+
+        On GPUs `together` counts one task for each, which had as many cores when it was measured.
+        """
         measured = self.basis.measured
         if self.cuda or measured.threads == 1 or not measured.grown.seconds:
             return 1.0
@@ -102,8 +105,9 @@ class Pace:
         """Of a task. Args: periods of scene Gaussians; sky Gaussians besides."""
         iterations = sum(count for count, _ in periods)
         steps = sum(count * self.iteration(gaussians + sky, together) for count, gaussians in periods)
-        decoded = min(cameras, iterations) if self.kept >= cameras else iterations
-        return self.basis.measured.begin + steps + decoded * self.decode
+        decoding = self.decode * (min(cameras, iterations) if self.kept >= cameras else iterations)
+        both = max(steps, decoding) if self.cuda else steps + decoding  # on the CPU they share its cores
+        return self.basis.measured.begin + both
 
     @property
     def decode(self) -> float:

@@ -129,6 +129,16 @@ def test_on_gpus_memory_is_the_devices_and_each_takes_a_block(tmp_path: Path) ->
     assert block.host > 0
 
 
+@pytest.mark.parametrize("decode", [0.01, 0.5])
+def test_cores_decode_while_a_gpu_trains(tmp_path: Path, decode: float) -> None:
+    """The slower of the two decides, where no panorama stays decoded."""
+    settings: dict[str, Any] = {"densify": {"until": 0}, "sky": {"count": 11_000 - 200}}
+    basis = Basis(calibrated(decode=decode, threads=2, grown=IterationCost(11_000, 0.021, 2**30, 2**27)), 3.0)
+    job = estimator(tmp_path, basis, **settings, device="cuda", cache={"memory": 1e-5})
+    seconds = stage(job.estimate(), Stage.COARSE).seconds
+    assert seconds == pytest.approx(0.5 + 300 * max(0.021, decode / 2), rel=0.02)
+
+
 def test_a_block_with_a_baked_exterior_trains_what_its_cell_has(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"blocks": "2x1x1", "sky": {"count": 5_000}}
     whole, own = (estimator(tmp_path, **settings, stage2={"exterior": kind}) for kind in ("frozen", "baked"))
