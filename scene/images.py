@@ -73,6 +73,11 @@ class Staged:
     ready: torch.cuda.Event | None = None
 
 
+def sleeping_event() -> torch.cuda.Event:
+    """An event on a GPU for which a thread of the host sleeps; by default it would keep a core busy."""
+    return torch.cuda.Event(blocking=True)  # type: ignore[no-untyped-call]
+
+
 def pixels(layer: Tensor, v: NDArray[np.int64], u: NDArray[np.int64]) -> NDArray[Any]:
     """The values (M, ...) of a layer in rows v and columns u (M,): only they leave its device."""
     at = tuple(torch.from_numpy(index).to(layer.device) for index in (v, u))
@@ -113,7 +118,7 @@ class CudaUpload(Upload):
         with torch.cuda.stream(self._stream):  # which the memory then belongs to, see `finish`
             memory = torch.empty(len(pinned), dtype=torch.uint8, device=self._device)
             memory.copy_(pinned, non_blocking=True)
-            ready = self._own.ready = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            ready = self._own.ready = sleeping_event()
             ready.record(self._stream)
         return Staged(View.of(view.row, unpack(memory, layers)), memory, ready)
 

@@ -23,6 +23,7 @@ from panolog.renderer.motion import MOTION_SUMS
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
+from panolog.scene.images import sleeping_event
 from panolog.workers.capture.learning import Learning, Observed
 from panolog.workers.training.densify import Statistics
 from panolog.workers.training.loss import loss_of
@@ -201,7 +202,7 @@ class Pipeline:
             plan.learning.step(observed)
         report = self._reports[plan.iteration % AHEAD, : len(found.report)]
         report.copy_(found.report, non_blocking=True)
-        event = torch.cuda.Event() if self._cuda else None  # type: ignore[no-untyped-call]
+        event = sleeping_event() if self._cuda else None
         if event is not None:
             event.record()
         self._launched.append(_Launched(plan, report, event))

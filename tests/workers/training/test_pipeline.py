@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -250,6 +251,24 @@ def test_no_wait_in_a_usual_iteration(
         with counted((trainer.pipeline._reports,)) as found:
             assert all(len(trainer.pipeline._launched) < pipeline.AHEAD for _ in steps)
         assert found == {}
+
+
+def test_the_host_sleeps_while_it_waits_for_an_iteration(
+    spec: TrainSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[mock.Mock] = []
+
+    def event(*, blocking: bool = False) -> mock.Mock:
+        made.append(mock.Mock(blocking=blocking, **{"query.return_value": False}))
+        return made[-1]
+
+    monkeypatch.setattr("torch.cuda.Event", event)
+    with stubbed(without_pairs), warm(spec) as (trainer, steps):
+        assert isinstance(trainer.pipeline, pipeline.Pipeline)
+        trainer.pipeline._cuda = True
+        count = len(list(steps))
+    assert [each.blocking for each in made] == [True] * count
+    assert sum(each.synchronize.call_count for each in made) == count - pipeline.AHEAD + 1
 
 
 def test_captures_learnt_on_a_card_are_those_of_the_cpu(spec: TrainSpec) -> None:
