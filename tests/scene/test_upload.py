@@ -190,7 +190,7 @@ class Torch:
         return Memory(torch.empty(size, **options), self.log)
 
     def _event(self, *, blocking: bool) -> SimpleNamespace:
-        assert blocking  # whoever waits sleeps
+        assert blocking  # who waits sleeps
         return SimpleNamespace(
             record=lambda stream: self.log.append(f"event on {stream}"),
             synchronize=lambda: self.log.append(f"{threading.current_thread().name} waits"),

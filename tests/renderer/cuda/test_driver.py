@@ -69,7 +69,7 @@ def test_the_driver_copies_what_each_kernel_takes(
     sizes: dict[str, list[int]] = {}
     for module in nvrtc.MODULES:
         sizes |= parameters(nvrtc.code(module, ARCH))
-        nvrtc.code(module, arch)  # the driver of the other process cannot be asked for all that NVRTC asks
+        nvrtc.code(module, arch)  # the stubbed driver of the other process lacks calls that NVRTC makes
     assert sizes["project_forward"] == [8] * 7 + [64] + [8] * 6
     assert sizes["adam_step"] == [6 * 64, 4, 4, 4, 4, 8]
     command = [sys.executable, "-m", "tests.renderer.cuda.driver_calls", arch, repr(sizes)]
