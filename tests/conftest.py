@@ -73,19 +73,22 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 
 
 def _record(terminalreporter: pytest.TerminalReporter, seconds: dict[str, float]) -> None:
-    """Writes how long files took that take long or have tests of a system, in place of what was recorded."""
+    """Writes how long files took that take long or have tests of a system; files that did not run stay."""
     reports = [report for reports in terminalreporter.stats.values() for report in reports]
     system = {
         _file(report.nodeid)
         for report in reports
         if isinstance(report, pytest.TestReport) and "system" in report.keywords
     }
-    recorded = {}
-    for file, took in sorted(seconds.items(), key=lambda item: -item[1]):
+    recorded = {
+        file: took for file, took in json.loads(_DURATIONS.read_text()).items() if file not in seconds
+    }
+    for file, took in seconds.items():
         if took >= _LONG_S or file in system:
             tenths = round(10 * took)
             recorded[file] = (tenths + (tenths % 10 == 0)) / 10  # a whole number would be an estimate
-    _DURATIONS.write_text(json.dumps(recorded, indent=2) + "\n")
+    longest_first = dict(sorted(recorded.items(), key=lambda item: -item[1]))
+    _DURATIONS.write_text(json.dumps(longest_first, indent=2) + "\n")
 
 
 def _file(nodeid: str) -> str:
