@@ -44,7 +44,7 @@ def find_masks(
     used = {mask.resolve() for mask in found if mask}
     for folder in folders:
         if lost := [it.name for it in find_image_files(folder) if it.resolve() not in used]:
-            notes.append(f"{folder}: {some_of(lost)}: left out, as no panorama is called so")
+            notes.append(f"{folder}: {some_of(lost)}: left out, as they are the masks of no panorama")
     notes += [
         f"{root / 'mask.png'}: left out; if black in it is to be ignored in all panoramas, "
         "copy it to SCENE/masks/STEM.png"

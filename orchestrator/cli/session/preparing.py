@@ -290,9 +290,11 @@ class Preparation:
         shutil.rmtree(workspace_folder(scene.resolve()), ignore_errors=True)
         for masks in (MASKS, GIVEN):  # the scene has copies
             shutil.rmtree(self.folder.preparation / masks, ignore_errors=True)
-        self._counts = counts = _counts(json.loads(report.read_bytes()))
+        content = json.loads(report.read_bytes())
+        self._counts = counts = Counts.of(content)
         self._lines = self._lines or [f"{counts.registered} of {counts.panoramas} panoramas have a pose"]
-        self.journal.record([Noticed(PREPARE, line) for line in self._notices(counts)])
+        lines = [*self._notices(counts), *content.get("left_out", ())]
+        self.journal.record([Noticed(PREPARE, line) for line in lines])
 
     def _notices(self, counts: Counts) -> Iterator[str]:
         """What the user should read of the reconstruction."""
@@ -386,14 +388,3 @@ class Preparation:
         with suppress(OSError):
             notes.write_note(notes.progress_path(self.folder), note)
         self.journal.show_step(str(note))
-
-
-def _counts(content: Any) -> Counts:
-    """What sfm.json says of the reconstruction."""
-    return Counts(
-        panoramas=content["panoramas"],
-        registered=content["registered"],
-        points=content["points"],
-        weak_links=len(content["weak_links"]),
-        contradictions=len(content["contradictions"]),
-    )

@@ -45,6 +45,17 @@ class Counts(_Model):
     weak_links: _Count
     contradictions: _Count
 
+    @staticmethod
+    def of(content: Any) -> "Counts":
+        """What sfm.json, of this `content`, says of the reconstruction."""
+        return Counts(
+            panoramas=content["panoramas"],
+            registered=content["registered"],
+            points=content["points"],
+            weak_links=len(content["weak_links"]),
+            contradictions=len(content["contradictions"]),
+        )
+
 
 class StepResult(_Model):
     """A step that is done."""

@@ -26,6 +26,7 @@ REPORT = {
     "points": 300,
     "weak_links": [],
     "contradictions": [{"between": ["a", "b"]}],
+    "left_out": ["2 files (a.heic, b.heic): left out, each HEIC"],
 }
 Hook = Callable[[str], object]
 

@@ -47,6 +47,7 @@ def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> N
     noticed = [it.message for it in records if isinstance(it, Noticed) and str(it.task) == "prepare"]
     assert noticed[0] == "9 of 10 panoramas have a pose"
     assert noticed[1].startswith("without a pose: 1, contradictions: 1; ")
+    assert noticed[2] == "2 files (a.heic, b.heic): left out, each HEIC"
     done = shown("status", calm.root)
     assert [step["status"] for step in done["preparation"]["steps"]] == ["done"] * 3
     assert done["preparation"]["registered"] == 9
