@@ -76,10 +76,8 @@ def test_masks_that_belong_to_no_panorama_are_named(tmp_path: Path) -> None:
     write_mask(source.path / "images" / "mask.png")
     notes = import_scene(source, tmp_path / "scene").notes
     assert "1 of 6 panoramas have a mask in the source" in notes[0]
-    assert (
-        "masks: 4 files (a.png, b.png, left.png, …): left out, as they are the masks of no panorama"
-        in notes[1]
-    )
+    lost = "masks: 4 files (a.png, b.png, left.png, …): left out, as they are the masks of no panorama"
+    assert lost in notes[1]
     assert "images/mask.png: left out; if black in it is to be ignored in all panoramas" in notes[2]
     assert "depths: left out; `panolog scene depth` makes depth maps" in notes[3]
     assert len(notes) == 4
