@@ -92,6 +92,21 @@ class RunFolder:
         return self.root / "partition" / "plan.json"
 
     @property
+    def outline(self) -> Path:
+        """The place before it is partitioned, as a plan of one block: cameras, and the box around them."""
+        return self.root / "outline" / "plan.json"
+
+    @property
+    def outline_points(self) -> Path:
+        """Some of the sparse points, PLY."""
+        return self.root / "outline" / "points.ply"
+
+    @property
+    def known_plan(self) -> Path:
+        """The partition, or before there is one the outline: perhaps neither is there."""
+        return self.plan if self.plan.exists() else self.outline
+
+    @property
     def plan_picture(self) -> Path:
         """The partition from above."""
         return self.root / "partition" / "plan.png"

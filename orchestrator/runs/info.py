@@ -23,6 +23,7 @@ from panolog.orchestrator.runs.store import read_milestones
 from panolog.scene.errors import ConfigError, RunFolderError
 from panolog.scene.files import SUFFIX
 from panolog.scene.model import NO_OFFSET, Vector
+from panolog.workers.training.recipes import RECIPES
 
 _PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
 _ROOT = Path(__file__).parents[2]  # of the package, or of its checkout
@@ -52,6 +53,7 @@ class RunInfo(BaseModel):
     seed: int
     versions: dict[str, str]
     created: str  # UTC, ISO 8601
+    given: tuple[str, ...] | None = None  # settings that the user gave, by dotted key; None: not recorded
 
 
 def check_output(root: Path, fingerprint: str) -> None:
@@ -107,7 +109,7 @@ def clear(folder: RunFolder, *, keep_info: bool = False) -> None:
         path.unlink(missing_ok=True)
     for path in () if keep_info else (folder.info,):
         path.unlink(missing_ok=True)
-    for path in (folder.control, folder.sparse, folder.follower, folder.mirror.parent):
+    for path in (folder.control, folder.sparse, folder.follower, folder.mirror.parent, folder.outline.parent):
         shutil.rmtree(path, ignore_errors=True)
 
 
@@ -120,11 +122,20 @@ def discard(folder: RunFolder, made: Sequence[Path]) -> None:
             path.rmdir()
 
 
-def make_info(scene: SceneRef, config: RunConfig) -> RunInfo:
-    """The content of run.json of a new run."""
+def make_info(scene: SceneRef, config: RunConfig, wanted: RunConfig | None = None) -> RunInfo:
+    """The content of run.json of a new run. Args: wanted, the settings as the user gave them."""
+    preset, given = RECIPES[config.recipe].items(), None
+    if wanted is not None:
+        values = flat(wanted.model_dump(mode="json", exclude_unset=True))
+        given = tuple(key for key, value in values if (key, value) not in preset)
     created = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     return RunInfo(
-        scene=scene, config=config, seed=config.seed, versions=installed_versions(), created=created
+        scene=scene,
+        config=config,
+        seed=config.seed,
+        versions=installed_versions(),
+        created=created,
+        given=given,
     )
 
 

@@ -87,7 +87,7 @@ def site(root: Path) -> Iterator[Site]:
 
 
 def _listed(page: Page) -> None:
-    expect(page.locator("#runs tbody tr")).to_have_count(7)
+    expect(page.locator("#runs tbody tr")).to_have_count(8)
     expect(page.locator("#queue-entries li")).to_have_count(5)
 
 
@@ -164,7 +164,8 @@ SHOTS = (
     Shot("compare", lambda site: site.compare_url, _compared),
     _run("finished", _camera_around),
     _run("live", _failed_block),
-    _run("failed", _charts, "desk-light", "desk-dark"),
+    _run("failed", _drawn, "desk-light", "desk-dark", "phone-light"),
+    Shot("waiting", lambda site: site.run_url("waiting"), _drawn, ("desk-dark", "phone-light"), whole=False),
     _run("preparing", _prepared, "desk-light", "phone-light"),
     Shot("confirm", lambda site: site.run_url("live"), _confirm, ("desk-dark", "phone-light"), whole=False),
     Shot("missing", lambda site: f"{site.served.url}/runs/0123456789abcdef", _missing, ("phone-light",)),

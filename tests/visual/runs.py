@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -46,6 +46,7 @@ from panolog.orchestrator.runs.records import (
     Record,
     RunBegan,
     RunEnded,
+    RunWaiting,
     ScoresSaved,
     StopRequested,
     TaskFailed,
@@ -66,6 +67,7 @@ NAMES = {
     "killed": "riverside",
     "stopped": "quarry-test",
     "preparing": "arcade",
+    "waiting": "bridge",
 }
 LENGTH = 30_000  # iterations of a task
 _CAMERAS = 64
@@ -288,6 +290,20 @@ def live(root: Path, clock: Clock) -> RunFolder:
     return run.folder
 
 
+def waiting(root: Path, clock: Clock) -> RunFolder:
+    """One of two blocks is done, and the other is paused."""
+    with _written(root, clock, 2_700, "2x1x1") as run:
+        _stage_one(run)
+        done, paused = _partition(run)
+        run.add(_started(done), _started(paused), after=4)
+        _train(run, {done: (0.0, 1.0), paused: (0.0, 0.6)}, seconds=1_200, gaussians=380_000)
+        run.add(PauseRequested(paused), TaskYielded(paused), after=3)
+        _finish(run, [done], 402_000, 1_210.0)
+        run.add(RunWaiting(f"waiting: block {paused.number} is paused"))
+        run.folder.control.mkdir()
+    return run.folder
+
+
 def preparing(root: Path, clock: Clock) -> RunFolder:
     """A run of a video that has masks and poses, and estimates depth."""
     with _written(root, clock, 1_540, "auto") as run:
@@ -330,8 +346,8 @@ def preparing(root: Path, clock: Clock) -> RunFolder:
 
 @contextmanager
 def all_runs(root: Path, clock: Clock) -> Iterator[dict[str, RunFolder]]:
-    """The three runs and smaller ones that have ended, while drivers hold the locks of the live ones."""
-    makers = {"finished": finished, "live": live, "preparing": preparing}
+    """Four runs and smaller ones that have ended, while drivers hold the locks of the live ones."""
+    makers = {"finished": finished, "live": live, "preparing": preparing, "waiting": waiting}
     folders = {state: maker(root / NAMES[state], clock) for state, maker in makers.items()}
     why = "Stage I failed: street_031.jpg cannot be decoded; `panolog resume` tries again"
     ended: dict[str, tuple[Record, ...]] = {
@@ -341,11 +357,15 @@ def all_runs(root: Path, clock: Clock) -> Iterator[dict[str, RunFolder]]:
     }
     for days, (state, last) in enumerate(ended.items(), 2):
         with _written(root / NAMES[state], clock, days * 86_400, "2x1x1") as run:
+            write_json(run.folder.outline, town.plan("1x1x1", _CAMERAS)[0].to_json())
+            town.write_model(run.folder.outline_points)
             run.add(_started(COARSE), after=12)
             _train(run, {COARSE: (0.0, 0.42)}, seconds=400, gaussians=900_000)
             run.add(*last, after=9)
         folders[state] = run.folder
     (root / "damaged").mkdir()
     (root / "damaged" / "run.json").write_text("{")
-    with lock.hold(folders["live"].lock), lock.hold(folders["preparing"].lock):
+    with ExitStack() as drivers:
+        for state in ("live", "preparing", "waiting"):
+            drivers.enter_context(lock.hold(folders[state].lock))
         yield folders

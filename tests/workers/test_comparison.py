@@ -27,7 +27,7 @@ from tests.workers.trainings import block_of, bytes_of, coarse_of, notices, trai
 pytestmark = pytest.mark.system
 
 CONFIG = TrainConfig.model_validate(
-    {"sky": {"count": 60}, "checkpoint": {"every": 5, "share": 1}, "preview": {"every": 50}}
+    {"sky": {"count": 60}, "checkpoint": {"every": 5, "share": 1}, "preview": {"every": 50, "seconds": 1e9}}
 )
 
 

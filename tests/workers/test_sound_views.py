@@ -22,7 +22,7 @@ from tests.workers.small import WIDTH, small_scene
 from tests.workers.trainings import checkpoints, coarse_of, evaluation_of, same, score_of, trained
 
 CONFIG = TrainConfig.model_validate(
-    {"sky": {"count": 60}, "checkpoint": {"every": 3, "share": 1}, "preview": {"every": 4}}
+    {"sky": {"count": 60}, "checkpoint": {"every": 3, "share": 1}, "preview": {"every": 4, "seconds": 1e9}}
 )
 NONE = CONFIG.model_copy(update={"images": CONFIG.images.model_copy(update={"damaged": 0.0})})
 

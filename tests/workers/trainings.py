@@ -29,7 +29,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "reset": {"every_floor": 9, "opacity": 0.05},
     "sh": {"every": 6000},
     "checkpoint": {"every": 5, "share": 1},
-    "preview": {"every": 8},
+    "preview": {"every": 8, "seconds": 1e9},
 }
 RELOCATED: dict[str, Any] = {  # of "densify": growth to a budget
     **{"method": "relocate", "until": 25_000, "growth": 0.3, "weight": "gradient", "long_axis": True},

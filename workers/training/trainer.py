@@ -30,7 +30,7 @@ from panolog.workers.capture.learning import Learning
 from panolog.workers.comparison import better_block, with_block
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Trained
 from panolog.workers.merge import retained
-from panolog.workers.meter import Meter
+from panolog.workers.meter import Meter, PreviewClock
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.checkpoint import loaded
@@ -140,6 +140,7 @@ class Trainer:
         self.schedule = Schedule(spec.config, spec.iterations, extent, spec.cell is not None)
         self.loss = Loss(scene, spec.config, spec.seed, self.schedule)
         self.meter = Meter(spec.task, spec.iterations, spec.device)
+        self.previews = PreviewClock(spec.config.preview)
         self.saver = Saver(spec.config.checkpoint, spec.outbox, spec.device)
         device = self.device = torch.device(spec.device)
         launch, count, broken = ops.launcher(device), self.meter.count, self._not_finite
@@ -249,7 +250,7 @@ class Trainer:
             if self.meter.due() or last:
                 count, rates = len(self.state.gaussians), self.schedule.rates(iteration)
                 yield self.meter.progress(iteration, count, rates)
-            if iteration % self.spec.config.preview.every == 0 or last:
+            if self.previews.due(iteration) or last:
                 yield self._preview()
             stopped = stop() and not last
             if stopped or (self.saver.due(iteration) and not last):
@@ -388,11 +389,11 @@ class Trainer:
         self.settle()
         view, degree = self.views.first(self.spec.views), self.schedule.sh_degree(self.iteration)
         model, camera, around = self.state.gaussians, self._camera(view.row), self._around(view.row)
-        with torch.no_grad():
+        with torch.no_grad(), self.previews.timed():
             rendered = render(model, camera, sh_degree=degree, near=self.near, exterior=around)
-        photograph, picture = view.image.cpu().numpy(), to_bytes(rendered.color)
-        if around is not None:
-            left_out = ~around.active(self.spec.width, self.spec.width // 2).cpu().numpy()
-            picture[left_out] = photograph[left_out] // 4
-        jpeg = encode_jpeg(np.concatenate([picture, photograph]), PREVIEW_WIDTH)
+            photograph, picture = view.image.cpu().numpy(), to_bytes(rendered.color)
+            if around is not None:
+                left_out = ~around.active(self.spec.width, self.spec.width // 2).cpu().numpy()
+                picture[left_out] = photograph[left_out] // 4
+            jpeg = encode_jpeg(np.concatenate([picture, photograph]), PREVIEW_WIDTH)
         return Preview(self.spec.task, self.iteration, self.scene.panoramas[view.row].name, jpeg)

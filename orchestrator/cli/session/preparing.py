@@ -19,6 +19,7 @@ from pydantic import TypeAdapter
 
 from panolog.orchestrator.engine.driver.journal import Journal
 from panolog.orchestrator.engine.driver.requests import interrupt
+from panolog.orchestrator.engine.stages.outline import write_outline
 from panolog.orchestrator.runs import control
 from panolog.orchestrator.runs import info as run_info
 from panolog.orchestrator.runs.config import RunConfig
@@ -129,14 +130,13 @@ def settings_of(source: Path, options: Options) -> Settings | None:
         read_trajectory(Path(trajectory))
         sfm["trajectory"] = str(Path(trajectory).resolve())
     video, panoramas, width, masked = _look_at(source)
-    nadir = (0.0 if masked else NADIR) if options.nadir is None else options.nadir
     return Settings(
         source=str(source.resolve()),
         video=video,
         panoramas=panoramas,
         width=width,
         sfm=sfm,
-        nadir=nadir,
+        nadir=(0.0 if masked else NADIR) if options.nadir is None else options.nadir,
         static=not masked if options.static is None else options.static,
         depth_model=options.depth_model and str(Path(options.depth_model).resolve()),
     )
@@ -295,6 +295,7 @@ class Preparation:
         self._lines = self._lines or [f"{counts.registered} of {counts.panoramas} panoramas have a pose"]
         lines = [*self._notices(counts), *content.get("left_out", ())]
         self.journal.record([Noticed(PREPARE, line) for line in lines])
+        self.journal.until_done(lambda: write_outline(self.folder, read_scene(scene), RunConfig()))
 
     def _notices(self, counts: Counts) -> Iterator[str]:
         """What the user should read of the reconstruction."""

@@ -24,6 +24,7 @@ from panolog.orchestrator.engine.driver.requests import interruptible, on_signal
 from panolog.orchestrator.engine.estimates.preflight import Preflight, examine, require_memory
 from panolog.orchestrator.engine.scheduling.pool import Pool
 from panolog.orchestrator.engine.stages.measuring import Measuring
+from panolog.orchestrator.engine.stages.outline import write_outline
 from panolog.orchestrator.engine.stages.scenes import measured_scene, save_measured, scene_of
 from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs import folder as run_folder
@@ -89,15 +90,14 @@ def start(
     new = preparing.found(source, config, options or Options())
     new.check_output(root)
     if address is None and config.device == "cuda":
-        choose_device(config.device)
-    if new.scene is not None:
-        require_memory(new.scene, new.config)
+        choose_device(config.device)  # which refuses what is missing
+    require_memory(new.scene, new.config)
     folder = RunFolder(root)
     made = run_folder.make(root)
     with lock.hold(folder.lock), ExitStack() as undo:
         new.check_output(root)  # another driver may have been quicker
         undo.callback(preparing.discard, folder, made)
-        info = run_info.make_info(new.reference(folder), new.config)
+        info = run_info.make_info(new.reference(folder), new.config, config)
         if new.settings is not None:  # first, so that this can be resumed from now on
             write_settings(folder, new.settings)
             run_info.write_info(folder, info)
@@ -206,16 +206,13 @@ class _Beginning:
         return self.made
 
     def prepare(self, info: RunInfo, settings: Settings | None) -> RunInfo:
-        """Makes the scene of a run that was given none, and returns run.json with it.
-
-        Raises as `Preparation.make`.
-        """
-        if settings is None:
-            return info
-        self.made = preparing.Preparation(self.folder, settings, self.journal).make()
-        config = preparing.with_width(self.made.width, info.config)
-        info = info.model_copy(update={"scene": preparing.reference(self.made), "config": config})
-        self.journal.until_done(lambda: run_info.write_info(self.folder, info))
+        """Makes the scene of a run that was given none, and returns run.json with it. Raises as `make`."""
+        if settings is not None:
+            self.made = preparing.Preparation(self.folder, settings, self.journal).make()
+            config = preparing.with_width(self.made.width, info.config)
+            info = info.model_copy(update={"scene": preparing.reference(self.made), "config": config})
+            self.journal.until_done(lambda: run_info.write_info(self.folder, info))
+        self.journal.until_done(lambda: write_outline(self.folder, self.scene, info.config))
         return info
 
     def take_over(

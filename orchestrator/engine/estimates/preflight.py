@@ -145,12 +145,12 @@ def examine(
     return Preflight(estimator.config, basis, estimator.estimate(), nodes, free, why, chosen, table)
 
 
-def require_memory(scene: Scene, config: RunConfig) -> None:
+def require_memory(scene: Scene | None, config: RunConfig) -> None:
     """Refuses a `memory` that is less than what a task takes without any Gaussians, before anything starts.
 
-    Args: config with a width. Raises InputError, which says what is the least.
+    Args: scene, if it is known; config with a width. Raises InputError, which says what is the least.
     """
-    if config.memory is None or config.memory * 2**30 >= device_memory.CONTEXT:
+    if scene is None or config.memory is None or config.memory * 2**30 >= device_memory.CONTEXT:
         return
     bare = change(config, {"densify.max_gaussians": 1, "cache.memory": config.memory})
     least = math.ceil(10 * _most_memory(_whole(scene, bare, assumed(scene, bare))) / 2**30) / 10

@@ -2,6 +2,7 @@
 
 import json
 from collections import OrderedDict
+from contextlib import suppress
 from threading import Lock
 from typing import Any
 
@@ -25,10 +26,10 @@ _CACHED = 4  # maps, of about a megabyte
 
 
 def _read_plan(entry: RunEntry) -> Plan:
-    """The plan of a run. Raises InputError if there is none or it contradicts itself."""
+    """The plan of a run, or its outline. Raises InputError if there is none or it contradicts itself."""
     folder = entry.folder
     try:
-        data = json.loads(read_below(folder.plan, folder.root, _MOST))
+        data = json.loads(read_below(folder.known_plan, folder.root, _MOST))
     except ValueError as error:
         raise InputError(f"plan.json: is not JSON: {error}") from error
     return Plan.from_json(data)
@@ -61,24 +62,25 @@ def _figure(entry: RunEntry) -> Figure:
     folder, seams = entry.folder, {}
     if folder.seams.exists():
         seams = dict(by_blocks(parse_seams(read_below(folder.seams, folder.root, _MOST))))
-    return map_figure(_read_plan(entry), _points(entry), seams=seams)
+    planned = folder.plan.exists()
+    return map_figure(_read_plan(entry), _points(entry), seams=seams, planned=planned)
 
 
 def _stamp(entry: RunEntry) -> tuple[int, ...]:
     """A value that changes when the plan, the points or the seams do."""
     folder = entry.folder
-    stats = [path.stat() for path in (folder.plan, folder.model(COARSE), folder.seams) if path.exists()]
+    files = (folder.known_plan, folder.model(COARSE), folder.seams)
+    stats = [path.stat() for path in files if path.exists()]
     return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
 
 
 def _points(entry: RunEntry) -> NDArray[np.floating[Any]]:
-    """(P, 3) of the scene: the Gaussians of Stage I, if their file still exists."""
+    """(P, 3) of the scene: the Gaussians of Stage I, else sparse points; none if both files are gone."""
     folder = entry.folder
-    try:
-        with opened(folder.model(COARSE), folder.root) as file:
+    for path in (folder.model(COARSE), folder.outline_points):
+        with suppress(InputError), opened(path, folder.root) as file:
             return read_points(by_handle(file.fileno()))
-    except InputError:
-        return np.empty((0, 3), np.float32)
+    return np.empty((0, 3), np.float32)
 
 
 def camera_of(entry: RunEntry, row: int) -> PlanCamera | None:
@@ -88,11 +90,16 @@ def camera_of(entry: RunEntry, row: int) -> PlanCamera | None:
 
 
 def scored_camera_of(entry: RunEntry, row: int) -> tuple[PlanCamera, tuple[float, ...]] | None:
-    """One camera of the plan with its gradient scores, one for each block; None if there is no such row."""
+    """One camera of the plan with its gradient scores, one for each block; before there is a plan none.
+
+    Returns None if there is no such row.
+    """
     plan, folder = _read_plan(entry), entry.folder
     if row not in plan.rows:
         return None
     k = plan.rows.index(row)
+    if not folder.plan.exists():
+        return plan.camera_json(k).model_copy(update={"assigned": {}}), ()
     with opened(folder.scores, folder.root) as file:
         scores = read_scores(file, plan.rows, plan.grid.count)
     return plan.camera_json(k), tuple(scores[[k], :].toarray()[0].tolist())

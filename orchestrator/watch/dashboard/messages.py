@@ -32,6 +32,7 @@ class Results(ViewModel):
 
     model: bool
     report: bool
+    map: bool = False  # whether cameras and points can be shown from above, also before there is a plan
     exposure: str | None = None
     findings: str = ""
 

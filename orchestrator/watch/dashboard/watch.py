@@ -186,6 +186,7 @@ class Watch:
         result = Results(
             model=folder.point_cloud.is_file(),
             report=folder.report.is_file(),
+            map=folder.known_plan.is_file(),
             exposure=version_of(folder.exposure),
             findings=findings_version(folder),
         )

@@ -22,15 +22,20 @@ _RINGED = 1_500  # cameras up to which rings are drawn: each is a shape of its o
 
 
 def map_figure(
-    plan: Plan, points: NDArray[np.floating], seams: Mapping[tuple[int, int], float] | None = None
+    plan: Plan,
+    points: NDArray[np.floating],
+    seams: Mapping[tuple[int, int], float] | None = None,
+    *,
+    planned: bool = True,
 ) -> Figure:
     """A plan from above in world space: cells, faces, AABB, points and cameras.
 
-    The figure has one more key, "blocks": `count` and `colors` of all blocks, `names` of the cameras,
+    The figure has one more key, "blocks": `planned`; `count` and `colors` of all blocks; `names` of cameras,
     `grades` for the legend of seams, and for blocks on top of each other `layers`, the `layer` shown and the
     `stride` of ids between layers. The trace "blocks" has the ids of the lowest layer as `z`.
 
-    Args: points (P, 3) of the scene, such as those of `plan_map.read_points`; seams of faces by their blocks.
+    Args: points (P, 3) of the scene, such as those of `plan_map.read_points`; seams of faces by their blocks;
+    planned, False of an outline: its only block is none.
     """
     view = window_on(plan, points)
     return {
@@ -39,12 +44,13 @@ def map_figure(
             _density(view, points),
             _line("faces", view.faces(), _GREY, "solid"),
             *_seams(view, seams or {}),
-            _line("box", view.outline(), _GREY, "dash"),
-            *_cameras(view),
-            _labels(view),
+            _line("box", view.outline()[: None if planned else 0], _GREY, "dash"),
+            *_cameras(view, planned=planned),
+            _labels(view, planned=planned),
         ],
         "layout": _map_layout(view),
         "blocks": {
+            "planned": planned,
             "count": plan.grid.count,
             "colors": view.colors,
             "names": list(plan.names),
@@ -141,7 +147,7 @@ def _seams(view: MapWindow, seams: Mapping[tuple[int, int], float]) -> list[dict
     return traces
 
 
-def _cameras(view: MapWindow) -> list[dict[str, Any]]:
+def _cameras(view: MapWindow, *, planned: bool) -> list[dict[str, Any]]:
     """A disc for each camera in the colour of its own block, and rings for other blocks that it trains."""
     plan = view.plan
     blocks = [served(plan, k) for k in range(len(plan.rows))]
@@ -158,7 +164,7 @@ def _cameras(view: MapWindow) -> list[dict[str, Any]]:
                 "x": places[:, 0].tolist(),
                 "y": places[:, 1].tolist(),
                 "customdata": [plan.rows[k] for k in here],
-                "text": [f"{escape(plan.names[k])}<br>trains {_listed(blocks[k])}" for k in here],
+                "text": [escape(plan.names[k]) + planned * f"<br>trains {_listed(blocks[k])}" for k in here],
                 "marker": {
                     "size": RINGS[ring] * size,
                     "color": [block_color(blocks[k][ring]) for k in here],
@@ -176,9 +182,9 @@ def _listed(blocks: Sequence[int]) -> str:
     return f"block{'s' * (len(blocks) > 1)} {head}{', …' * (len(blocks) > 8)}"
 
 
-def _labels(view: MapWindow) -> dict[str, Any]:
+def _labels(view: MapWindow, *, planned: bool) -> dict[str, Any]:
     """The number of each cell on a disc, if there are not too many."""
-    few = len(np.unique(view.cells)) <= LABELS
+    few = planned and len(np.unique(view.cells)) <= LABELS
     ids, places = view.labels() if few else (np.empty(0, np.int64), np.empty((0, 2)))
     shown = ids + view.layer * view.stride
     return {

@@ -26,6 +26,7 @@ from panolog.orchestrator.watch.views.timing import share_of, tasks_of
 from panolog.workers.tasks import Stage
 from panolog.workers.training.recipes import RECIPES
 
+_CHOSEN = ("device", "width", "partition.cuts")  # settings that a run chooses where they are not given
 STOPPED: Literal["stopped"] = "stopped"  # of a stage whose driver has ended before it
 
 
@@ -280,20 +281,31 @@ def _nodes(
 
 
 def _settings(info: Mapping[str, Any]) -> tuple[SettingView, ...]:
-    """All settings of a run, flat, next to their defaults, those of its recipe where it has one."""
-    given = dict(flat(info.get("config") or {}))
-    preset = RECIPES.get(given.get("recipe", "paper"), {})
+    """All settings of a run, flat, next to their defaults, those of its recipe; first what was changed.
+
+    What the run has chosen itself, such as its device, is no change.
+    """
+    values, given = dict(flat(info.get("config") or {})), info.get("given")
+    preset = RECIPES.get(values.get("recipe", "paper"), {})
     fields = {key: (preset.get(key, default), text) for key, (default, text) in map(_field, keys())}
-    return tuple(
+
+    def changed(key: str) -> bool:
+        if key not in fields:
+            return True
+        differs = key in values and values[key] != fields[key][0]
+        return differs and (key in given if isinstance(given, list) else key not in _CHOSEN)
+
+    views = [
         SettingView(
             key=key,
-            value=given.get(key),
+            value=values.get(key),
             default=fields[key][0] if key in fields else None,
-            changed=key not in fields or (key in given and given[key] != fields[key][0]),
+            changed=changed(key),
             unit_or_doc=fields[key][1] if key in fields else "not a setting of this version",
         )
-        for key in [*fields, *(key for key in given if key not in fields)]
-    )
+        for key in [*fields, *(key for key in values if key not in fields)]
+    ]
+    return tuple(sorted(views, key=lambda view: not view.changed))
 
 
 def _field(key: str) -> tuple[str, tuple[Any, str]]:

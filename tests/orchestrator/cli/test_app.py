@@ -68,12 +68,12 @@ def test_wrong_options(scene: Path, tmp_path: Path, arguments: tuple[str, ...], 
 def test_folders_that_are_no_run_and_no_scene(tmp_path: Path) -> None:
     for command in ("status", "resume", "events", "eval", "partition"):
         assert "is not a run folder" in one_line(call(command, tmp_path))
-    expected = "give a scene, a folder of panoramas or a 360° video"
+    wanted = "give a scene, a folder of panoramas or a 360° video"
     none = one_line(call("run", tmp_path / "none", "-o", tmp_path / "run"))
-    assert none == f"panolog: {tmp_path / 'none'}: there is no such file or folder; {expected}"
+    assert none == f"panolog: {tmp_path / 'none'}: there is no such file or folder; {wanted}"
     (tmp_path / "empty").mkdir()
     empty = one_line(call("run", tmp_path / "empty", "-o", tmp_path / "run"))
-    assert empty == f"panolog: {tmp_path / 'empty'}: the folder is empty; {expected}"
+    assert empty == f"panolog: {tmp_path / 'empty'}: the folder is empty; {wanted}"
     assert "no such folder" in one_line(call("scene", "info", tmp_path / "none"))
     assert "`panolog run` makes one of panoramas" in one_line(call("scene", "info", tmp_path / "empty"))
 

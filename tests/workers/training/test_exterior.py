@@ -39,7 +39,7 @@ USUAL: dict[str, Any] = {
     "sky": {"count": 60},
     "densify": {"method": "relocate", "until": 24_000, "every_floor": 5},
     "checkpoint": {"every": 7, "share": 1},
-    "preview": {"every": 12},
+    "preview": {"every": 12, "seconds": 1e9},
 }
 
 

@@ -89,6 +89,7 @@ def _message(folder: RunFolder, view: RunView) -> dict[str, Any]:
             "model": False,
             "report": False,
             "exposure": version_of(folder.exposure),
+            "map": folder.known_plan.exists(),
             "findings": findings_version(folder),
         },
     }
@@ -104,10 +105,11 @@ def _answers(folder: RunFolder, view: RunView, found: Findings) -> Iterator[tupl
             yield f"{_PATH}/preparation/{picture.name}?{picture.version}", _picture(made)
     if folder.exposure.is_file():
         yield f"{_PATH}/exposure", exposure_curve(folder, Path.read_bytes)
-    if folder.plan.exists():
-        plan = read_plan(folder.plan)
-        seams = by_blocks(found.seams)
-        yield f"{_PATH}/map", map_figure(plan, read_points(folder.model(COARSE)), seams)
+    if folder.known_plan.exists():
+        plan, planned = read_plan(folder.known_plan), folder.plan.exists()
+        model = folder.model(COARSE)
+        points = read_points(model if model.exists() or planned else folder.outline_points)
+        yield f"{_PATH}/map", map_figure(plan, points, by_blocks(found.seams), planned=planned)
         yield from _cameras(folder, plan)
     if folder.database.exists():
         without = Filter(without=frozenset({Progressed.__name__}))

@@ -23,6 +23,7 @@ from panolog.orchestrator.runs.records import (
     Merged,
     ModelSaved,
     Noticed,
+    PreflightSaved,
     PreviewSaved,
     Progressed,
     Record,
@@ -87,6 +88,7 @@ def write_whole_run(root: Path, scene: str = "/scenes/town") -> RunFolder:
     append(
         folder,
         RunBegan(socket.gethostname(), 1, resumed=False),
+        PreflightSaved("preflight.json", {"coarse": 60.0, "block": 90.0, "merge": 1.0, "eval": 5.0}),
         started(COARSE),
         progressed(COARSE, 50),
         PreviewSaved(COARSE, 50, "1.jpg", "coarse/previews/000050.jpg"),

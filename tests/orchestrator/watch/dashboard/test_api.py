@@ -6,25 +6,33 @@ import hashlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
 import pytest
 
+from panolog.orchestrator.engine.stages.outline import write_outline
+from panolog.orchestrator.engine.stages.partitioning import write_plan
+from panolog.orchestrator.runs.config import RunConfig, change, load_config
 from panolog.orchestrator.runs.folder import write_json
-from panolog.orchestrator.runs.records import Noticed, Outcome, RunBegan, RunEnded
+from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
+from panolog.orchestrator.runs.records import Noticed, Outcome, Record, RunBegan, RunEnded
 from panolog.orchestrator.watch.views import queries
+from panolog.orchestrator.watch.views.pages.shell import STATIC
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.watch.dashboard import api_types
 from tests.orchestrator.watch.dashboard.served import (
+    SCORES,
     Served,
+    plan,
     progressed,
     serving,
     started,
     write_run,
     write_whole_run,
 )
+from tests.workers.small import small_scene
 
 
 def test_the_declaration_for_the_pages_is_up_to_date() -> None:
@@ -42,7 +50,7 @@ def test_the_list_has_a_row_for_each_run(tmp_path: Path) -> None:
     assert rows["a/b"]["status"] == "stopped"
     assert rows["a/b"]["scene"] == "town"
     assert rows["a/b"]["gaussians"] == 500
-    assert 0 < rows["a/b"]["progress"] < 1
+    assert rows["a/b"]["progress"] < 1
     assert rows["done"]["progress"] == 1
     assert all(row["error"] is None for row in rows.values())
 
@@ -50,14 +58,59 @@ def test_the_list_has_a_row_for_each_run(tmp_path: Path) -> None:
 def test_the_page_of_a_run_has_its_results_and_settings(served: Served) -> None:
     run = served.get(f"/api/runs/{served.id('run')}")
     assert run["result"].pop("findings") == "- - - -"
-    assert run["result"] == {"model": True, "report": True, "exposure": None}
+    assert run["result"] == {"model": True, "report": True, "map": True, "exposure": None}
     settings = {setting["key"]: setting for setting in run["config"]}
     assert settings["iterations"]["changed"]
+    assert run["config"][0]["key"] == "iterations"  # what was changed is first
+    assert not settings["width"]["changed"]  # it is the scene's
     assert not settings["sky.kappa"]["changed"]
     assert not settings["partition.cuts"]["changed"]  # a list in run.json
     relocates = settings["densify.method"]
     assert (relocates["value"], relocates["changed"]) == ("relocate", False)  # that is its recipe's
     assert "eq. 3" in settings["sky.kappa"]["unit_or_doc"]
+
+
+def test_what_the_user_gave_is_changed_and_what_the_run_chose_is_not(tmp_path: Path) -> None:
+    given = load_config(flags={"width": 64, "iterations": 30_000, "seed": 3})
+    resolved = change(given, {"device": "cpu", "densify.max_gaussians": 9_000})
+    info = make_info(SceneRef(path="/scenes/town", fingerprint="f"), resolved, given)
+    assert sorted(info.given or ()) == ["iterations", "seed", "width"]
+    folder = write_run(tmp_path / "run")
+    write_info(folder, info)
+    with serving(tmp_path) as served:
+        settings = served.get(f"/api/runs/{served.id('run')}")["config"]
+    assert [it["key"] for it in settings if it["changed"]] == ["width", "seed"]  # the others are defaults
+
+
+def test_the_map_and_the_cameras_are_there_before_there_is_a_plan(tmp_path: Path) -> None:
+    scene = small_scene(tmp_path / "scene")
+    folder = write_run(tmp_path / "run")
+    with serving(tmp_path) as served:
+        path = f"/api/runs/{served.id('run')}"
+        assert not served.get(path)["result"]["map"]
+        write_outline(folder, scene, RunConfig(width=64))
+        assert served.get(path)["result"]["map"]
+        figure = served.get(f"{path}/map")
+        names = [scene.panoramas[row].name for row in scene.train]
+        assert (figure["blocks"]["planned"], figure["blocks"]["names"]) == (False, names)
+        (cameras,) = (trace for trace in figure["data"] if trace["name"] == "cameras")
+        assert (cameras["customdata"], cameras["text"]) == (list(scene.train), names)
+        row = scene.train[1]
+        camera = served.get(f"{path}/camera/{row}")
+        assert (camera["name"], camera["scores"], camera["assigned"]) == (names[1], [], {})
+        (points,) = (trace for trace in figure["data"] if trace["name"] == "points")
+        assert np.frombuffer(base64.b64decode(points["z"]["bdata"]), np.uint8).any()
+        write_plan(folder, plan(), SCORES)
+        assert served.get(f"{path}/map")["blocks"]["planned"]
+
+
+def test_every_record_has_words_in_the_log() -> None:
+    def names(kind: Any) -> set[str]:
+        parts = get_args(kind)
+        return set().union(*map(names, parts)) if parts else {kind.__name__}
+
+    words = (STATIC / "run" / "log.js").read_text()
+    assert names(Record) == set(re.findall(r"^  (\w+): \[", words, re.MULTILINE))
 
 
 def test_a_run_whose_scene_is_gone_allows_no_action(served: Served) -> None:

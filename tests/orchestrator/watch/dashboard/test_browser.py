@@ -248,9 +248,15 @@ def test_the_log_is_filtered(town: Page) -> None:
 
 
 def test_settings_that_differ_are_marked(town: Page) -> None:
-    town.get_by_label("only changed").check()
-    expect(town.locator("#setting-table code")).to_have_text(["iterations", "width"])
-    expect(town.locator("#setting-table .changed")).to_have_count(2)
+    expect(town.get_by_label("only changed")).to_be_checked()
+    expect(town.locator("#setting-table code")).to_have_text(["iterations"])
+    expect(town.locator("#setting-table .changed")).to_have_count(1)
+    town.get_by_label("Search settings").fill("no such words")
+    expect(town.locator("#setting-table tbody")).to_have_text("No setting has these words.")
+    town.get_by_label("Search settings").fill("")
+    town.get_by_label("only changed").uncheck()
+    expect(town.locator("#setting-table code").first).to_have_text("iterations")
+    expect(town.locator("#setting-table code").nth(50)).to_be_visible()
 
 
 def test_what_a_scene_says_stays_text(browser: Browser, shown: Served) -> None:

@@ -110,6 +110,8 @@ export function curves(path, table) {
         }
         settled = shown.size >= FIRST;
       }
+      byId("charts").hidden = !begun.length;
+      byId("charts-empty").hidden = begun.length > 0;
       chips();
     },
     /** @param {string[]} colors */

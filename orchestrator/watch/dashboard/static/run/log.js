@@ -11,6 +11,8 @@ const QUIET = "quiet"; // the filter without progress
 /** The label and the text of each type of event. @type {Record<string, [string, (e: RunEvent) => string]>} */
 const TYPES = {
   RunBegan: ["Driver", (e) => `${e.resumed ? "resumed the run" : "started"} on ${e.host}`],
+  Preparing: ["Preparing", (e) => e.step],
+  PreflightSaved: ["Preflight", (e) => `about ${duration(Object.values(e.seconds).reduce((sum, seconds) => sum + (seconds ?? 0), 0))} in all`],
   TaskStarted: ["Started", (e) => `attempt ${e.attempt}${e.iteration ? ` from iteration ${count(e.iteration)}` : ""} on ${e.node}, ${e.device}, ${e.threads} threads`],
   Progressed: ["Progress", (e) => `${count(e.iteration)} of ${count(e.iterations)}, ${fixed(e.rate, 1)} it/s${e.loss === null ? "" : `, loss ${significant(e.loss)}`}`],
   PreviewSaved: ["Picture", (e) => `${e.view} at iteration ${count(e.iteration)}`],
@@ -27,7 +29,7 @@ const TYPES = {
   MeasuresSaved: ["Measures", (e) => `${count(e.views)} panoramas, ${count(e.faces)} seams`],
   EvaluationSaved: ["Metrics", (e) => `PSNR ${decibel(e.metrics.psnr)}, SSIM ${fixed(e.metrics.ssim, 4)}`],
   Transferred: ["Moved", (e) => `${bytes(e.received)} received, ${bytes(e.sent)} sent`],
-  StopRequested: ["Stop requested", (e) => `${count(e.tasks)} tasks save a checkpoint first`],
+  StopRequested: ["Stop", (e) => (e.tasks ? `${e.tasks > 1 ? `${count(e.tasks)} tasks save` : "a task saves"} a checkpoint first` : "no task is in training")],
   PauseRequested: ["Pause requested", () => "saves a checkpoint, then waits"],
   UnpauseRequested: ["Resume requested", () => "resumes when a worker is free"],
   RetryRequested: ["Retry requested", () => "gets all its attempts again"],

@@ -17,6 +17,13 @@ const FULL = 0.42; // and of what is done
 const MARK = 60; // of 255, added to the opacity of the selected block
 /** A mark for each state, next to the number of a block: its colour alone says nothing to many. @type {Record<string, string>} */
 const MARKS = { done: "✓", failed: "✕", paused: "‖", running: "▸" };
+/** Sign and meaning of what else the map has, and whether only a plan has it. @type {[string, string, boolean][]} */
+const MARKED = [
+  ["●", "camera", false],
+  ["◎", "rings: other blocks that it trains", true],
+  ["∴", "points", false],
+  ["╌", "box, beyond which cells bend", true],
+];
 const coarse = matchMedia("(pointer: coarse)"); // a finger on the map scrolls the page
 
 /** @param {string} color @param {number} alpha */
@@ -71,6 +78,8 @@ export function planMap(path, choose) {
 
   /** @param {string} name @returns {Trace} */
   const trace = (name) => figure?.data.find((item) => item.name === name) ?? { name };
+  /** @returns {number[]} */
+  const cameraRows = () => (figure ? trace("cameras").customdata : []);
   const cameras = () => (figure?.data ?? []).filter((item) => item.name.startsWith("cameras"));
   /** @param {number} block @returns {[string, number]} */
   const statusOf = (block) => statuses.get(block) ?? ["waiting", 0];
@@ -93,8 +102,11 @@ export function planMap(path, choose) {
     shift(figure);
     byId("map-empty").hidden = true;
     byId("legend").hidden = false;
+    const { planned } = figure.blocks;
+    const drawn = MARKED.filter(([, , ofPlan]) => planned || !ofPlan);
     byId("legend").replaceChildren(
-      ...BLOCK_STATUSES.map((status) => el("li", { "data-block-status": status }, `${MARKS[status] ?? ""} ${STATES[status] ?? status}`)),
+      ...drawn.map(([mark, text]) => el("li", { class: "mark" }, el("span", { "aria-hidden": "true" }, mark), text)),
+      ...(planned ? BLOCK_STATUSES : []).map((status) => el("li", { "data-block-status": status }, `${MARKS[status] ?? ""} ${STATES[status] ?? status}`)),
       ...figure.blocks.grades.map(([text, color]) => el("li", { class: "grade", style: `--tone: ${color}` }, text)),
     );
     const [across, up] = [figure.layout.xaxis, figure.layout.yaxis].map(({ range: [low, high] }) => high - low);
@@ -105,10 +117,10 @@ export function planMap(path, choose) {
     for (const event of ["click", "hover", "unhover"]) plot.removeAllListeners?.(`plotly_${event}`);
     plot.on("plotly_click", ({ points: [{ data, customdata }] }) => {
       if (data.name.startsWith("cameras")) choose.camera(customdata);
-      else if (data.name !== "seams") choose.block(Number(customdata));
+      else if (figure?.blocks.planned && data.name !== "seams") choose.block(Number(customdata));
     });
     plot.on("plotly_hover", ({ points: [{ data, customdata }] }) => {
-      const block = data.name === "blocks" || data.name === "labels";
+      const block = figure?.blocks.planned && (data.name === "blocks" || data.name === "labels");
       setText(byId("pointed"), block ? describe(Number(customdata)) : data.name === "seams" ? data.text : "");
     });
     plot.on("plotly_unhover", () => setText(byId("pointed"), ""));
@@ -148,6 +160,7 @@ export function planMap(path, choose) {
   /** Updates the text for screen readers. */
   function label() {
     drawn = key();
+    if (!figure?.blocks.planned) return plot.setAttribute("aria-label", `The ${cameraRows().length} cameras and the points from above`);
     const shares = [...statuses.values()].map(([, share]) => share);
     const done = percent(shares.reduce((sum, share) => sum + share, 0) / Math.max(shares.length, 1));
     const groups = Object.entries(Object.groupBy(statuses.values(), ([status]) => status));
@@ -156,7 +169,7 @@ export function planMap(path, choose) {
   }
 
   async function repaint() {
-    if (!figure || !plot.layout) return;
+    if (!figure?.blocks.planned || !plot.layout) return;
     if (plot._dragging) return soon(); // plotly would end the drag
     if (marks !== states()) return render();
     label();
@@ -202,7 +215,7 @@ export function planMap(path, choose) {
       x: x0 - dx / 2, y: y0 + (rows - 0.5) * dy, sizex: columns * dx, sizey: rows * dy,
     };
     const data = figure.data.map((item) => ({ ...item }));
-    await draw(plot, data, { ...layout, images: [image], dragmode: coarse.matches ? false : "pan" });
+    await draw(plot, data, { ...layout, images: figure.blocks.planned ? [image] : [], dragmode: coarse.matches ? false : "pan" });
   }
 
   const key = () => JSON.stringify([...statuses].map(([block, [status, share]]) => [block, status, Math.floor(share * 200)]));
@@ -239,9 +252,9 @@ export function planMap(path, choose) {
 
   return {
     /** @param {RunPage} run @param {Map<number, [string, number]>} current */
-    update({ summary: { blocks } }, current) {
+    update({ summary: { blocks }, result }, current) {
       statuses = current;
-      const plan = blocks.length ? JSON.stringify(blocks) : "";
+      const plan = blocks.length ? JSON.stringify(blocks) : result.map ? "outline" : "";
       if (plan && plan !== requested) {
         requested = plan;
         load();
@@ -255,6 +268,6 @@ export function planMap(path, choose) {
       else render();
     },
     /** Rows and names of the cameras, for the keyboard. @returns {{row: number, name: string}[]} */
-    cameras: () => (figure ? trace("cameras").customdata.map((/** @type {number} */ row, /** @type {number} */ i) => ({ row, name: figure?.blocks.names[i] })) : []),
+    cameras: () => cameraRows().map((row, i) => ({ row, name: figure?.blocks.names[i] ?? "" })),
   };
 }

@@ -231,7 +231,8 @@ export function settings() {
   const show = () => {
     const word = search.value.toLowerCase();
     const found = config.filter((setting) => (!changed.checked || setting.changed) && `${setting.key} ${setting.unit_or_doc}`.toLowerCase().includes(word));
-    replaceIfChanged(first("#setting-table tbody"), found, () => found.map(settingRow));
+    const none = config.length && changed.checked && !word ? "All settings are the defaults." : "No setting has these words.";
+    replaceIfChanged(first("#setting-table tbody"), found, () => (found.length ? found.map(settingRow) : [el("tr", {}, el("td", { colspan: 3, class: "muted" }, none))]));
   };
   changed.addEventListener("change", show);
   search.addEventListener("input", show);

@@ -57,6 +57,7 @@ function cameraList({ cameras }, choose) {
 
 /** @param {CameraView} camera @param {Choose} choose */
 function cameraPanel(camera, choose) {
+  if (!camera.scores.length) return [el("p", { class: "muted small" }, "Which blocks it trains is decided after Stage I.")];
   const most = Math.max(...camera.scores, 0);
   const order = camera.scores.map((score, block) => ({ score, block, reason: camera.assigned[block] }));
   order.sort((a, b) => Number(Boolean(b.reason)) - Number(Boolean(a.reason)) || b.score - a.score);

@@ -354,6 +354,7 @@ export interface Ratios {
 export interface Results {
   model: boolean;
   report: boolean;
+  map: boolean;
   exposure: string | null;
   findings: string;
 }

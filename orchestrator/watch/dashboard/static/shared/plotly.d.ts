@@ -39,7 +39,7 @@ export interface Packed {
 export interface MapFigure {
   data: Trace[];
   layout: Layout;
-  blocks: { count: number; colors: string[]; names: string[]; grades: [string, string][]; layers: number; layer: number; stride: number };
+  blocks: { planned: boolean; count: number; colors: string[]; names: string[]; grades: [string, string][]; layers: number; layer: number; stride: number };
 }
 
 declare global {
