@@ -11,8 +11,7 @@ INPUTS := Makefile pyproject.toml constraints.txt CMakeLists.txt $(shell find re
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
 ifeq ($(TORCH),cpu)
-INDEX := --extra-index-url https://download.pytorch.org/whl/cpu
-PIP += $(INDEX)
+export PIP_EXTRA_INDEX_URL := https://download.pytorch.org/whl/cpu
 endif
 
 # Most tests wait for processes that they started: one more of them than cores keeps two cores busy.
@@ -77,7 +76,7 @@ wheel: $(READY)  ## build a wheel for this Python and any Linux with the same or
 wheel-check: wheel  ## install the newest wheel of dist/ into an empty environment and run `panolog doctor` there
 	rm -rf build/wheel-venv
 	$(PYTHON) -m venv build/wheel-venv
-	build/wheel-venv/bin/pip install --quiet --constraint constraints.txt $(INDEX) "$$(ls -t dist/*.whl | head -1)"
+	build/wheel-venv/bin/pip install --quiet --constraint constraints.txt "$$(ls -t dist/*.whl | head -1)[all]"
 	cd build/wheel-venv && bin/panolog doctor
 
 bench: $(READY)  ## measure what is claimed to be fast
@@ -98,7 +97,7 @@ $(READY): $(INPUTS)
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@$(PIP) --upgrade pip
 	@$(PIP) --group build
-	@$(PIP) --group dev --no-build-isolation --editable .
+	@$(PIP) --group dev --no-build-isolation --editable '.[all]'
 	@touch $@
 
 # Launchers that read files of deploy/ in tests. They pin versions of what PanoLOG needs too, so they have a place of their own.

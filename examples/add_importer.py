@@ -15,33 +15,31 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.importers.import_scene import Format, import_scene, register
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
-from panolog.scene.write import PosedImage
+import panolog
 
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # z up -> y down, y ahead -> z ahead
 
 
-def detect(source: ImportSource) -> bool:
+def detect(source: panolog.ImportSource) -> bool:
     """Whether a source is of this format; looks at names only."""
     return source.first("poses.csv") is not None
 
 
-def read(source: ImportSource) -> ImportedScene:
+def read(source: panolog.ImportSource) -> panolog.ImportedScene:
     """Poses and points in PanoLOG's convention."""
     images = [_posed(source, row) for row in _rows(source.folder / "poses.csv")]
     table = [[float(value) for value in row.values()] for row in _rows(source.folder / "points.csv")]
     points = np.array(table).reshape(-1, 6)
-    return ImportedScene(images, points=points[:, :3], colors=points[:, 3:].astype(np.uint8))
+    return panolog.ImportedScene(images, points=points[:, :3], colors=points[:, 3:].astype(np.uint8))
 
 
-def _posed(source: ImportSource, row: dict[str, str]) -> PosedImage:
+def _posed(source: panolog.ImportSource, row: dict[str, str]) -> panolog.PosedImage:
     """World-to-camera: X_cam = rotation @ X + translation, with camera axes x right, y down, z forward."""
     turn = Rotation.from_euler("z", float(row["heading"]), degrees=True).as_matrix()
     rotation: NDArray[np.float64] = UPRIGHT @ turn
     center = np.array([float(row[axis]) for axis in "xyz"])
-    name, file = find_panorama("poses.csv", [source.images or source.folder / "images"], row["name"])
-    return PosedImage(name, file, rotation, -rotation @ center)
+    name, file = panolog.find_panorama("poses.csv", [source.images or source.folder / "images"], row["name"])
+    return panolog.PosedImage(name, file, rotation, -rotation @ center)
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -56,8 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("scene", metavar="SCENE", type=Path)
     options = parser.parse_args(arguments)
 
-    register("csv", Format(detect, read))
-    report = import_scene(ImportSource(options.source), options.scene)  # finds the format by itself
+    panolog.register_format("csv", panolog.ImportFormat(detect, read))
+    source = panolog.ImportSource(options.source)
+    report = panolog.import_scene(source, options.scene)  # finds the format by itself
     print(f"{options.scene}: {report.panoramas} panoramas, {report.points} points, from {report.format}")
 
 

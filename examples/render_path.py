@@ -11,7 +11,6 @@ import cv2
 import torch
 
 import panolog
-from panolog.renderer.poses import smooth_path
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -27,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     scene = panolog.read_scene(options.scene)
     model = panolog.read_ply(options.model).to("cuda" if torch.cuda.is_available() else "cpu")
     options.folder.mkdir(parents=True, exist_ok=True)
-    for pose in smooth_path(scene.panoramas, options.frames):
+    for pose in panolog.smooth_path(scene.panoramas, options.frames):
         camera = panolog.Camera.of(pose.rotation, pose.translation, options.width, options.width // 2)
         with torch.no_grad():
             color = panolog.render(model, camera.to(model.means.device)).color  # (H, W, 3), RGB, 0 to 1

@@ -1,4 +1,4 @@
-"""Reconstructs a scene without Ray: all stages, each task in a process of its own on this machine.
+"""Reconstructs a scene without Ray, installed or not: each task in a process of its own on this machine.
 
     python examples/run_without_ray.py SCENE RUN --set iterations=2000 --set width=512
 
@@ -7,15 +7,12 @@
 
 import argparse
 from collections.abc import Sequence
+from typing import Any
 
 import panolog
-from panolog.orchestrator.engine.driver.local_pool import local_pool
-from panolog.orchestrator.runs.config import load_config
-from panolog.orchestrator.runs.records import Stored
-from panolog.orchestrator.runs.state import RunState
 
 
-def show(_: RunState, news: Sequence[Stored]) -> None:
+def show(_: panolog.RunState, news: Sequence[Any]) -> None:
     """Prints what happens, except for progress."""
     for stored in news:
         name = type(stored.record).__name__
@@ -31,8 +28,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="a setting of a run")
     options = parser.parse_args(arguments)
 
-    with local_pool() as pool:
-        config = load_config(sets=options.set)
+    with panolog.local_pool() as pool:
+        config = panolog.load_config(sets=options.set)
         state = panolog.run(options.scene, options.run, config, pool=pool, on_change=show)
     print(state.metrics)
 

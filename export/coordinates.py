@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.export.earth import geocentric
-from panolog.scene.errors import ConfigError
+from panolog.scene.errors import ConfigError, require
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -98,13 +98,11 @@ def to_geocentric(epsg: int, points: Doubles, geoid: float | None) -> Doubles:
 
 
 def _system(epsg: int) -> "CRS":
-    """Raises ConfigError if PROJ is not installed, or knows no such system."""
-    try:
-        from pyproj import CRS  # noqa: PLC0415  # needed for this alone
-        from pyproj.exceptions import CRSError  # noqa: PLC0415
-    except ModuleNotFoundError as error:
-        reason = "converting coordinate systems needs pyproj: `pip install pyproj`"
-        raise ConfigError(f"EPSG:{epsg}: {reason}") from error
+    """Raises MissingPackageError without PROJ, and ConfigError if it knows no such system."""
+    require("pyproj")
+    from pyproj import CRS  # noqa: PLC0415  # needed for this alone
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
     try:
         return CRS.from_epsg(epsg)
     except CRSError as error:

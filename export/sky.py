@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from panolog.export.frame import Frame
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render
-from panolog.scene.errors import ConfigError, InputError
+from panolog.scene.errors import InputError, require
 from panolog.scene.files import atomic, write_bytes
 from panolog.scene.gaussians import Gaussians
 
@@ -68,10 +68,9 @@ def _continued(color: Image, alpha: Image) -> Image:
 
 
 def _write_exr(path: Path, image: Image) -> None:
-    try:
-        import OpenEXR  # noqa: PLC0415  # needed for this alone
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"{path}: writing EXR needs OpenEXR: `pip install OpenEXR`") from error
+    require("OpenEXR")
+    import OpenEXR  # noqa: PLC0415  # needed for this alone
+
     dark = image.clip(0, None)
     linear = np.where(dark <= 0.04045, dark / 12.92, ((dark + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}

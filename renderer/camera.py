@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from panolog.scene.model import Panorama
+
 _MAX_PANORAMA_WIDTH = 16_384  # columns; OpenCV resamples images below 32,768
 _MAX_SIZE = 32_766  # columns or rows that OpenCV resamples into
 _BORDER = 2  # pixels around a panorama that bilinear sampling may touch
@@ -16,7 +18,11 @@ _BORDER = 2  # pixels around a panorama that bilinear sampling may touch
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Pose, X_cam = rotation @ X + translation (x right, y down, z forward), and image size in pixels."""
+    """Pose, X_cam = rotation @ X + translation (x right, y down, z forward), and image size in pixels.
+
+    >>> import torch, panolog
+    >>> camera = panolog.Camera(torch.eye(3), torch.tensor([0.0, 0, 1]), width=512, height=256)
+    """
 
     rotation: Tensor  # (3, 3) float32
     translation: Tensor  # (3,) float32
@@ -34,6 +40,11 @@ class Camera:
             width,
             height,
         )
+
+    @staticmethod
+    def at(panorama: Panorama, width: int) -> "Camera":
+        """That of a panorama of a scene, at `width` pixels, on the CPU."""
+        return Camera.of(panorama.rotation, panorama.translation, width, width // 2)
 
     def to(self, device: torch.device | str) -> "Camera":
         """The same camera on another device."""

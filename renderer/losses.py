@@ -52,6 +52,13 @@ def photometric_loss(
 
     Raises:
         ValueError: shapes or types do not fit.
+
+    >>> import torch, panolog
+    >>> color = torch.full((32, 64, 3), 0.5, requires_grad=True)
+    >>> found = panolog.photometric_loss(color, torch.full((32, 64, 3), 255, dtype=torch.uint8))
+    >>> found.loss.backward()
+    >>> round(found.l1.item(), 3), color.grad.shape
+    (0.5, torch.Size([32, 64, 3]))
     """
     _check_images(color, target, torch.float32, torch.uint8)
     if mask is not None and (mask.shape != color.shape[:2] or mask.dtype != torch.bool):
@@ -71,6 +78,12 @@ def sphere_rows(height: int, mask: Tensor | None, device: torch.device | str) ->
     """(height,) float32 weights of the rows in proportion to cos φ, the area of their pixels on the sphere.
 
     Their mean over the unmasked pixels is 1: L1 and SSIM become those of WS-PSNR's kind (Sun et al. 2017).
+
+    Args: mask (height, W) bool, True where a pixel counts; None: everywhere.
+
+    >>> import panolog
+    >>> panolog.sphere_rows(4, None, "cpu").tolist()
+    [0.585..., 1.414..., 1.414..., 0.585...]
     """
     latitude = ((torch.arange(height, dtype=torch.float64) + 0.5) / height - 0.5) * math.pi
     area = torch.cos(latitude).to(device)
@@ -88,6 +101,11 @@ def inverse_depth_loss(rendered: Tensor, target: Tensor, valid: Tensor) -> Tenso
 
     Raises:
         ValueError: shapes or types do not fit.
+
+    >>> import torch, panolog
+    >>> rendered, target, valid = torch.ones(2, 4), torch.zeros(2, 4), torch.ones(2, 4, dtype=torch.bool)
+    >>> panolog.inverse_depth_loss(rendered, target, valid).item()
+    1.0
     """
     types = [tensor.dtype for tensor in (rendered, target, valid)]
     if not rendered.shape == target.shape == valid.shape or types != [
@@ -116,6 +134,11 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
 
     Raises:
         ValueError: shapes or types do not fit.
+
+    >>> import torch, panolog
+    >>> image = torch.rand(32, 64, 3)
+    >>> round(panolog.ssim_map(image, image).mean().item(), 3)
+    1.0
     """
     _check_images(a, b, torch.float32, torch.float32)
     if a.is_cuda:

@@ -54,6 +54,11 @@ def smooth_path(panoramas: Sequence[Panorama], frames: int) -> list[Pose]:
 
     Args: panoramas with at least two different positions; frames, how many poses, at least 2.
     Raises InputError with fewer than two positions or frames.
+
+    >>> import panolog
+    >>> poses = panolog.smooth_path(panolog.read_scene(SCENE).panoramas, frames=10)
+    >>> len(poses), poses[0].name, poses[0].rotation.shape
+    (10, 'frame_00000', (3, 3))
     """
     if frames < 2:
         raise InputError(f"a path needs at least two frames, not {frames}")

@@ -1,19 +1,25 @@
-"""COLMAP models: read without COLMAP, as files may be damaged or of a fork, and written through pycolmap."""
+"""COLMAP models, read and written without COLMAP: files may be damaged or of a fork, and pycolmap large."""
 
 import math
-import tempfile
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.colmap_files import (
+    CAMERA,
+    COUNT,
     EQUIRECTANGULAR,
+    EQUIRECTANGULAR_ID,
+    FRAME,
+    IMAGE,
     NO_POINT,
     PINHOLE,
+    POINT,
+    POINT2D,
     SIMPLE_PINHOLE,
     ColmapCamera,
     ImageRecord,
@@ -25,11 +31,10 @@ from panolog.scene.colmap_files import (
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, natural_key
 
-if TYPE_CHECKING:
-    import pycolmap
-
+_SENSOR = 0  # COLMAP's type of a sensor that is a camera
 LARGEST = 1e12  # of any coordinate: a larger one is no place, and its square must stay a number
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: text models have as few as four digits
+Posed = tuple[str, NDArray[np.float64], NDArray[np.float64]]  # name, rotation (3, 3), translation (3,)
 Observations = tuple[NDArray[np.int64], NDArray[np.float64]]  # (M,) rows of the points, (M, 2) pixels
 
 
@@ -94,7 +99,7 @@ def read_colmap(folder: Path, *, observations: bool = True) -> ColmapModel:
 
 def write_colmap(
     folder: Path,
-    images: Sequence[tuple[str, NDArray[np.float64], NDArray[np.float64]]],
+    images: Sequence[Posed],
     *,
     width: int,
     height: int,
@@ -108,55 +113,88 @@ def write_colmap(
 
     Args:
         folder: where cameras.bin and the others go, such as SCENE/sparse/0; made if missing.
-        images: (name, rotation (3, 3), translation (3,)), world-to-camera.
+        images: world-to-camera; images and points have ids from 1 in their order.
         width, height: pixels.
         points: (P, 3) world units.
         colors: (P, 3) RGB.
         observations: for each image the rows of the points that it sees and where, in pixels.
     """
-    reconstruction = reconstruction_of(
-        images, width=width, height=height, points=points, colors=colors, observations=observations
-    )
+    files = {
+        "cameras.bin": _camera_records(width, height),
+        "rigs.bin": _RIG,
+        "frames.bin": _frame_records(images),
+        "images.bin": _image_records(images, observations),
+        "points3D.bin": _point_records(points, colors, [rows for rows, _ in observations]),
+    }
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder) as temporary:
-        reconstruction.write_binary(temporary)
-        for file in sorted(Path(temporary).iterdir(), key=lambda file: file.name == "points3D.bin"):
-            with atomic(folder / file.name) as whole:
-                file.replace(whole)
+    for name, records in files.items():
+        with atomic(folder / name) as temporary, temporary.open("wb") as file:
+            file.writelines(records)
 
 
-def reconstruction_of(
-    images: Sequence[tuple[str, NDArray[np.float64], NDArray[np.float64]]],
-    *,
-    width: int,
-    height: int,
-    points: NDArray[np.float64],
-    colors: NDArray[np.uint8],
-    observations: Sequence[Observations],
-) -> "pycolmap.Reconstruction":
-    """The model that `write_colmap` writes; images and points have ids from 1 in their order."""
-    import cv2  # noqa: F401, PLC0415 (before pycolmap: see panolog.prepare)
-    import pycolmap  # noqa: PLC0415 (slow and large: loaded where a model is made)
+_RIG = (struct.pack("<Q4I", 1, 1, 1, _SENSOR, 1),)  # one rig of one sensor, camera 1
 
-    camera = pycolmap.Camera(
-        camera_id=1, model=EQUIRECTANGULAR, width=width, height=height, params=[float(width), float(height)]
-    )
-    reconstruction = pycolmap.Reconstruction()
-    reconstruction.add_camera_with_trivial_rig(camera)
-    tracks = [pycolmap.Track() for _ in points]
-    for index, ((name, rotation, translation), (rows, pixels)) in enumerate(
-        zip(images, observations, strict=True), start=1
+
+def _camera_records(width: int, height: int) -> Iterator[bytes]:
+    yield COUNT.pack(1) + CAMERA.pack(1, EQUIRECTANGULAR_ID, width, height)
+    yield struct.pack("<2d", width, height)
+
+
+def _frame_records(images: Sequence[Posed]) -> Iterator[bytes]:
+    """A frame for each image, which is all that it has."""
+    yield COUNT.pack(len(images))
+    for number, (_, rotation, translation) in enumerate(images, 1):
+        yield FRAME.pack(number, 1, *_quaternion(rotation), *translation, 1)
+        yield struct.pack("<IIQ", _SENSOR, 1, number)
+
+
+def _image_records(images: Sequence[Posed], observations: Sequence[Observations]) -> Iterator[bytes]:
+    yield COUNT.pack(len(images))
+    for number, ((name, rotation, translation), (rows, pixels)) in enumerate(
+        zip(images, observations, strict=True), 1
     ):
-        image = pycolmap.Image(
-            name, np.asarray(pixels, np.float64).reshape(-1, 2), camera_id=1, image_id=index
-        )
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.asarray(rotation, np.float64)), translation)
-        reconstruction.add_image_with_trivial_frame(image, pose)
-        for feature, row in enumerate(rows):
-            tracks[row].add_element(index, feature)
-    for point, color, track in zip(points, colors, tracks, strict=True):
-        reconstruction.add_point3D(point, track, color)
-    return reconstruction
+        yield IMAGE.pack(number, *_quaternion(rotation), *translation, 1) + name.encode() + b"\0"
+        seen = np.empty(len(rows), POINT2D)
+        seen["xy"], seen["point"] = np.reshape(pixels, (-1, 2)), np.asarray(rows) + 1
+        yield COUNT.pack(len(seen)) + seen.tobytes()
+
+
+def _point_records(
+    points: NDArray[np.float64], colors: NDArray[np.uint8], seen: Sequence[NDArray[np.int64]]
+) -> Iterator[bytes]:
+    """The points with their tracks. Args: seen, by image the rows of the points that it observes."""
+    lengths = [len(rows) for rows in seen]
+    track = np.empty((sum(lengths), 2), "<u4")  # image, number of the observation
+    track[:, 0] = np.repeat(np.arange(1, len(seen) + 1), lengths)
+    track[:, 1] = np.concatenate([*map(np.arange, lengths), np.empty(0)])
+    rows = np.concatenate([*seen, np.empty(0, np.int64)])
+    track = track[np.argsort(rows, kind="stable")]
+    ends = np.cumsum(np.bincount(rows, minlength=len(points)))
+    yield COUNT.pack(len(points))
+    start = 0
+    for number, (point, color, end) in enumerate(zip(points, colors, ends.tolist(), strict=True), 1):
+        yield (
+            POINT.pack(number, *point, *color, -1.0, end - start) + track[start:end].tobytes()
+        )  # -1: no error
+        start = end
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """w x y z of a rotation (3, 3), from its largest value: as Eigen, and so COLMAP, computes it."""
+    R, trace = rotation, rotation[0, 0] + (rotation[1, 1] + rotation[2, 2])
+    if trace > 0:
+        root = math.sqrt(trace + 1)
+        others = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
+        return np.array([0.5 * root, *(0.5 / root * np.array(others))])
+    i = int(np.argmax(np.diag(R)))
+    j, k = (i + 1) % 3, (i + 2) % 3
+    root = math.sqrt(R[i, i] - R[j, j] - R[k, k] + 1)
+    found = np.empty(4)
+    found[[0, 1 + j, 1 + k]] = np.array([R[k, j] - R[j, k], R[j, i] + R[i, j], R[k, i] + R[i, k]]) * (
+        0.5 / root
+    )
+    found[1 + i] = 0.5 * root
+    return found
 
 
 def _check_panorama(folder: Path, camera: ColmapCamera) -> None:

@@ -20,17 +20,18 @@ from numpy.typing import NDArray
 from panolog.scene.errors import SceneError
 
 EQUIRECTANGULAR, PINHOLE, SIMPLE_PINHOLE, SPHERE = "EQUIRECTANGULAR", "PINHOLE", "SIMPLE_PINHOLE", "SPHERE"
+EQUIRECTANGULAR_ID = 17  # COLMAP's
 # COLMAP's id: (name, parameters). SphereSfM gave SPHERE the id of COLMAP's RAD_TAN_THIN_PRISM_FISHEYE.
-_MODELS = {0: (SIMPLE_PINHOLE, 3), 1: (PINHOLE, 4), 11: (SPHERE, 3), 17: (EQUIRECTANGULAR, 2)}
+_MODELS = {0: (SIMPLE_PINHOLE, 3), 1: (PINHOLE, 4), 11: (SPHERE, 3), EQUIRECTANGULAR_ID: (EQUIRECTANGULAR, 2)}
 _PARAMETERS = dict(_MODELS.values())
 _SPHERICAL = (EQUIRECTANGULAR, "SPHERICAL")  # what others write into text models, also without its size again
 NO_POINT = 2**64 - 1  # the id of an observation that belongs to no point
-_CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
-_IMAGE = struct.Struct("<I7dI")  # id, quaternion and translation, camera
-_FRAME = struct.Struct("<II7dI")  # id, rig, quaternion and translation, number of data ids
-_POINT = struct.Struct("<Q3d3BdQ")  # id, position, colour, error, track length
-_COUNT = struct.Struct("<Q")
-_POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
+CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
+IMAGE = struct.Struct("<I7dI")  # id, quaternion and translation, camera
+FRAME = struct.Struct("<II7dI")  # id, rig, quaternion and translation, number of data ids
+POINT = struct.Struct("<Q3d3BdQ")  # id, position, colour, error, track length
+COUNT = struct.Struct("<Q")
+POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
 _TRACK, _DATA_ID = 8, 16  # bytes of one entry
 _LONGEST_NAME = 1024  # bytes
 _LONGEST_LINE = 2**24  # characters: half a million observations of one image; 0.8 GB while it is parsed
@@ -107,8 +108,8 @@ def read_frame_poses(folder: Path) -> Iterator[tuple[int, Sequence[float]]]:
     path = folder / "frames.bin"
     if path.is_file():
         cursor = _Cursor(path)
-        for _ in range(cursor.count(_FRAME.size)):
-            number, _, *pose, ids = cursor.take(_FRAME)
+        for _ in range(cursor.count(FRAME.size)):
+            number, _, *pose, ids = cursor.take(FRAME)
             cursor.advance(_DATA_ID * ids)
             yield number, pose
         cursor.end()
@@ -167,7 +168,7 @@ class _Cursor:
 
     def count(self, smallest: int) -> int:
         """The number of records that follow, of at least `smallest` bytes each."""
-        (count,) = self.take(_COUNT)
+        (count,) = self.take(COUNT)
         if count * smallest > len(self.data) - self.at:
             raise SceneError(
                 f"{self.path}: truncated: it is too short for its {count:,} records; export it again"
@@ -195,8 +196,8 @@ class _Cursor:
 
 def _binary_cameras(path: Path) -> Iterator[ColmapCamera]:
     cursor = _Cursor(path)
-    for _ in range(cursor.count(_CAMERA.size)):
-        number, model, width, height = cursor.take(_CAMERA)
+    for _ in range(cursor.count(CAMERA.size)):
+        number, model, width, height = cursor.take(CAMERA)
         if model not in _MODELS:
             raise _unknown_camera(f"{path}: camera {number}", f"id {model}")
         name, parameters = _MODELS[model]
@@ -207,12 +208,12 @@ def _binary_cameras(path: Path) -> Iterator[ColmapCamera]:
 
 def _binary_images(path: Path, observations: bool) -> Iterator[ImageRecord]:
     cursor = _Cursor(path)
-    for _ in range(cursor.count(_IMAGE.size + 1 + _COUNT.size)):
-        number, *pose, camera = cursor.take(_IMAGE)
+    for _ in range(cursor.count(IMAGE.size + 1 + COUNT.size)):
+        number, *pose, camera = cursor.take(IMAGE)
         name = cursor.text()
-        count = cursor.count(_POINT2D.itemsize)
-        at = cursor.advance(count * _POINT2D.itemsize)
-        seen = np.frombuffer(cursor.data, _POINT2D, count if observations else 0, at)
+        count = cursor.count(POINT2D.itemsize)
+        at = cursor.advance(count * POINT2D.itemsize)
+        seen = np.frombuffer(cursor.data, POINT2D, count if observations else 0, at)
         yield ImageRecord(
             number, name, camera, pose, seen["xy"].astype(float), seen["point"].astype(np.uint64)
         )
@@ -221,8 +222,8 @@ def _binary_images(path: Path, observations: bool) -> Iterator[ImageRecord]:
 
 def _binary_points(path: Path) -> PointRecords:
     cursor, found = _Cursor(path), PointRecords()
-    for _ in range(cursor.count(_POINT.size)):
-        number, x, y, z, *color, _, length = cursor.take(_POINT)
+    for _ in range(cursor.count(POINT.size)):
+        number, x, y, z, *color, _, length = cursor.take(POINT)
         at = cursor.advance(_TRACK * length)
         found.add(number, (x, y, z), color, cursor.data[at : cursor.at])
     cursor.end()

@@ -1,7 +1,25 @@
 """The one exception tree. Every message is one line: what is wrong, where, and how to fix it.
 
 Each error takes that line as its only argument, so it survives pickling across a process boundary.
+
+Modules import the packages of an extra as any other; where one is missing, `explained` says what to install.
 """
+
+from importlib.util import find_spec
+
+PACKAGES = {  # a module: its name for people, and the extra of pyproject.toml
+    "av": ("PyAV", "prepare"),
+    "pycolmap": ("pycolmap", "prepare"),
+    "ray": ("Ray", "cluster"),
+    "requests": ("requests", "cluster"),
+    "fastapi": ("FastAPI", "dashboard"),
+    "matplotlib": ("matplotlib", "dashboard"),  # which `prepare` brings as well
+    "plotly": ("plotly", "dashboard"),
+    "uvicorn": ("uvicorn", "dashboard"),
+    "OpenEXR": ("OpenEXR", "export"),
+    "pyproj": ("pyproj", "export"),
+    "zstandard": ("zstandard", "export"),
+}
 
 
 def in_one_line(error: BaseException, most: int | None = None) -> str:
@@ -45,6 +63,15 @@ class DeviceError(InputError):
     """The requested device, or what is needed to compute on it, is not there."""
 
 
+class MissingPackageError(InputError):
+    """A package is missing that only some of PanoLOG needs."""
+
+    @staticmethod
+    def of(module: str) -> "MissingPackageError":
+        """Says what to install for a module of `PACKAGES`."""
+        return MissingPackageError(f"this needs {PACKAGES[module][0]}: {command_for(module)}")
+
+
 class ClusterError(InputError):
     """A Ray cluster does not answer, refuses access or does not know the job."""
 
@@ -71,3 +98,25 @@ class ClusterLostError(RunError):
 
 class StoreLostError(RunError):
     """An object store has failed for too long."""
+
+
+def command_for(module: str) -> str:
+    """What installs a module of `PACKAGES`."""
+    return f"pip install 'panolog[{PACKAGES[module][1]}]'"
+
+
+def installed(module: str) -> bool:
+    """Whether a package is there; imports nothing."""
+    return find_spec(module) is not None
+
+
+def require(module: str) -> None:
+    """Raises MissingPackageError if a module of `PACKAGES` is not installed; imports nothing."""
+    if not installed(module):
+        raise MissingPackageError.of(module)
+
+
+def explained(error: ModuleNotFoundError) -> MissingPackageError | None:
+    """What a failed import says to a user; None if its package is of no extra, so that it is a fault."""
+    module = (error.name or "").partition(".")[0]
+    return MissingPackageError.of(module) if module in PACKAGES else None

@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")  # of `Gaussians`, in their order
 SH_REST = 15  # coefficients of degrees 1 to 3
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 
 
 def logit(probability: float) -> float:
@@ -17,7 +19,14 @@ def logit(probability: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N Gaussians as they are stored and optimised; the last `sky` of them are the sky sphere (eq. 3)."""
+    """N Gaussians as they are stored and optimised; the last `sky` of them are the sky sphere (eq. 3).
+
+    >>> import panolog
+    >>> model = panolog.initial_gaussians(panolog.read_scene(SCENE))
+    >>> faint = model.select(model.opacities < 0)
+    >>> len(faint), {name: tuple(tensor.shape) for name, tensor in faint.tensors().items()}["sh0"]
+    (50, (50, 1, 3))
+    """
 
     means: Tensor  # (N, 3) world units
     quats: Tensor  # (N, 4) w x y z, not necessarily unit
@@ -38,8 +47,7 @@ class Gaussians:
 
     def tensors(self) -> dict[str, Tensor]:
         """The parameters by name, in the order of the fields."""
-        names = [field.name for field in fields(self) if field.name not in ("sky", "exact")]
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in PARAMETERS}
 
     def with_tensors(self, tensors: Mapping[str, Tensor], sky: int | None = None) -> "Gaussians":
         """Gaussians of the same kind. Args: all parameters by name; how many are sky, as many if None."""

@@ -45,6 +45,9 @@ def write_ply(path: StrPath, gaussians: Gaussians, *, offset: Vector = NO_OFFSET
 
     Raises:
         OSError: the file cannot be written.
+
+    >>> import panolog
+    >>> panolog.write_ply("model.ply", panolog.initial_gaussians(panolog.read_scene(SCENE)))
     """
     parts, count = [gaussians], len(gaussians)
     write_ply_parts(Path(path), parts, count=count, sky=gaussians.sky, offset=offset, exact=gaussians.exact)
@@ -127,6 +130,10 @@ def read_ply(path: StrPath) -> Gaussians:
 
     Raises:
         PlyError: not a binary PLY of Gaussians, or truncated.
+
+    >>> import panolog
+    >>> len(panolog.read_ply(MODEL))
+    50
     """
     table, rest, sky = _open(Path(path))
     none = _decode(table, slice(0, 0), rest, 0)

@@ -55,6 +55,11 @@ def read_scene(path: StrPath) -> Scene:
         SceneError: what is wrong with it, in one line.
         PlyError: its points3D.ply is damaged.
         StoreError, StoreLostError: the store has no such scene, refuses access or fails.
+
+    >>> import panolog
+    >>> scene = panolog.read_scene(SCENE)
+    >>> scene.width, len(scene.panoramas), len(scene.train), scene.points.shape
+    (64, 9, 7, (50, 3))
     """
     if isinstance(path, str) and is_url(path):
         return _read_stored(path)

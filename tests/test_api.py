@@ -14,17 +14,25 @@ from panolog.workers.events import Checkpoint, Progress, Trained
 from panolog.workers.training.initialise import scene_gaussians
 from tests.scenes import HEIGHT, WIDTH, write_scene
 
+# Versions are semantic in these names: none goes without a new major version.
 ERRORS = {
     "PanologError",
     "InputError",
     "SceneError",
     "ConfigError",
     "DeviceError",
+    "MissingPackageError",
     "RunLockedError",
     "RunError",
 }
-TYPES = {"Scene", "Gaussians", "Camera", "RunConfig"}
-FUNCTIONS = {"read_scene", "read_ply", "write_ply", "render", "train", "evaluate", "run", "resume"}
+EVENTS = {"Progress", "Preview", "Notice", "LeftOut", "Checkpoint", "Trained"}
+IMPORTS = {"ImportFormat", "ImportSource", "ImportedScene", "PosedImage"}
+TYPES = {"Scene", "Gaussians", "Camera", "RunConfig", "RunState", "Raster", "Render", "PhotometricLoss"}
+TYPES |= {"TrainingView", "Clone3DGS", "Relocate"} | EVENTS | IMPORTS
+FUNCTIONS = {"read_scene", "read_ply", "write_ply", "train", "evaluate", "run", "resume", "load_config"}
+FUNCTIONS |= {"rasterize", "render", "smooth_path", "photometric_loss", "inverse_depth_loss", "sphere_rows"}
+FUNCTIONS |= {"ssim_map", "initial_gaussians", "load_views", "local_pool"}
+FUNCTIONS |= {"import_scene", "register_format", "find_panorama"}
 
 
 @pytest.fixture(scope="module")

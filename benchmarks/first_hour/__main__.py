@@ -25,7 +25,7 @@ INSTALL = """\
 PanoLOG is not installed for this Python. From the root of the repository, where torch with CUDA is installed:
     python -m pip install scikit-build-core nanobind setuptools-scm cmake ninja pytest pytest-timeout \\
         hypothesis
-    python -m pip install --no-build-isolation --editable .
+    python -m pip install --no-build-isolation --editable '.[all]'
 benchmarks/README.md has more, for machines without network."""
 _LEAST_S = 2.0  # in which no step can do anything
 _LINE = 100  # characters of a log on stderr

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
-from panolog.scene.gaussians import Gaussians
+from panolog.scene.gaussians import SH_C0, Gaussians
 from panolog.scene.images import load_view
 from panolog.scene.ply import read_ply
 from panolog.scene.projection import fibonacci_sphere
 from panolog.scene.read import read_scene
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.exterior import Exterior
-from panolog.workers.training.initialise import SH_C0, near_distance
+from panolog.workers.training.initialise import near_distance
 
 LENGTH, WIDTH, EAVES, EYE = 60.0, 14.0, 9.0, 1.7  # metres: of the street, of the houses, of the camera
 SKY_RADIUS = 400.0  # metres

@@ -22,7 +22,7 @@ from panolog.orchestrator.cli import (
 from panolog.orchestrator.cli.console import Lasting, say
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.orchestrator.runs import log
-from panolog.scene.errors import InputError, PanologError, in_one_line
+from panolog.scene.errors import InputError, PanologError, explained, in_one_line
 
 
 class ExitCodes(Group):
@@ -34,6 +34,10 @@ class ExitCodes(Group):
             return super().invoke(ctx)
         except PanologError as error:
             message, code = in_one_line(error), 2 if isinstance(error, InputError) else 1
+        except ModuleNotFoundError as error:
+            if (missing := explained(error)) is None:
+                raise
+            message, code = str(missing), 2
         except KeyboardInterrupt:
             message, code = "interrupted", 130
         except BrokenPipeError as error:  # the reader of stdout has gone, as in `panolog events RUN | head`

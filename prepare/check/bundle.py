@@ -1,6 +1,8 @@
 """Poses and points that agree with the observations: COLMAP's bundle adjustment of a scene as it is."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,8 +10,12 @@ from numpy.typing import NDArray
 from panolog.prepare.check.evidence import Array
 from panolog.prepare.check.residuals import Tracks, measure_residuals
 from panolog.renderer.motion import Common
-from panolog.scene.colmap import Observations, reconstruction_of
+from panolog.scene.colmap import Observations, Posed
+from panolog.scene.colmap_files import EQUIRECTANGULAR
 from panolog.scene.model import Scene
+
+if TYPE_CHECKING:
+    import pycolmap
 
 MENDS = 2.0  # from this gain on poses were off, and not only the observations that they were found by
 _SEAM = 0.02  # of the width: observations nearer to the edge may be projected to the other one
@@ -58,7 +64,7 @@ def adjust(scene: Scene, tracks: Tracks) -> Adjusted:
     used, observations = _in_several([_used(scene, tracks, each.name) for each in scene.panoramas])
     if not len(used) or not np.isfinite(before).any():
         return Adjusted(scene.poses, scene.points, before, before)
-    model = reconstruction_of(
+    model = _reconstruction_of(
         [(each.name, each.rotation, each.translation) for each in scene.panoramas],
         width=scene.width,
         height=scene.height,
@@ -109,3 +115,36 @@ def _in_several(observations: list[Observations]) -> tuple[NDArray[np.int64], li
         (np.searchsorted(used, rows[keep]), pixels[keep])
         for keep, (rows, pixels) in zip(kept, observations, strict=True)
     ]
+
+
+def _reconstruction_of(
+    images: Sequence[Posed],
+    *,
+    width: int,
+    height: int,
+    points: NDArray[np.float64],
+    colors: NDArray[np.uint8],
+    observations: Sequence[Observations],
+) -> "pycolmap.Reconstruction":
+    """A model with one EQUIRECTANGULAR camera; images and points have ids from 1 in their order."""
+    import pycolmap  # noqa: PLC0415 (slow and large: loaded where a model is made)
+
+    camera = pycolmap.Camera(
+        camera_id=1, model=EQUIRECTANGULAR, width=width, height=height, params=[float(width), float(height)]
+    )
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.add_camera_with_trivial_rig(camera)
+    tracks = [pycolmap.Track() for _ in points]
+    for index, ((name, rotation, translation), (rows, pixels)) in enumerate(
+        zip(images, observations, strict=True), start=1
+    ):
+        image = pycolmap.Image(
+            name, np.asarray(pixels, np.float64).reshape(-1, 2), camera_id=1, image_id=index
+        )
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.asarray(rotation, np.float64)), translation)
+        reconstruction.add_image_with_trivial_frame(image, pose)
+        for feature, row in enumerate(rows):
+            tracks[row].add_element(index, feature)
+    for point, color, track in zip(points, colors, tracks, strict=True):
+        reconstruction.add_point3D(point, track, color)
+    return reconstruction

@@ -32,28 +32,28 @@ from panolog.scene.read import MASKS, MIN_CAMERAS, check_names, find_offset
 from panolog.scene.write import NewScene, Offset, Origin, StageProgress, no_progress, require_new, write_scene
 
 
-class Format(NamedTuple):
+class ImportFormat(NamedTuple):
     """One format; see `interface`."""
 
     detect: Callable[[ImportSource], bool]
     read: Callable[[ImportSource], ImportedScene]
 
 
-FORMATS: dict[str, Format] = {
-    "openmvg": Format(openmvg.detect, openmvg.read),
-    "omnigs": Format(omnigs.detect, omnigs.read),
-    "opensfm": Format(opensfm.detect, opensfm.read),
-    "nerfstudio": Format(nerfstudio.detect, nerfstudio.read),
-    "360roam": Format(roam360.detect, roam360.read),
-    "egonerf": Format(egonerf.detect_ricoh360, egonerf.read_ricoh360),
-    "omniblender": Format(egonerf.detect_omniblender, egonerf.read_omniblender),
-    "panorama_sfm": Format(panorama_sfm.detect, panorama_sfm.read),
-    "spheresfm": Format(spheresfm.detect, spheresfm.read),
-    "metashape": Format(metashape.detect, metashape.read),
+FORMATS: dict[str, ImportFormat] = {
+    "openmvg": ImportFormat(openmvg.detect, openmvg.read),
+    "omnigs": ImportFormat(omnigs.detect, omnigs.read),
+    "opensfm": ImportFormat(opensfm.detect, opensfm.read),
+    "nerfstudio": ImportFormat(nerfstudio.detect, nerfstudio.read),
+    "360roam": ImportFormat(roam360.detect, roam360.read),
+    "egonerf": ImportFormat(egonerf.detect_ricoh360, egonerf.read_ricoh360),
+    "omniblender": ImportFormat(egonerf.detect_omniblender, egonerf.read_omniblender),
+    "panorama_sfm": ImportFormat(panorama_sfm.detect, panorama_sfm.read),
+    "spheresfm": ImportFormat(spheresfm.detect, spheresfm.read),
+    "metashape": ImportFormat(metashape.detect, metashape.read),
 }
 
 
-def register(name: str, format: Format) -> None:
+def register_format(name: str, format: ImportFormat) -> None:
     """Adds a format, or replaces the one of that name: `import_scene` and `--format` then know it."""
     FORMATS[name] = format
 

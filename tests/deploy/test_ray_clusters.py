@@ -52,7 +52,7 @@ def test_ray_up_does_what_the_page_says(tmp_path: Path) -> None:
         "-avz dist/ ubuntu@192.0.2.10:~/panolog-dist/",
         "ubuntu@192.0.2.10:~/.ray/auth_token",
         "python3 -m venv ~/panolog",
-        "pip install --constraint ~/panolog-dist/constraints.txt ~/panolog-dist/panolog-*.whl",
+        'pip install --constraint ~/panolog-dist/constraints.txt "$(ls ~/panolog-dist/panolog-*.whl)[all]"',
         "ray start --head",
     )
     places = [log.index(step) for step in steps]

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
-from panolog.scene.colmap import read_panoramas, write_colmap
+from panolog.scene.colmap import _quaternion, read_panoramas, write_colmap
 from panolog.scene.colmap_files import read_cameras, read_image_records, read_point_records
 from panolog.scene.errors import InputError
 from panolog.scene.files import atomic
@@ -116,6 +117,17 @@ def test_a_written_model_reads_back_and_projects_onto_its_observations(
     np.testing.assert_allclose(model.points, points)
     np.testing.assert_array_equal(model.colors, colors)
     assert [list(image.observed) for image in model.images] == [[], [1, 5]]
+    of_colmap = tmp_path / "of_colmap"
+    of_colmap.mkdir()
+    pycolmap.Reconstruction(str(tmp_path)).write_binary(str(of_colmap))
+    for file in of_colmap.iterdir():
+        assert file.read_bytes() == (tmp_path / file.name).read_bytes(), file.name
+
+
+def test_rotations_have_the_quaternions_of_colmap() -> None:
+    for rotation in Rotation.random(200, random_state=1).as_matrix():
+        written = _quaternion(rotation)[[1, 2, 3, 0]]
+        assert written.tolist() == pycolmap.Rotation3d(rotation).quat.tolist()
 
 
 @pytest.mark.parametrize("name", ["flat", "street"])

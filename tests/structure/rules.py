@@ -22,7 +22,7 @@ DIALECT = re.compile(
     r"\b(told|tells|asks|asked|hears|nobody|whoever|somebody|beside|mend)\b"
     r"|\b(from afar|limits, honestly|last sign|a place is free|fewer will do|judge this|gradients added)\b"
     r"|\b((?:above|below|from) the truth|its truth|above truth|there already; give)\b"
-    r"|(--most\b|panolog\[)",  # an option's former name; a package of whatever has this name on an index
+    r"|(--most\b)",  # an option's former name
     re.IGNORECASE,
 )
 

@@ -14,14 +14,13 @@ from scipy.spatial import cKDTree
 
 from panolog.partition.bounds import baseline
 from panolog.partition.cells import Volume
-from panolog.scene.gaussians import SH_REST, Gaussians, concatenate, logit
+from panolog.scene.gaussians import SH_C0, SH_REST, Gaussians, concatenate, logit
 from panolog.scene.images import View, pixels, unexposed
 from panolog.scene.model import Scene
 from panolog.scene.projection import fibonacci_sphere, project_to_pixels
 from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.surfaces import NO_POINTS, Points
 
-SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 DARKEST = 0.25 / 255  # initial: colours are clamped at 0, where they have no gradient and would stay black
 NEIGHBOURS = 3  # whose distances set the size of a Gaussian, 3DGS
 # Initial sizes as fractions of the distance to the nearest camera. A lone point, far from its neighbours, may
@@ -43,9 +42,13 @@ def camera_extent(scene: Scene, views: Sequence[int]) -> float:
     Args: views, the rows of `scene.panoramas` that are trained on. So a block takes steps, and splits at
     sizes, that fit its part of the scene.
     """
-    centers = scene.centers[list(views)]
+    return extent_of(scene.centers[list(views)], scene_length(scene))
+
+
+def extent_of(centers: NDArray[np.float64], apart: float) -> float:
+    """`camera_extent` of cameras at centers (K, 3). Args: apart, the distance of neighbours, world units."""
     radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    return 1.1 * max(radius, scene_length(scene) / 2)
+    return 1.1 * max(radius, apart / 2)
 
 
 def near_distance(scene: Scene, config: TrainConfig) -> float:

@@ -9,6 +9,7 @@ Opacities and sums are computed by numpy on one thread: the rounding of torch de
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,13 +19,16 @@ from typing_extensions import assert_never
 
 from panolog.partition.cells import Volume
 from panolog.scene.gaussians import Gaussians, logit
+from panolog.scene.random_streams import generator
 from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.densify import (
     Statistics,
     camera_distances,
     densify,
     drop_large,
+    drop_unrisen,
     opacities_of,
+    reset_opacities,
     rotate,
     stretch_apart,
     write_opacities,
@@ -62,30 +66,64 @@ class Room:
     cooling: float  # share of the noise that is left, 1 at the first iteration
 
 
-def grow(
-    state: ModelState,
-    statistics: Statistics,
-    schedule: Schedule,
-    place: Place,
-    iteration: int,
-    random: np.random.Generator,
-) -> None:
-    """Densify after an iteration, by the method of the settings."""
-    config = schedule.densify
-    match config.method:
-        case "clone-split":
-            means = state.gaussians.means[state.gaussians.scene]
-            apart = config.large == "distance"
-            extent = camera_distances(means, place.centers) if apart else schedule.extent
-            densify(state, statistics, config, extent, random)
-            if schedule.prunes_large(iteration):
-                drop_large(state, config.prune_scale * schedule.extent)
-        case "relocate":
-            target = schedule.budget(iteration, place.start, place.pixels)
-            room = Room(target, inside(state.gaussians, place.cell), schedule.cooling(iteration))
-            relocate(state, statistics, config, room, random)
-        case _:
-            assert_never(config.method)
+class Grown(NamedTuple):
+    """What has happened to the rows of a model."""
+
+    statistics: Statistics  # those that go on: the same where no row has changed
+    invalid: int  # Gaussians that were not finite and are removed
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """Which Gaussians there are, from iteration to iteration: of a trainer's task, and of `workers.loop`."""
+
+    schedule: Schedule
+    place: Place
+    seed: int
+    task: str  # whose random numbers these are
+
+    def after(self, state: ModelState, statistics: Statistics, iteration: int) -> Grown:
+        """What is due after a step: drop invalid Gaussians, densify, reset opacities, at last drop haze.
+
+        Only `schedule.changes` iterations change anything.
+        """
+        schedule, reset = self.schedule, self.schedule.config.reset
+        last, invalid = iteration == schedule.iterations, 0
+        if (schedule.ends_interval(iteration) or last) and (invalid := state.drop_invalid()):
+            statistics = self._anew(state, statistics)
+        if schedule.densifies(iteration):
+            self._grow(state, statistics, iteration)
+            statistics = self._anew(state, statistics)
+        if schedule.resets(iteration):
+            cell = self.place.cell if schedule.config.stage2.reset == "cell" else None
+            reset_opacities(state, reset.opacity, inside(state.gaussians, cell))
+        if last and schedule.drops_unrisen:
+            drop_unrisen(state, reset.opacity)
+            statistics = self._anew(state, statistics)
+        return Grown(statistics, invalid)
+
+    def _grow(self, state: ModelState, statistics: Statistics, iteration: int) -> None:
+        """Densify, by the method of the settings."""
+        schedule, place, config = self.schedule, self.place, self.schedule.densify
+        random = generator(self.seed, self.task, "split", iteration)
+        match config.method:
+            case "clone-split":
+                means = state.gaussians.means[state.gaussians.scene]
+                apart = config.large == "distance"
+                extent = camera_distances(means, place.centers) if apart else schedule.extent
+                densify(state, statistics, config, extent, random)
+                if schedule.prunes_large(iteration):
+                    drop_large(state, config.prune_scale * schedule.extent)
+            case "relocate":
+                target = schedule.budget(iteration, place.start, place.pixels)
+                room = Room(target, inside(state.gaussians, place.cell), schedule.cooling(iteration))
+                relocate(state, statistics, config, room, random)
+            case _:
+                assert_never(config.method)
+
+    def _anew(self, state: ModelState, statistics: Statistics) -> Statistics:
+        """What is collected by row begins anew: the rows have changed."""
+        return Statistics.zeros(state.gaussians.scene.stop, statistics.gradient.device, statistics.config)
 
 
 def relocate(

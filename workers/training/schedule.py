@@ -102,6 +102,10 @@ class Schedule:
         due = iteration % self.interval(reset.every, reset.every_floor) == 0
         return due and self.collects(iteration) and iteration <= (1 - reset.quiet) * self.iterations
 
+    def changes(self, iteration: int) -> bool:
+        """Whether rows of Gaussians or opacities may change after this iteration (`relocate.Growth`)."""
+        return self.ends_interval(iteration) or self.resets(iteration) or iteration == self.iterations
+
     def averages(self, iteration: int) -> bool:
         """Whether the model after this iteration counts in the average: some do, and the last."""
         span = self.iterations * self.config.optimizer.average

@@ -24,7 +24,6 @@ from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
-from panolog.scene.random_streams import generator
 from panolog.workers import stopping
 from panolog.workers.capture.learning import Learning
 from panolog.workers.comparison import better_block, with_block
@@ -35,7 +34,7 @@ from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.checkpoint import loaded
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.densify import Statistics, drop_unrisen, rate_units, reset_opacities
+from panolog.workers.training.densify import Statistics, rate_units
 from panolog.workers.training.exterior import Exterior, Rooms, exterior_last, inside
 from panolog.workers.training.initialise import (
     camera_extent,
@@ -47,7 +46,7 @@ from panolog.workers.training.initialise import (
 from panolog.workers.training.loss import Loss, loss_rows
 from panolog.workers.training.optimizer import AVERAGE, Average, ModelState, trained_rows
 from panolog.workers.training.pipeline import Direct, Pipeline, Plan
-from panolog.workers.training.relocate import Place, grow
+from panolog.workers.training.relocate import Growth, Place
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
 from panolog.workers.training.schedule import Schedule, order
 from panolog.workers.training.surfaces import Surfaces
@@ -354,29 +353,23 @@ class Trainer:
 
     def _maintain(self, iteration: int, last: bool) -> Iterator[Event]:
         """After a step, when due: average, drop invalid Gaussians, densify, reset opacities, drop haze."""
-        averages, resets = self.schedule.averages(iteration), self.schedule.resets(iteration)
-        if self.schedule.ends_interval(iteration) or averages or resets or last:
+        averages, changes = self.schedule.averages(iteration), self.schedule.changes(iteration)
+        if averages or changes:
             self.settle()
         if averages:
             self.average.add(self.state.gaussians)
         if last:
             self.state.gaussians = self.average.take(self.state.gaussians)
-        if (self.schedule.ends_interval(iteration) or last) and (invalid := self.state.drop_invalid()):
-            message = f"{invalid} Gaussians were not finite at iteration {iteration}: removed"
-            yield Notice(self.spec.task, message)
-            self.reset_statistics()
-        if self.schedule.densifies(iteration):
-            random = generator(self.spec.seed, str(self.spec.task), "split", iteration)
+        if changes:
             place = Place(self.spec.cell, self.start, self.spec.width**2 // 2, self.centers)
-            grow(self.state, self.statistics, self.schedule, place, iteration, random)
-            self.reset_statistics()
-        if resets:
-            self.average.clear()
-            cell = self.spec.cell if self.spec.config.stage2.reset == "cell" else None
-            reset_opacities(self.state, self.spec.config.reset.opacity, inside(self.state.gaussians, cell))
-        if last and self.schedule.drops_unrisen:
-            drop_unrisen(self.state, self.spec.config.reset.opacity)
-            self.reset_statistics()
+            growth = Growth(self.schedule, place, self.spec.seed, str(self.spec.task))
+            before = self.statistics
+            self.statistics, invalid = growth.after(self.state, before, iteration)
+            if self.statistics is not before or self.schedule.resets(iteration):
+                self.average.clear()
+            if invalid:
+                message = f"{invalid} Gaussians were not finite at iteration {iteration}: removed"
+                yield Notice(self.spec.task, message)
 
     def reset_statistics(self) -> None:
         """What is collected by row begins anew: the rows have changed."""

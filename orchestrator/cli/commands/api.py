@@ -47,6 +47,11 @@ def train(
 
     Raises:
         RunError: a loss is not finite, or the checkpoint belongs to another training.
+
+    >>> import panolog
+    >>> *events, trained = panolog.train(SCENE, panolog.load_config(sets=["iterations=2", "sky.count=0"]))
+    >>> isinstance(trained, panolog.Trained), len(trained.gaussians)
+    (True, 50)
     """
     scene, config = _scene(scene), config or RunConfig()
     spec = trainer.TrainSpec(
@@ -88,6 +93,10 @@ def evaluate(
         {"mean": metrics, "views": {name: metrics}, "lpips_reason": why LPIPS is None, or None,
         "left_out": {name: why it could not be measured}}, with the metrics psnr and ws_psnr (dB), ssim,
         ws_ssim, lpips, and lpips_3dgs of images in [0, 1].
+
+    >>> import panolog
+    >>> sorted(panolog.evaluate(MODEL, SCENE, device="cpu")["mean"])[:2]
+    ['cc_lpips', 'cc_psnr']
     """
     scene = _scene(scene)
     spec = evaluation.EvaluateSpec(

@@ -5,7 +5,7 @@ import platform
 import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.machines.machine import cores, memory
 from panolog.orchestrator.runs.units import gib
 from panolog.renderer.unused_gpu import unused_gpu
-from panolog.scene.errors import InputError
+from panolog.scene.errors import PACKAGES, InputError, command_for, installed
 
 if TYPE_CHECKING:
     from panolog.orchestrator.engine.estimates.preflight import Preflight
@@ -76,7 +76,7 @@ def diagnose(
     Args: source, of a scene a folder or a URL; prices of machines, if they are known.
     Raises InputError if the scene, the settings or the address are wrong; StoreLostError.
     """
-    packages = (_package("ray", "'ray[default]'"), _package("pycolmap", "pycolmap"))
+    packages = (_package(module) for module in PACKAGES)
     findings = [_cpu(), _memory(), _disk(Path.cwd()), _torch(), _gpu(), _kernels(), *packages]
     machine = Diagnosis(findings)
     if source is None or not machine.ready:
@@ -137,11 +137,10 @@ def _kernels() -> Finding:
     return Finding("compiled core", "missing", ok=False, fatal=True, fix=fix)
 
 
-def _package(name: str, requirement: str) -> Finding:
-    try:
-        return Finding(name, version(name))
-    except PackageNotFoundError:
-        return Finding(name, "missing", ok=False, fatal=True, fix=f"pip install {requirement}")
+def _package(module: str) -> Finding:
+    if installed(module):
+        return Finding(module, version(module))
+    return Finding(module, "missing", ok=False, fix=f"some commands need it: {command_for(module)}")
 
 
 def _source(settings: "Settings") -> Iterator[Finding]:

@@ -6,7 +6,7 @@ import socket
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from panolog.orchestrator.engine.driver.driver import Driver, Hooks
 from panolog.orchestrator.engine.driver.ending import end_recorded
 from panolog.orchestrator.engine.driver.job import Job
 from panolog.orchestrator.engine.driver.journal import Journal, Patience
+from panolog.orchestrator.engine.driver.local_pool import local_pool
 from panolog.orchestrator.engine.driver.purse import require_enough
 from panolog.orchestrator.engine.driver.requests import interruptible, on_signals
 from panolog.orchestrator.engine.estimates.preflight import Preflight, examine, require_memory
@@ -53,11 +54,10 @@ from panolog.orchestrator.runs.retention.clean import remove_models
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import report_or_notice
-from panolog.orchestrator.watch.views.plan_picture import write_plan_picture
 from panolog.partition.plan import Plan
 from panolog.prepare.check.layers import describe_layers
 from panolog.renderer.process import choose_device
-from panolog.scene.errors import ClusterError, RunFolderError, RunLockedError
+from panolog.scene.errors import ClusterError, MissingPackageError, RunFolderError, RunLockedError, installed
 from panolog.scene.files import remove_partial
 from panolog.scene.model import Scene
 
@@ -240,11 +240,12 @@ class _Beginning:
 
     @contextmanager
     def workers(self) -> Iterator[Pool]:
-        """The pool that was given, else Ray's, which also exports the state as metrics."""
-        if self.pool is None:
+        """The pool that was given, else that of `_workers`: Ray's also exports the state as metrics."""
+        exports = self.pool is None and not _works_without_ray(self.address, self.nice)
+        if exports:
             self.journal.record([Preparing("connecting to the cluster" if self.address else "starting Ray")])
         with _workers(self.address, self.folder.root, self.pool, self.nice) as workers:
-            if self.pool is None:
+            if exports:
                 from panolog.orchestrator.engine.cluster.run_metrics import RunMetrics
 
                 self.journal.on_change = RunMetrics(self.folder.root, self.journal.on_change).show
@@ -294,6 +295,11 @@ class _Beginning:
         self.journal.record([Preparing("starting workers")])
 
         def draw(plan: Plan, means: NDArray[np.float32]) -> None:
+            if not installed("matplotlib"):
+                self.warn(f"plan.png is not drawn: {MissingPackageError.of('matplotlib')}")
+                return
+            from panolog.orchestrator.watch.views.plan_picture import write_plan_picture
+
             write_plan_picture(folder.plan_picture, plan, means)
 
         with on_signals() as stop:
@@ -340,14 +346,20 @@ def _examine(
 
 @contextmanager
 def _workers(address: str | None, root: Path, pool: Pool | None, nice: int | None = None) -> Iterator[Pool]:
-    """The pool that is given, else Ray's."""
-    if pool is not None:
-        yield pool
+    """The pool that is given, else Ray's; where Ray is not installed, one of this machine without it."""
+    if pool is not None or _works_without_ray(address, nice):
+        with local_pool() if pool is None else nullcontext(pool) as here:
+            yield here
         return
     from panolog.orchestrator.engine.cluster.connection import connect  # other pools need no Ray
 
     with connect(address, root, nice) as ray_pool:
         yield ray_pool
+
+
+def _works_without_ray(address: str | None, nice: int | None) -> bool:
+    """Whether a run on this machine goes without Ray: it is not installed, and nothing needs it."""
+    return address is None and nice is None and not installed("ray")
 
 
 def _report(folder: RunFolder, journal: Journal) -> None:

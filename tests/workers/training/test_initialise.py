@@ -12,6 +12,7 @@ from panolog.partition.bounds import Aabb
 from panolog.partition.cells import Cell, Grid
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render
+from panolog.scene.gaussians import SH_C0
 from panolog.scene.images import View, exposed, exposure_affine, load_view
 from panolog.scene.model import Scene
 from panolog.scene.projection import fibonacci_sphere
@@ -19,7 +20,6 @@ from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.initialise import (
     OUTSIDE,
     SCALE_MAX,
-    SH_C0,
     camera_extent,
     first_model,
     near_distance,

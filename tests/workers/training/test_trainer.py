@@ -142,7 +142,7 @@ def test_resets_may_spare_what_is_outside_of_a_block(
 
 def test_each_densification_draws_other_numbers(coarse: TrainSpec, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[float] = []
-    name = "panolog.workers.training.trainer.grow"
+    name = "panolog.workers.training.relocate.densify"
     monkeypatch.setattr(name, lambda *arguments: drawn.append(arguments[-1].random()))
     list(train(coarse))
     assert len(drawn) == len({*drawn}) > 1

@@ -20,6 +20,7 @@ import jinja2
 from markupsafe import Markup
 
 from panolog.orchestrator.watch.views.pages.encoding import encode
+from panolog.scene.errors import require
 from panolog.scene.files import write_bytes
 
 STATIC = Path(__file__).parents[2] / "dashboard" / "static"
@@ -77,7 +78,8 @@ def write_snapshot(path: Path, page: Page, answers: Mapping[str, Any], stream: M
 
 
 def plotly() -> bytes:
-    """plotly.min.js of its Python package."""
+    """plotly.min.js of its Python package. Raises MissingPackageError without it."""
+    require("plotly")
     return (files("plotly") / "package_data" / "plotly.min.js").read_bytes()
 
 

@@ -1,0 +1,60 @@
+"""What is said where a package of an extra is missing, and that the extras are those of pyproject.toml."""
+
+import re
+import sys
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+
+from panolog.scene.errors import PACKAGES, MissingPackageError, explained, require
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
+
+
+def distributions(extra: str) -> set[str]:
+    """The distributions of an extra and of those that it includes."""
+    found = set()
+    for requirement in EXTRAS[extra]:
+        name, included = re.match(r"([\w.-]+)(?:\[([\w,]+)\])?", requirement).groups()  # type: ignore[union-attr]
+        if name == "panolog":
+            found |= set().union(*map(distributions, included.split(",")))
+        else:
+            found.add(name.lower())
+    return found
+
+
+def distribution(module: str) -> str:
+    """What brings a module; a few do not list theirs, and have its name."""
+    return packages_distributions().get(module, [module])[0].lower()
+
+
+def test_each_package_is_of_the_extra_that_is_named_and_not_of_the_core() -> None:
+    core = " ".join(PROJECT["dependencies"]).lower()
+    for module, (_, extra) in PACKAGES.items():
+        assert distribution(module) in distributions(extra), module
+        assert distribution(module) not in core, module
+
+
+def test_each_package_of_the_four_extras_is_known() -> None:
+    ours = set(map(distribution, PACKAGES))
+    for extra in ("prepare", "cluster", "dashboard", "export"):
+        assert distributions(extra) <= ours
+        assert distributions(extra) <= distributions("all")
+
+
+def test_a_missing_package_is_one_line_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = explained(ModuleNotFoundError("No module named 'ray.util'", name="ray.util"))
+    assert str(said) == "this needs Ray: pip install 'panolog[cluster]'"
+    assert explained(ModuleNotFoundError("No module named 'numpy'", name="numpy")) is None
+    assert explained(ModuleNotFoundError()) is None
+    require("plotly")
+    monkeypatch.setitem(PACKAGES, "no_such_module", ("Nothing", "export"))
+    with pytest.raises(MissingPackageError, match=r"^this needs Nothing: pip install 'panolog\[export\]'$"):
+        require("no_such_module")

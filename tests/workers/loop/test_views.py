@@ -1,0 +1,66 @@
+"""Views for a training loop: their order is that of `panolog.train`, and depth is aligned."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from panolog.renderer.camera import Camera
+from panolog.scene.errors import ConfigError
+from panolog.scene.images import load_view
+from panolog.scene.model import Scene
+from panolog.scene.read import read_scene
+from panolog.synthetic.make import make_town
+from panolog.workers.loop.views import initial_gaussians, load_views
+from panolog.workers.training.config import DepthConfig
+from panolog.workers.training.initialise import scene_gaussians
+from panolog.workers.training.loss import DepthTargets
+from panolog.workers.training.schedule import order
+from tests.scenes import write_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return read_scene(write_scene(tmp_path_factory.mktemp("scene")))
+
+
+def test_the_order_is_that_of_the_trainer_with_each_view_once_an_epoch(scene: Scene) -> None:
+    count = 2 * len(scene.train) + 3
+    rows = [view.row for view in load_views(scene, 32, count)]
+    assert rows == [next(order(0, "coarse", scene.train, iteration)) for iteration in range(1, count + 1)]
+    assert sorted(rows[: len(scene.train)]) == sorted(scene.train)
+    assert rows != [view.row for view in load_views(scene, 32, count, seed=1)]
+
+
+def test_a_view_has_its_camera_and_its_picture(scene: Scene) -> None:
+    (view,) = load_views(scene, 32, 1, rows=[scene.test[0]])
+    panorama = scene.panoramas[scene.test[0]]
+    assert (view.name, view.row) == (panorama.name, scene.test[0])
+    assert (view.image.shape, view.image.dtype) == ((16, 32, 3), torch.uint8)
+    expected = Camera.at(panorama, 32)
+    assert torch.equal(view.camera.rotation, expected.rotation)
+    assert torch.equal(view.camera.translation, expected.translation)
+    assert (view.camera.width, view.camera.height) == (32, 16)
+    assert view.depth is None
+
+
+def test_a_width_that_the_panoramas_do_not_have_is_an_error(scene: Scene) -> None:
+    with pytest.raises(ConfigError, match="width 65"):
+        next(load_views(scene, 65, 1))
+
+
+def test_the_first_model_has_points_then_a_sky(scene: Scene) -> None:
+    model = initial_gaussians(scene, sky=40)
+    assert (len(model), model.sky) == (len(scene.points) + 40, 40)
+    assert torch.equal(model.means[:-40], scene_gaussians(scene).means)
+    assert initial_gaussians(scene).sky == 0
+
+
+def test_depth_is_the_target_of_the_trainer(tmp_path: Path) -> None:
+
+    town = read_scene(make_town(tmp_path / "town", panoramas=6, width=128, points=400))
+    (view,) = load_views(town, 64, 1, depth=True)
+    found = DepthTargets(town, DepthConfig(), 0).target(load_view(town.panoramas[view.row], view.row, 64))
+    assert view.depth is not None and found is not None
+    assert torch.equal(view.depth[0], found[0]) and torch.equal(view.depth[1], found[1])
+    assert view.depth[1].any()

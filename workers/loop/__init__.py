@@ -1,0 +1,1 @@
+"""What a training loop of one's own uses: a model to begin with, views, growth strategies."""
