@@ -16,7 +16,7 @@ from panolog.scene.write import Origin, read_offset
 
 _AGREEMENT = 0.7  # length of the mean of the cameras' unit ups from which on they have one
 _SNAP = 0.996  # cosine of 5 degrees: an up so close to an axis of the world is that axis
-_STEP = 10.0  # metres, over which a projection is taken to be linear: it errs by less than a millimetre
+_STEP = 10.0  # units, over which a projection is taken to be linear: it errs by less than a millimetre
 
 Doubles = NDArray[np.float64]
 

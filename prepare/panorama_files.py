@@ -70,6 +70,10 @@ def look_into(folder: Path) -> FolderContent:
             continue
         seen.add(here.resolve())
         added = any(_is_added(part) for part in here.relative_to(folder).parts)
+        links = {it for it in folders if (added or _is_added(it)) and (here / it).is_symlink()}
+        folders[:] = [
+            it for it in folders if it not in links
+        ]  # they may lead to panoramas, which are not hidden
         for path in (here / name for name in names):
             if not added and not _is_added(path.name):
                 files.append(path)

@@ -118,12 +118,10 @@ def _decoded(path: Path, data: bytes, flags: int) -> NDArray[Any]:
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _chunks_fit(data) else None
     if pixels is None:
         kind = kind_of(data)
-        reason = (
-            f"it is {kind}, whatever its name says; save it as JPEG or PNG"
-            if kind
-            else ("the image is damaged or of an unknown format")
+        named = f"it is {kind}, whatever its name says; save it as JPEG or PNG" if kind else None
+        raise ImageError(
+            f"{path}: cannot be decoded; {named or 'the image is damaged or of an unknown format'}"
         )
-        raise ImageError(f"{path}: cannot be decoded; {reason}")
     return pixels
 
 

@@ -5,6 +5,7 @@ differ in the names: masks/STEM.png, masks/NAME.png (COLMAP, OpenSfM), masks/STE
 NAME_mask.png next to the panorama (openMVG); nerfstudio's transforms.json names them.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -34,9 +35,14 @@ def find_masks(
     Raises SceneError if a mask is damaged or not 2:1.
     """
     roots = list(dict.fromkeys(_root(image) for image in images))
-    places = dict.fromkeys([source.folder, *(root.parent for root in roots)])
+    places = dict.fromkeys([source.folder, *(root.parent for root in roots if root != source.folder)])
     folders = [place / name for place in places for name in _MASKS if (place / name).is_dir()]
-    found = [named.get(image.name) or _mask_of(image, folders) for image in images]
+    stems = [PurePosixPath(stem_of(image.name)).name for image in images]
+    shared = Counter(stems)
+    found = [
+        named.get(image.name) or _mask_of(image, folders, alone=shared[stem] == 1)
+        for image, stem in zip(images, stems, strict=True)
+    ]
     check_layer(found, bits=8)
     notes = []
     if count := len([mask for mask in found if mask]):
@@ -44,7 +50,7 @@ def find_masks(
     used = {mask.resolve() for mask in found if mask}
     for folder in folders:
         if lost := [it.name for it in find_image_files(folder) if it.resolve() not in used]:
-            notes.append(f"{folder}: {some_of(lost)}: left out, as they are the masks of no panorama")
+            notes.append(f"{folder}: {some_of(lost)}: left out, as masks of no panorama")
     notes += [
         f"{root / 'mask.png'}: left out; if black in it is to be ignored in all panoramas, "
         "copy it to SCENE/masks/STEM.png"
@@ -63,10 +69,13 @@ def _root(image: PosedImage) -> Path:
     return image.file.parents[len(PurePosixPath(image.name).parts) - 1]
 
 
-def _mask_of(image: PosedImage, folders: Sequence[Path]) -> Path | None:
-    """The mask of an image in one of the folders, or next to it."""
+def _mask_of(image: PosedImage, folders: Sequence[Path], *, alone: bool) -> Path | None:
+    """The mask of an image in one of the folders, or next to it.
+
+    Args: alone, no image in another folder has its name, so that its mask needs no folder.
+    """
     for folder in folders:
-        for name in (image.name, PurePosixPath(image.name).name):
+        for name in (image.name, *([PurePosixPath(image.name).name] if alone else [])):
             for spelling in _spellings(name, ("", "_mask")):
                 if (folder / spelling).is_file():
                     return folder / spelling

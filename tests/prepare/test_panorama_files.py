@@ -26,6 +26,8 @@ def test_links_are_followed_and_what_systems_add_is_left_out(tmp_path: Path) -> 
         path.touch()
     (folder / "day 1").symlink_to(elsewhere)
     (elsewhere / "above").symlink_to(folder)  # no end
+    (folder / ".link").symlink_to(folder / "day 2")
+    (folder / ".thumbnails" / "link").symlink_to(elsewhere)
     found = [path.relative_to(folder).as_posix() for path in find_image_files(folder)]
     assert found == ["day 1/b.png", "day 2/9.JPG", "day 2/10.jpg"]
     hidden = "._9.jpg, .thumbnails/9.jpg, @eaDir/9.jpg/THUMB_M.jpg"

@@ -68,6 +68,26 @@ def test_masks_are_imported(case: str, pattern: str, tmp_path: Path) -> None:
         assert np.array_equal(mask.numpy(), MASK > 0)
 
 
+def test_a_mask_is_not_that_of_two_panoramas(tmp_path: Path) -> None:
+    """Cameras name files alike in each folder: without the folder a mask is of one of them, but of which?"""
+    _, source = nerfstudio(tmp_path / "source")
+    path, images = source.path / "transforms.json", source.path / "images"
+    content = json.loads(path.read_text())
+    for number, frame in enumerate(content["frames"]):
+        name = f"day{number % 2}/{number // 2}.png"
+        (images / name).parent.mkdir(exist_ok=True)
+        (source.path / frame["file_path"]).rename(images / name)
+        frame["file_path"] = f"images/{name}"
+    path.write_text(json.dumps(content))
+    write_mask(source.path / "masks" / "0.png")
+    write_mask(source.path / "masks" / "day1" / "1.png")
+    notes = import_scene(source, tmp_path / "scene").notes
+    assert "1 of 6 panoramas have a mask in the source" in notes[0]
+    assert "masks: 1 file (0.png): left out" in notes[1]
+    masks = {panorama.name: panorama.mask for panorama in read_scene(tmp_path / "scene").panoramas}
+    assert [name for name, mask in masks.items() if mask] == ["day1/1.png"]
+
+
 def test_masks_that_belong_to_no_panorama_are_named(tmp_path: Path) -> None:
     _, source = WRITERS["spheresfm"][1](tmp_path / "source")
     for name in ("pano_00.png", "left.png", "right.png", "a.png", "b.png"):
@@ -76,7 +96,7 @@ def test_masks_that_belong_to_no_panorama_are_named(tmp_path: Path) -> None:
     write_mask(source.path / "images" / "mask.png")
     notes = import_scene(source, tmp_path / "scene").notes
     assert "1 of 6 panoramas have a mask in the source" in notes[0]
-    lost = "masks: 4 files (a.png, b.png, left.png, …): left out, as they are the masks of no panorama"
+    lost = "masks: 4 files (a.png, b.png, left.png, …): left out, as masks of no panorama"
     assert lost in notes[1]
     assert "images/mask.png: left out; if black in it is to be ignored in all panoramas" in notes[2]
     assert "depths: left out; `panolog scene depth` makes depth maps" in notes[3]
