@@ -72,6 +72,7 @@ class Page:
     title: str
     total: int = 0  # Gaussians of the model; 0 if that is not known
     shown: int | None = None  # of them; None = all
+    iteration: int | None = None  # of a model in training
     start: Pose | None = None  # None: at the first camera
     cameras: tuple[PageCamera, ...] = ()  # in the order in which one walks along them
     step: float | None = None  # world units: the sense of scale of the controls; None: as the model is large
@@ -86,6 +87,8 @@ class Page:
             "title": self.title,
             "shown": self.total if self.shown is None else self.shown,
             "total": self.total,
+            "iteration": self.iteration,
+            "refresh": None,
             "model": model,
             "sky": sky,
             "start": self.start.as_json() if self.start else None,

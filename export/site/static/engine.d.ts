@@ -114,6 +114,7 @@ export class Entity {
   readonly gsplat?: GSplatComponent;
   addComponent(kind: string, options: object): unknown;
   addChild(child: Entity): void;
+  destroy(): void;
   readonly right: Vec3;
   readonly up: Vec3;
   readonly forward: Vec3;
@@ -124,6 +125,7 @@ export class Entity {
 
 export class Asset extends EventHandler {
   constructor(name: string, kind: string, file: object);
+  unload(): void;
 }
 
 export interface GSplatParams {

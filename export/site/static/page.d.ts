@@ -23,6 +23,10 @@ export interface Page {
   /** Gaussians: drawn at most, and those of the model. */
   shown: number;
   total: number;
+  /** Of a model in training; null of one that is done. */
+  iteration: number | null;
+  /** Seconds between two looks for a newer model, as the dashboard serves it; null where there will be none. */
+  refresh: number | null;
   /** A .sog, or the lod-meta.json of Streamed SOG. */
   model: string;
   /** An equirectangular picture whose middle is towards -z; null if the model has none. */

@@ -72,6 +72,8 @@ export class Stage {
     this.backdrops = [];
     /** @type {pc.GSplatComponent | null} */
     this.model = null;
+    /** What is drawn of it. @type {{ entity: pc.Entity, asset: pc.Asset } | null} */
+    this._shown = null;
     /** @type {number[]} */
     this._times = [];
     this._moved = this._ticked = 0;
@@ -123,6 +125,42 @@ export class Stage {
    */
   async load(url, contents, progress, known) {
     const { app } = this;
+    const model = await this._add(url, contents, progress);
+    const levels = model.resource?.octree?.lodLevels ?? 0;
+    if (levels) {
+      model.lodRangeMin = model.lodRangeMax = levels - 1; // all of the place first
+    }
+    known();
+    await this._first(levels > 0);
+    model.lodRangeMin = Math.max(0, levels - 2);
+    app.autoRender = false;
+    this.loading = levels > 1 ? 1 : 0;
+    app.on("update", () => this._adapt());
+    app.systems.gsplat.on("frame:ready", (/** @type {unknown} */ _, /** @type {unknown} */ __, /** @type {boolean} */ ready, /** @type {number} */ loading) => {
+      this.loading = ready ? loading : Math.max(1, loading);
+      if (this.loading || !this.model?.lodRangeMin) return;
+      this.model.lodRangeMin -= 1; // one level after the other: what is near is soon better, and the best comes last
+      this.loading = 1;
+      this.draw();
+    });
+    this.draw();
+  }
+
+  /** Shows another model in place of the one that is there, from where the view is. @param {string} url */
+  async replace(url) {
+    const before = this._shown;
+    await this._add(url, null, () => {});
+    this.setStep(this._step);
+    this.draw();
+    await this._first(false);
+    before?.entity.destroy();
+    before?.asset.unload();
+    this.draw();
+  }
+
+  /** Adds a model to what is drawn. @param {string} url @param {ArrayBuffer | null} contents @param {(share: number) => void} progress */
+  async _add(url, contents, progress) {
+    const { app } = this;
     const asset = new pc.Asset("model", "gsplat", contents ? { url, filename: url, contents } : { url });
     asset.on("progress", (/** @type {number} */ loaded, /** @type {number} */ total) => total && progress(Math.min(1, loaded / total)));
     app.assets.add(asset);
@@ -134,27 +172,10 @@ export class Stage {
     const entity = new pc.Entity("model");
     entity.setLocalEulerAngles(0, 0, 180); // SOG has y down, as PlayCanvas's own viewers expect it
     entity.addComponent("gsplat", { asset });
-    const model = /** @type {pc.GSplatComponent} */ (entity.gsplat);
-    this.model = model;
-    const levels = model.resource?.octree?.lodLevels ?? 0;
-    if (levels) {
-      model.lodRangeMin = model.lodRangeMax = levels - 1; // all of the place first
-    }
+    this.model = /** @type {pc.GSplatComponent} */ (entity.gsplat);
+    this._shown = { entity, asset };
     app.root.addChild(entity);
-    known();
-    await this._first(levels > 0);
-    model.lodRangeMin = Math.max(0, levels - 2);
-    app.autoRender = false;
-    this.loading = levels > 1 ? 1 : 0;
-    app.on("update", () => this._adapt());
-    app.systems.gsplat.on("frame:ready", (/** @type {unknown} */ _, /** @type {unknown} */ __, /** @type {boolean} */ ready, /** @type {number} */ loading) => {
-      this.loading = ready ? loading : Math.max(1, loading);
-      if (this.loading || !model.lodRangeMin) return;
-      model.lodRangeMin -= 1; // one level after the other: what is near is soon better, and the best comes last
-      this.loading = 1;
-      this.draw();
-    });
-    this.draw();
+    return this.model;
   }
 
   /** @param {boolean} streamed  Resolves when the first picture has been drawn. */

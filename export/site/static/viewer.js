@@ -27,12 +27,18 @@ async function read() {
   return { page: JSON.parse(inside.textContent ?? ""), contents: bytes.buffer };
 }
 
+/** @param {Page} page  Says how large the model is, and how far its training. */
+function tell(page) {
+  const part = page.shown < page.total ? `${number.format(page.shown)} of ${number.format(page.total)}` : number.format(page.total);
+  const iteration = page.iteration ? ` · iteration ${number.format(page.iteration)}` : ""; // not of older pages
+  at("count").textContent = page.total ? `${part} Gaussians${iteration}` : "";
+}
+
 /** @param {Page} page */
 function describe(page) {
   document.title = page.title;
   at("title").textContent = page.title;
-  const part = page.shown < page.total ? `${number.format(page.shown)} of ${number.format(page.total)}` : number.format(page.total);
-  at("count").textContent = page.total ? `${part} Gaussians` : "";
+  tell(page);
   at("list").hidden = !page.cameras.length;
   at("sky").hidden = !page.sky;
 }
@@ -75,6 +81,35 @@ function begin(page, walk, flight) {
   };
 }
 
+/** @param {Page} page @param {string} url  The URL with what tells a later model from those before. */
+const fresh = (page, url) => `${url}?${page.iteration ?? "done"}-${page.total}`;
+
+/**
+ * Looks for newer models of a training, and shows each in place of the last: the view stays where it is.
+ * @param {import("./stage.js").Stage} stage @param {Page} page @param {Panorama | undefined} sky
+ */
+async function follow(stage, page, sky) {
+  let now = page;
+  while (now.refresh) {
+    await new Promise((resolve) => setTimeout(resolve, 1000 * (now.refresh ?? 0)));
+    if (document.hidden) continue;
+    try {
+      const answer = await fetch("scene.json");
+      if (!answer.ok) continue;
+      /** @type {Page} */
+      const next = await answer.json();
+      if (fresh(next, "") !== fresh(now, "")) {
+        await stage.replace(fresh(next, next.model));
+        if (next.sky) await sky?.show(fresh(next, next.sky));
+        tell(next);
+      }
+      now = next;
+    } catch {
+      // the server is busy or away, or the files were replaced meanwhile: tried again
+    }
+  }
+}
+
 /** @param {import("./stage.js").Stage} stage @param {Page} page  The button of the sky, which comes when it is loaded. */
 async function showSky(stage, page) {
   if (!page.sky) return;
@@ -88,6 +123,7 @@ async function showSky(stage, page) {
   try {
     await sky.show(page.sky);
     button("sky").disabled = false;
+    return sky;
   } catch {
     at("sky").hidden = true; // the model can be seen without
   }
@@ -167,8 +203,9 @@ async function show() {
   performance.mark("first picture");
   Object.assign(window, { panolog: { stage, flight, walk, measure, ahead, shifted } });
   document.documentElement.dataset.state = "ready";
-  await sky;
+  const backdrop = await sky;
   stage.draw();
+  await follow(stage, page, backdrop);
 }
 
 at("offline").remove();

@@ -58,6 +58,7 @@ from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
+from panolog.export.site.write import DESCRIPTION
 from panolog.orchestrator.watch.dashboard import maps, pictures, stream
 from panolog.orchestrator.watch.dashboard.dependencies import (
     ComparedRuns,
@@ -366,6 +367,8 @@ async def post_viewer(request: Request, registry: Registry, id: str) -> Response
 async def get_model_page(request: Request, key: str, path: str) -> Response:
     """A file of one of these pages."""
     pages: ModelPages = request.app.state.pages
+    if path == DESCRIPTION:
+        await pages.renew(key)
     policy = page_policy(request.headers.get("host", ""), key)
     return await respond(request, 404, pages.file, key, path, policy, request.app.state.panoramas)
 

@@ -8,12 +8,14 @@ browsers send no cookie, so its address has a random key that grants its files, 
 """
 
 import asyncio
+import json
 import os
 import re
 import secrets
 import shutil
 import sys
 from collections import OrderedDict
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,6 +24,7 @@ from fastapi.responses import Response
 
 from panolog.export.site.page import described, photograph_number
 from panolog.export.site.write import media_type
+from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import model_of
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry, by_handle, open_below, read_below
 from panolog.orchestrator.watch.dashboard.pictures import PanoramaCache
@@ -31,6 +34,7 @@ from panolog.scene.errors import InputError, PanologError
 from panolog.workers.tasks import TaskId
 
 _CACHED = 8  # pages
+_REFRESH_S = 10  # between two looks of a page for a newer model of a training
 _QUEUED = 4  # requests that may wait at a time
 _TIMEOUT_S = 300.0  # for one page
 _MOST = 1_000_000  # Gaussians of a page that is made on request
@@ -66,12 +70,17 @@ class _Site:
     scene: Path | None  # None: the photographs are not on this machine
 
     @staticmethod
-    def of(folder: Path, scene: Path | None, *, temporary: bool) -> "_Site":
-        """Raises InputError if it is no page."""
+    def of(folder: Path, scene: Path | None, *, temporary: bool, live: bool = False) -> "_Site":
+        """Args: live, the model may become another. Raises InputError if it is no page."""
         data, names = read_below(folder / "scene.json", folder, _DESCRIPTION_BYTES), list[str]()
         if scene is not None:
             data, names = described(data)
+        if live:
+            data = json.dumps(json.loads(data) | {"refresh": _REFRESH_S}).encode()
         return _Site(folder, temporary, data, names, scene)
+
+
+_Source = tuple[RunEntry, str | None, Path | None]  # the arguments of `ModelPages.make`
 
 
 class ModelPages:
@@ -81,6 +90,7 @@ class ModelPages:
         self._folder = TemporaryDirectory(prefix="panolog-dashboard-")
         self._sites: OrderedDict[str, _Site] = OrderedDict()  # by key
         self._keys: dict[tuple[object, ...], str] = {}  # by what they show
+        self._sources: dict[str, _Source] = {}  # by key: of those that were made for this server
         self._lock = asyncio.Lock()
         self._waiting = 0
 
@@ -100,10 +110,29 @@ class ModelPages:
             try:
                 async with self._lock:
                     if self._key(shown) is None:
-                        self._add(shown, await self._site(entry, task, scene, known.st_mtime))
+                        key = self._add(shown, await self._site(entry, task, scene, known.st_mtime))
+                        self._sources[key] = entry, task, scene
             finally:
                 self._waiting -= 1
         return self._keys[shown]
+
+    async def renew(self, key: str) -> None:
+        """Brings a page up to the present model of its run; one that cannot be made leaves it as it is."""
+        source = self._sources.get(key)
+        if source is None or key not in self._sites:
+            return
+        known = set(self._sites)
+        with suppress(InputError, OSError):
+            newest = await self.make(*source)
+            if newest == key or key not in self._sites:
+                return
+            before, self._sites[key] = self._sites[key], self._sites[newest]
+            self._sites.move_to_end(key)
+            if newest not in known:  # nobody has its address
+                del self._sites[newest]
+                self._sources.pop(newest, None)
+                self._keys = {what: key if its == newest else its for what, its in self._keys.items()}
+            self._remove(before)
 
     def grants(self, path: str) -> bool:
         """Whether a path of an address is below that of a page."""
@@ -142,14 +171,20 @@ class ModelPages:
             self._sites.move_to_end(key)
         return key
 
-    def _add(self, shown: tuple[object, ...], site: _Site) -> None:
+    def _add(self, shown: tuple[object, ...], site: _Site) -> str:
         key = secrets.token_hex(24)
         self._sites[key], self._keys[shown] = site, key
         while len(self._sites) > _CACHED:
             old, removed = self._sites.popitem(last=False)
             self._keys = {what: key for what, key in self._keys.items() if key != old}
-            if removed.temporary:
-                shutil.rmtree(removed.folder, ignore_errors=True)
+            self._sources.pop(old, None)
+            self._remove(removed)
+        return key
+
+    def _remove(self, site: _Site) -> None:
+        """The files of a page that is under no key any more."""
+        if site.temporary and site not in self._sites.values():
+            shutil.rmtree(site.folder, ignore_errors=True)
 
     async def _site(self, entry: RunEntry, task: str | None, scene: Path | None, newest: float) -> _Site:
         """What the run has written for its model, if that is current, else a page made now."""
@@ -159,7 +194,8 @@ class ModelPages:
             return await asyncio.to_thread(_Site.of, web, scene, temporary=False)
         output = Path(self._folder.name) / secrets.token_hex(8)
         await self._write(entry, task, output)
-        return await asyncio.to_thread(_Site.of, output, scene, temporary=True)
+        live = lock.held(entry.folder.lock) and not entry.folder.point_cloud.is_file()
+        return await asyncio.to_thread(_Site.of, output, scene, temporary=True, live=live)
 
     async def _write(self, entry: RunEntry, task: str | None, output: Path) -> None:
         arguments = [str(entry.root), entry.path, task or "", str(output)]

@@ -139,6 +139,7 @@ def _page(title: str, model: Model, place: Georeference, wanted: Wanted) -> Page
     return Page(
         title=title,
         total=model.total,
+        iteration=model.iteration,
         start=Pose.towards(middle + away, -away),
         step=radius / _STEPS,
         metres_per_unit=place.unit,

@@ -23,6 +23,7 @@ class Model:
     scene: SplatSource  # in the exported frame; the sky, if there is nothing else
     sky: Gaussians | None  # in the model's coordinates
     total: int  # Gaussians in the file
+    iteration: int | None = None  # of a checkpoint
 
 
 def open_model(path: Path, frame: Frame, chosen: Selection) -> Model:
@@ -60,13 +61,14 @@ def _of_export(path: Path, chosen: Selection) -> Model:
 
 
 def _of_checkpoint(path: Path, frame: Frame, chosen: Selection) -> Model:
-    gaussians = ModelState.from_tensors(checkpoint.load(path).tensors).gaussians
+    saved = checkpoint.load(path)
+    gaussians = ModelState.from_tensors(saved.tensors).gaussians
     splats, scene = Splats.of(gaussians), (~_is_sky(gaussians)).numpy()
     selection = replace(chosen, part="scene" if scene.any() else "all")
     kept = splats.select(selection.keeps(splats, scene))
     turned = kept.reduced(chosen.degree).turned(frame)
     sky = _sky_of(gaussians) if gaussians.sky and scene.any() else None
-    return Model(InMemory(turned), sky, len(gaussians))
+    return Model(InMemory(turned), sky, len(gaussians), saved.iteration)
 
 
 def _is_checkpoint(file: Path) -> bool:

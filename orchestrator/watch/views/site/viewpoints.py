@@ -38,18 +38,18 @@ class Viewpoints:
 def read_viewpoints(
     folder: RunFolder, task: TaskId | None, camera: str | None = None, locate: Locate = here
 ) -> Viewpoints | None:
-    """The viewpoints of a run's model or of a task's; without a plan and a scene on this machine None.
+    """The viewpoints of a run's model or of a task's; None where no cameras are known, if none is named.
 
-    Cameras are those that train the task, each towards the next in the plan's order; without a plan, as a run
-    without blocks has none, those that train the scene. The page begins at the
+    Cameras are those that train the task, before there is a plan all, each towards the next; of a run that
+    knows none, as one without blocks of an earlier version, those that train the scene. The page begins at the
     panorama `camera`, else at the most central of them, towards the farthest.
 
     Args: camera, the name of a panorama of the plan, or of the scene if `locate` is `here`; locate says where
     the run's files are to be read.
     Raises InputError if there is no such panorama, or the plan cannot be read.
     """
-    plan = read_plan(locate(folder.plan)) if folder.plan.is_file() else None
-    if plan is not None:
+    if folder.known_plan.is_file():
+        plan = read_plan(locate(folder.known_plan))
         names, centers = plan.names, plan.centers
         shown = [names[plan.rows.index(row)] for row in _rows(plan, task)]
     elif (scene := _scene_here(folder, locate)) is not None:
@@ -59,9 +59,7 @@ def read_viewpoints(
     elif camera is None:
         return None
     else:
-        raise InputError(
-            f"{folder.root}: has no plan yet, so no camera {camera}; wait for the end of Stage I"
-        )
+        raise InputError(f"{folder.root}: has no cameras yet, so no camera {camera}")
     up = _up(centers)
     ahead = _towards_next(centers, up)
     every = {name: Viewpoint(*pose) for name, *pose in zip(names, centers, ahead, strict=True)}

@@ -10,10 +10,12 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, expect
 
 from panolog.orchestrator.engine.stages.partitioning import write_plan
-from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.folder import RunFolder, write_json
+from panolog.orchestrator.watch.dashboard import model_pages
 from panolog.orchestrator.watch.dashboard.model_pages import page_policy
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
 from panolog.scene.gaussians import Gaussians
@@ -21,7 +23,7 @@ from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.watch.dashboard.browser import opened
 from tests.orchestrator.watch.dashboard.served import POST, SCORES, Served, plan, raw, serving, write_run
-from tests.orchestrator.watch.views.models import some
+from tests.orchestrator.watch.views.models import save_checkpoint, some
 from tests.orchestrator.watch.views.pictures import layers, psnr, ready, rendered, shown, until
 from tests.orchestrator.watch.views.sites import SIZE, viewpoints_of
 from tests.scenes import write_scene
@@ -154,6 +156,34 @@ def test_a_model_that_is_not_there_or_not_the_runs_own_is_a_line(tmp_path: Path)
         line = refused(served, run="damaged")
         assert "model.ply: is not a model" in line and "/proc" not in line
         assert "was removed" in served.errors("/models/none/", 404)
+
+
+@pytest.mark.system
+def test_a_model_in_training_is_replaced_by_newer_ones_and_the_view_stays(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From its first checkpoint on: upright, at a panorama, with cameras, before there is a plan."""
+    monkeypatch.setattr(model_pages, "_REFRESH_S", 1)
+    folder = write_run(tmp_path / "run")
+    write_json(folder.outline, plan().to_json())
+    save_checkpoint(folder, COARSE)
+    with lock.hold(folder.lock), serving(tmp_path) as served:
+        url = served.url + url_of(served)
+        first = httpx.get(f"{url}scene.json").json()
+        assert (first["iteration"], first["total"], first["refresh"]) == (5, 20, 1)
+        assert [camera["name"] for camera in first["cameras"]] == [f"{number}.jpg" for number in range(4)]
+        assert first["start"]["position"] in [camera["position"] for camera in first["cameras"]]
+        with opened(browser, url, width=SIZE[0], height=SIZE[1]) as page:
+            ready(page)
+            expect(page.locator("#count")).to_have_text("20 Gaussians · iteration 5")
+            page.evaluate("panolog.flight.set({ position: [1, 2, 3], yaw: 40, pitch: 5 })")
+            save_checkpoint(folder, COARSE, 30, iteration=1_200)
+            expect(page.locator("#count")).to_have_text("30 Gaussians · iteration 1,200")
+            assert page.evaluate("[...panolog.flight.position, panolog.flight.yaw]") == [1, 2, 3, 40]
+            save_model(folder, some(40))
+            expect(page.locator("#count")).to_have_text("40 Gaussians")
+            models = "panolog.stage.app.root.children.filter((one) => one.name === 'model').length"
+            until(page, f"{models} === 1")
 
 
 @pytest.mark.system

@@ -56,10 +56,12 @@ def save_model(folder: RunFolder, task: TaskId, count: int = 20, sky: int = 0) -
     write_ply(folder.model(task), some(count, sky))
 
 
-def save_checkpoint(folder: RunFolder, task: TaskId, count: int = 20) -> None:
+def save_checkpoint(folder: RunFolder, task: TaskId, count: int = 20, iteration: int = 5) -> None:
     """A checkpoint of a task, two of its Gaussians sky."""
     folder.of(task).mkdir(parents=True, exist_ok=True)
-    checkpoint.save(folder.checkpoint(task), Checkpoint(task, 5, ModelState.start(some(count, 2)).tensors()))
+    checkpoint.save(
+        folder.checkpoint(task), Checkpoint(task, iteration, ModelState.start(some(count, 2)).tensors())
+    )
 
 
 def save_plan(folder: RunFolder, names: Sequence[str] = NAMES, centers: np.ndarray = CENTERS) -> None:

@@ -134,7 +134,7 @@ export function addHeadings(table, columns, sortBy) {
 /** Marks the column that a table is sorted by. @param {string} table selector @param {string} key @param {boolean} down */
 export function markSorted(table, key, down) {
   for (const head of childrenOf(first(`${table} thead tr`))) {
-    head.setAttribute("aria-sort", head.dataset.column !== key ? "none" : down ? "descending" : "ascending");
+    if (head.matches("th")) head.setAttribute("aria-sort", head.dataset.column !== key ? "none" : down ? "descending" : "ascending");
   }
 }
 
