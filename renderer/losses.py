@@ -85,8 +85,8 @@ def sphere_rows(height: int, mask: Tensor | None, device: torch.device | str) ->
     >>> panolog.sphere_rows(4, None, "cpu").tolist()
     [0.585..., 1.414..., 1.414..., 0.585...]
     """
-    latitude = ((torch.arange(height, dtype=torch.float64) + 0.5) / height - 0.5) * math.pi
-    area = torch.cos(latitude).to(device)
+    latitude = ((torch.arange(height, dtype=torch.float64, device=device) + 0.5) / height - 0.5) * math.pi
+    area = torch.cos(latitude)
     used = torch.ones_like(area) if mask is None else mask.sum(1, dtype=torch.float64)
     return (area * (used.sum() / (area * used).sum().clamp(min=1e-9))).float()
 

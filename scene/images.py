@@ -6,11 +6,11 @@ it; of the others those that are used next are there, and the rest waits decoded
 
 import logging
 import os
-import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeAlias
@@ -33,11 +33,11 @@ from panolog.scene.image_files import (
     resize_used,
 )
 from panolog.scene.model import Panorama, Scene
+from panolog.scene.tensors.transfer import CudaMover, Moving, pack
 
 _THREADS = min(4, os.cpu_count() or 1)  # on the CPU: decoding keeps up with training long before this
 MOST_THREADS = 8  # for a GPU: each holds a pinned view and has one more on the GPU
 PASSING = 2  # views on a GPU beyond one for each thread: the one in use, and a preview's
-_ALIGNMENT = 16  # bytes between beginnings of layers, a multiple of every element
 _LAYERS = ("image", "mask", "sky", "inverse_depth", "exposure")
 CURVE, TOE = 2.4, 0.055  # of sRGB (IEC 61966-2-1), above its linear part
 _LOG = logging.getLogger(__name__)
@@ -68,14 +68,8 @@ class View:
 class Staged:
     """A view on its way to a device."""
 
-    view: View  # its tensors are there; they have their values once `ready` has occurred
-    memory: Tensor | None = None  # (bytes,) uint8 that they are parts of
-    ready: torch.cuda.Event | None = None
-
-
-def sleeping_event() -> torch.cuda.Event:
-    """An event on a GPU for which a thread of the host sleeps; by default it would keep a core busy."""
-    return torch.cuda.Event(blocking=True)  # type: ignore[no-untyped-call]
+    view: View  # with the tensors of `moving`
+    moving: Moving | None = None
 
 
 def pixels(layer: Tensor, v: NDArray[np.int64], u: NDArray[np.int64]) -> NDArray[Any]:
@@ -98,66 +92,23 @@ class Upload:
 
 
 class CudaUpload(Upload):
-    """Through pinned memory and a stream of its own. What is computed waits for its view, the host does not.
-
-    Each thread that decodes has one pinned buffer, as large as its largest view.
-    """
+    """By a `CudaMover`. What is computed waits for its view, the host does not."""
 
     def __init__(self, device: str) -> None:
         """Args: device, such as "cuda"."""
-        self._device = device
-        self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-        self._own = threading.local()
+        self._mover = CudaMover(torch.device(device))
 
     def stage(self, view: View) -> Staged:
         """As `Upload.stage`: returns while the copy runs."""
         layers = view.layers()
-        pinned = self._buffer(packed_bytes(layers))
-        for name, part in unpack(pinned, layers).items():
-            part.copy_(layers[name])
-        with torch.cuda.stream(self._stream):  # which the memory then belongs to, see `finish`
-            memory = torch.empty(len(pinned), dtype=torch.uint8, device=self._device)
-            memory.copy_(pinned, non_blocking=True)
-            ready = self._own.ready = sleeping_event()
-            ready.record(self._stream)
-        return Staged(View.of(view.row, unpack(memory, layers)), memory, ready)
+        moving = self._mover.begin(layers, partial(pack, layers))
+        return Staged(View.of(view.row, moving.tensors), moving)
 
     def finish(self, staged: Staged) -> View:
         """As `Upload.finish`: the current stream waits for the copy."""
-        current = torch.cuda.current_stream(self._device)
-        if staged.memory is not None and staged.ready is not None:
-            current.wait_event(staged.ready)
-            # Once freed, the memory may be given to the next copy: not before this stream has read it.
-            staged.memory.record_stream(current)
+        if staged.moving is not None:
+            self._mover.end(staged.moving)
         return staged.view
-
-    def _buffer(self, size: int) -> Tensor:
-        """So many pinned bytes of this thread, which the copy before has left."""
-        own = self._own
-        if (ready := getattr(own, "ready", None)) is not None:
-            ready.synchronize()
-        if getattr(own, "buffer", None) is None or len(own.buffer) < size:
-            own.buffer = torch.empty(size, dtype=torch.uint8, pin_memory=True)
-        buffer: Tensor = own.buffer[:size]
-        return buffer
-
-
-def packed_bytes(layers: Mapping[str, Tensor]) -> int:
-    """Bytes of memory that holds these layers one after the other."""
-    return sum(_padded(layer.nbytes) for layer in layers.values())
-
-
-def unpack(memory: Tensor, layers: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Parts of `memory` (bytes,) uint8 with the shapes and types of the layers, one after the other."""
-    parts, at = {}, 0
-    for name, layer in layers.items():
-        parts[name] = memory[at : at + layer.nbytes].view(layer.dtype).view(layer.shape)
-        at += _padded(layer.nbytes)
-    return parts
-
-
-def _padded(size: int) -> int:
-    return -(-size // _ALIGNMENT) * _ALIGNMENT
 
 
 _Loaded: TypeAlias = "Future[tuple[View | None, Staged]]"  # the decoded view, if it is to be kept

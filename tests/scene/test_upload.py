@@ -5,7 +5,6 @@ import threading
 import weakref
 from collections import Counter
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -13,13 +12,14 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from panolog.scene import images
 from panolog.scene.errors import ImageError
 from panolog.scene.images import CudaUpload, PanoramaCache, Staged, Upload, View, load_view, passing_views
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
+from panolog.scene.tensors import transfer
+from tests.fake_cuda import Torch
 from tests.on_device import needs_a_card
 from tests.scenes import HEIGHT, WIDTH, write_scene
 
@@ -143,68 +143,10 @@ def test_a_damaged_image_is_named_by_get_although_it_never_gets_to_the_device(sc
 # CudaUpload, with a torch whose GPU is the CPU
 
 
-class Memory:
-    """A tensor that says which of its operations matter for the order between streams."""
-
-    def __init__(self, tensor: Tensor, log: list[str]) -> None:
-        self.tensor, self.log = tensor, log
-
-    def __len__(self) -> int:
-        return len(self.tensor)
-
-    def __getitem__(self, at: slice) -> Any:
-        return self.tensor[at]
-
-    def copy_(self, source: Tensor, *, non_blocking: bool) -> None:
-        assert non_blocking
-        self.log.append("copy")
-        self.tensor.copy_(source)
-
-    def record_stream(self, stream: str) -> None:
-        self.log.append(f"memory used by {stream}")
-
-
-class Torch:
-    """As much of torch as `CudaUpload` uses; everything else is torch's own."""
-
-    def __init__(self) -> None:
-        self.log: list[str] = []
-        self.pinned: list[int] = []  # sizes of the pinned buffers
-        self.cuda = SimpleNamespace(
-            Stream=lambda _: "uploads",
-            Event=self._event,
-            stream=self._switched,
-            current_stream=lambda _: SimpleNamespace(
-                wait_event=lambda _: self.log.append("training waits"), __str__=lambda: "training"
-            ),
-        )
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(torch, name)
-
-    def empty(self, size: int, *, pin_memory: bool = False, device: str = "cpu", **options: Any) -> Any:
-        if pin_memory:
-            self.pinned.append(size)
-            return torch.empty(size, **options)
-        assert device == "cuda"
-        return Memory(torch.empty(size, **options), self.log)
-
-    def _event(self, *, blocking: bool) -> SimpleNamespace:
-        assert blocking  # who waits sleeps
-        return SimpleNamespace(
-            record=lambda stream: self.log.append(f"event on {stream}"),
-            synchronize=lambda: self.log.append(f"{threading.current_thread().name} waits"),
-        )
-
-    def _switched(self, stream: str) -> Any:
-        self.log.append(f"stream {stream}")
-        return torch.no_grad()  # some context
-
-
 @pytest.fixture
 def cuda(monkeypatch: pytest.MonkeyPatch) -> Torch:
     fake = Torch()
-    monkeypatch.setattr(images, "torch", fake)
+    monkeypatch.setattr(transfer, "torch", fake)
     return fake
 
 

@@ -22,9 +22,10 @@ from panolog.renderer.cuda import launches
 from panolog.renderer.losses import photometric_loss
 from panolog.renderer.render import render, render_panorama
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.images import PanoramaCache, View, packed_bytes, unpack
+from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
+from panolog.scene.tensors.transfer import packed_bytes, unpack
 from panolog.workers import device_memory
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import densify

@@ -17,14 +17,17 @@ from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.files import read_at, write_all
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.images import packed_bytes, unpack, view_bytes
+from panolog.scene.images import view_bytes
 from panolog.scene.model import Panorama
+from panolog.scene.tensors.transfer import Mover, Moving, pack, packed_bytes
+from panolog.workers.training.pipeline import AHEAD
 from panolog.workers.training.task_config import CacheConfig
 
 _RELEASE = 8  # views: what baking one leaves free is not what the next one needs
 CHECKED = 4  # views, at most, on which what is baked is compared with the full render
 BAKED = 32  # bytes of a pixel of a baked view, about: its layers, and some of the splats among own Gaussians
-PASSING = 2  # baked views on the device of a block besides those that stay there: that in use and the next
+READING = 2  # baked views that are read from their file at a time: that in use and the next
+PASSING = AHEAD + 1  # on a GPU besides those that stay there: those of iterations in flight, and the next
 
 
 def inside(gaussians: Gaussians, cell: Volume | None) -> NDArray[np.bool_]:
@@ -85,9 +88,10 @@ class BakedViews:
         self._room, self._device = room, device
         self._staying: dict[int, Baked] = {}
         self._filed: dict[int, tuple[int, Baked]] = {}  # where one begins, and its layout, without memory
-        self._coming: dict[int, Future[Baked]] = {}
+        self._coming: dict[int, Future[Moving]] = {}
         self._used: tuple[int, Baked] | None = None
         self._reader = ThreadPoolExecutor(1, "baked")
+        self._mover = Mover.to(device)
 
     def __contains__(self, row: int) -> bool:
         return row in self._staying or row in self._filed
@@ -104,8 +108,9 @@ class BakedViews:
         self.nbytes += baked.nbytes
 
     def prefetch(self, rows: Sequence[int]) -> None:
-        """Begins to read those that `get` will return next; `PASSING` of them at most."""
-        ahead = [row for row in rows[:PASSING] if row in self._filed]
+        """Begins to read those that `get` will return next, and to move them; `READING` of them at most."""
+        used = None if self._used is None else self._used[0]
+        ahead = [row for row in rows[:READING] if row in self._filed and row != used]
         reading = self._coming
         self._coming = {row: reading.get(row) or self._reader.submit(self._read, row) for row in ahead}
 
@@ -114,9 +119,9 @@ class BakedViews:
         if row in self._staying:
             return self._staying[row]
         if self._used is None or self._used[0] != row:
-            coming = self._coming.pop(row, None)
-            baked = self._read(row) if coming is None else coming.result()
-            self._used = row, baked.to(self._device)
+            coming = self._coming.pop(row, None) or self._reader.submit(self._read, row)
+            tensors = self._mover.end(coming.result())
+            self._used = row, Baked(unit=self._filed[row][1].unit, **tensors)
         return self._used[1]
 
     def close(self) -> None:
@@ -130,8 +135,7 @@ class BakedViews:
             self._file = tempfile.TemporaryFile(prefix="panolog-baked-", buffering=0)  # noqa: SIM115
         at, tensors = self._file.tell(), baked.tensors()
         packed = torch.empty(packed_bytes(tensors), dtype=torch.uint8)
-        for name, part in unpack(packed, tensors).items():
-            part.copy_(tensors[name])
+        pack(tensors, packed)
         try:
             write_all(self._file, packed.numpy().data)
         except OSError as error:
@@ -141,11 +145,11 @@ class BakedViews:
             ) from error
         return at, baked.to("meta")
 
-    def _read(self, row: int) -> Baked:
+    def _read(self, row: int) -> Moving:
         at, layout = self._filed[row]
-        packed = torch.empty(packed_bytes(layout.tensors()), dtype=torch.uint8)
-        read_at(self._file, at, packed.numpy().data)
-        return Baked(unit=layout.unit, **unpack(packed, layout.tensors()))
+        return self._mover.begin(
+            layout.tensors(), lambda memory: read_at(self._file, at, memory.numpy().data)
+        )
 
 
 class Exterior:

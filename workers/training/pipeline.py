@@ -23,7 +23,7 @@ from panolog.renderer.motion import MOTION_SUMS
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.images import sleeping_event
+from panolog.scene.tensors.transfer import sleeping_event
 from panolog.workers.capture.learning import Learning, Observed
 from panolog.workers.training.densify import Statistics
 from panolog.workers.training.loss import loss_of

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from panolog.scene.errors import RunError
 from panolog.scene.files import SUFFIX
-from panolog.scene.images import packed_bytes, unpack
+from panolog.scene.tensors.transfer import packed_bytes, unpack
 from panolog.workers.events import Checkpoint, CheckpointWritten, Event, Notice
 from panolog.workers.training import checkpoint
 from panolog.workers.training.task_config import CheckpointConfig

@@ -32,7 +32,7 @@ from panolog.workers.device_memory import VALUES
 from panolog.workers.growth import Period, additions, population
 from panolog.workers.metrics import LPIPS_BYTES
 from panolog.workers.tasks import Stage
-from panolog.workers.training.exterior import BAKED, PASSING
+from panolog.workers.training.exterior import BAKED, PASSING, READING
 from panolog.workers.training.initialise import camera_extent
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.trainer import PREVIEW_WIDTH
@@ -252,7 +252,7 @@ class Estimator:
         Args: initial, the Gaussians of the model that it starts from, if it reads one.
         """
         baked = self.baked_view if initial else 0
-        need = self._fixed(cameras, 0 if self._cuda else baked) + initial * _HELD + PASSING * baked
+        need = self._fixed(cameras, 0 if self._cuda else baked) + initial * _HELD + READING * baked
         copies = 2 * self._saves + (not self._cuda)  # of what Stage I learns, as of its model
         need += initial * calibration.SPLAT * self.bakes if initial else copies * self.parts.learning(cameras)
         if self._cuda:  # copies for a checkpoint

@@ -1,7 +1,10 @@
 """Ops on CPU tensors, run as on a card: what the other tests of the CUDA path rely on."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from unittest import mock
 
+import numpy as np
 import pytest
 import torch
 
@@ -35,18 +38,28 @@ WAITS: dict[str, Callable[[torch.Tensor], object]] = {
     "nonzero": lambda tensor: tensor.nonzero(),
     "comparison": lambda tensor: torch.equal(tensor, tensor),
     "blocking copy": lambda tensor: torch.empty(3).copy_(tensor),
+    "to a device": lambda tensor: tensor.to("cpu"),
+    "to a device, by name": lambda tensor: tensor.to(dtype=torch.float64, device=torch.device("cpu")),
+    "to where another is": lambda tensor: tensor.to(torch.empty(1)),
+    "made on a device": lambda tensor: torch.tensor([1.0], device="cpu"),
+    "of an array": lambda tensor: torch.as_tensor(np.zeros(3), device=tensor.device),
     "synchronize": lambda tensor: torch.cuda.synchronize(),
+    "synchronize a stream": lambda tensor: torch.cuda.Stream.synchronize(mock.Mock()),
+    "wait for an event": lambda tensor: torch.cuda.Event.synchronize(mock.Mock()),
 }
 
 
 @pytest.mark.parametrize("name", WAITS)
-def test_waits_are_counted(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torch.cuda.synchronize", lambda: None)
+def test_waits_are_counted(name: str) -> None:
     tensor, into = torch.arange(3.0), torch.empty(3)
     with counted() as found:
         into.copy_(tensor * 2 + tensor.sum(), non_blocking=True)
         into[1:] = 5
         into[torch.tensor([0, 1])].double().sort()
+        into.to(torch.float64).to("cpu", non_blocking=True)
+        torch.zeros(3, device="cpu")
+        with ThreadPoolExecutor(1) as other:
+            other.submit(into.to, "cpu").result()
         assert not found
         WAITS[name](tensor)
     assert found.total() == 1

@@ -3,6 +3,7 @@
 Not what happens inside of an op of ours: torch's dispatcher shows it as a whole.
 """
 
+import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -24,7 +25,10 @@ _OPS = {  # their result, or its size, is read by the host
     "aten::unique_consecutive",
     "aten::repeat_interleave.Tensor",
 }
-_METHODS = ("cpu", "tolist")  # not all of them reach the dispatcher for a CPU tensor
+# Of tensors; not all of them reach the dispatcher for a CPU tensor, which is there already.
+_METHODS = ("cpu", "tolist", "to", "cuda")
+_MADE = ("tensor", "as_tensor", "asarray")  # by the host, and then copied to a device that is named
+_SYNCHRONIZE = ("synchronize", "Stream.synchronize", "Event.synchronize")
 
 
 class _Ops(TorchDispatchMode):
@@ -37,9 +41,8 @@ class _Ops(TorchDispatchMode):
     ) -> Any:
         name = func._schema.name + (f".{func._schema.overload_name}" if func._schema.overload_name else "")
         blocking = name == "aten::copy_" and not (args[2] if len(args) > 2 else False)
-        moves = name == "aten::_to_copy" and (kwargs or {}).get("device") is not None
         by_mask = name.startswith("aten::index") and _has_mask(args)
-        if name in _OPS or blocking or by_mask or moves:
+        if name in _OPS or blocking or by_mask:
             self.found[name] += 1
         return func(*args, **(kwargs or {}))
 
@@ -52,23 +55,43 @@ def _has_mask(args: Any) -> bool:
 
 @contextmanager
 def counted(allowed: tuple[Tensor, ...] = ()) -> Iterator[Counter[str]]:
-    """What waits, by name. Args: allowed, tensors that are on the host in any case."""
+    """What waits in this thread, by name. Args: allowed, tensors that are on the host in any case.
+
+    A copy between devices counts unless it is `non_blocking`, also of a tensor that would be there.
+    """
     found: Counter[str] = Counter()
-    own = {tensor.untyped_storage().data_ptr() for tensor in allowed}
+    own = {_storage(tensor) for tensor in allowed}
     with ExitStack() as stack:
         for name in _METHODS:
-            stack.enter_context(mock.patch.object(Tensor, name, _counting(name, found, own)))
-        stack.enter_context(mock.patch("torch.cuda.synchronize", _counting("synchronize", found, own)))
+            stack.enter_context(mock.patch.object(Tensor, name, _counting(getattr(Tensor, name), found, own)))
+        for name in _MADE:
+            stack.enter_context(mock.patch.object(torch, name, _counting(getattr(torch, name), found, own)))
+        for name in _SYNCHRONIZE:
+            stack.enter_context(mock.patch(f"torch.cuda.{name}", _counting(None, found, own)))
         stack.enter_context(_Ops(found))
         yield found
 
 
-def _counting(name: str, found: Counter[str], own: set[int]) -> Any:
-    method = getattr(Tensor, name, None)
+def _counting(function: Any, found: Counter[str], own: set[int]) -> Any:
+    """A function that counts those of its calls that wait. Args: function, None for one that only waits."""
+    name = "synchronize" if function is None else function.__name__
+    thread = threading.get_ident()
 
     def call(*arguments: Any, **named: Any) -> Any:
-        if not (arguments and arguments[0].untyped_storage().data_ptr() in own):
+        host = bool(own) and isinstance(arguments[0], Tensor) and _storage(arguments[0]) in own
+        waits = (name not in {"to", *_MADE} or _to_device(arguments, named)) and not named.get("non_blocking")
+        if waits and not host and threading.get_ident() == thread:
             found[name] += 1
-        return None if method is None else method(*arguments, **named)
+        return None if function is None else function(*arguments, **named)
 
     return call
+
+
+def _to_device(arguments: tuple[Any, ...], named: dict[str, Any]) -> bool:
+    """Whether a call of `Tensor.to`, or one that makes a tensor, names a device or a tensor on one."""
+    others = (*arguments[1:], named.get("device"), named.get("other"))
+    return any(isinstance(other, (str, torch.device, Tensor)) for other in others)
+
+
+def _storage(tensor: Tensor) -> int:
+    return tensor.untyped_storage().data_ptr()

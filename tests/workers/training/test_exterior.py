@@ -21,6 +21,7 @@ from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import View, load_view, view_bytes
 from panolog.scene.model import Scene
+from panolog.scene.tensors import transfer
 from panolog.workers.comparison import with_block
 from panolog.workers.events import Checkpoint, Preview
 from panolog.workers.specs import Value
@@ -31,6 +32,7 @@ from panolog.workers.training.loss import Loss, loss_of
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.task_config import CacheConfig
 from panolog.workers.training.trainer import TrainSpec, train
+from tests.fake_cuda import Torch
 from tests.workers.small import WIDTH, small_scene
 from tests.workers.trainings import block_of, coarse_of, notices, same, trained
 
@@ -162,6 +164,30 @@ def test_what_has_no_room_is_read_back_from_a_file(scene: Scene, initial: Gaussi
                 assert torch.equal(found.tensors()[name], tensor), name
     exterior.finish({row: camera(scene, row) for row in (0, 1, 2)})
     assert exterior.views.nbytes == sum(whole.of(row, camera(scene, row)).nbytes for row in (0, 1, 2))
+
+
+def test_on_a_gpu_the_thread_that_reads_begins_the_copy_and_only_the_device_waits(
+    scene: Scene, initial: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, rows = exterior_last(initial, block(scene, initial).cell), (0, 1, 2)
+    whole, fake = around_of(model), Torch()
+    monkeypatch.setattr(transfer, "torch", fake)
+    exterior = Exterior(model, 0.01, 1.0, 0, torch.device("cuda"))
+    for row in rows:
+        exterior.of(row, camera(scene, row))
+    fake.log.clear()
+    for row in rows:
+        exterior.views.prefetch(rows[row:])
+        assert exterior.views.get(row) is exterior.views.get(row)
+        for name, tensor in whole.of(row, camera(scene, row)).tensors().items():
+            assert torch.equal(exterior.views.get(row).tensors()[name], tensor), name
+    exterior.views.close()
+    log = [entry.split("(")[0] for entry in fake.log]
+    taken = ["training waits", "memory used by namespace"]
+    assert [entry for entry in log if entry in taken] == taken * len(rows)
+    one = ["stream uploads", "copy", "event on uploads", "baked_0 waits"]  # before it fills its buffer again
+    assert [entry for entry in log if entry not in taken] == ["baked_0 waits", *one * len(rows)][:-1]
+    assert len(fake.pinned) <= len(rows)  # one buffer of one thread, which grows
 
 
 def test_a_full_disk_says_what_to_do(

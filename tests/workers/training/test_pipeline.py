@@ -16,6 +16,8 @@ from panolog.scene.errors import RunError
 from panolog.workers.events import Checkpoint, Event, Progress
 from panolog.workers.specs import Value
 from panolog.workers.training import pipeline
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.recipes import RECIPES, Recipe
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.on_device import needs_a_card
 from tests.renderer.cuda.emulation import EmulatedLaunch
@@ -251,6 +253,32 @@ def test_no_wait_in_a_usual_iteration(
         with counted((trainer.pipeline._reports,)) as found:
             assert all(len(trainer.pipeline._launched) < pipeline.AHEAD for _ in steps)
         assert found == {}
+
+
+@pytest.mark.parametrize("kind", ["coarse", "block"])
+def test_no_wait_in_the_default_recipe(kind: str, spec: TrainSpec, block: TrainSpec) -> None:
+    """What is baked of a block's exterior comes from its file in each iteration."""
+    config = settings(**groups_of("panolog"))
+    assert config.loss.sphere and config.stage2.exterior == "baked"
+    task = replace(block if kind == "block" else spec, config=config, iterations=1000)
+    with stubbed(without_pairs), warm(task) as (trainer, _):
+        assert isinstance(trainer.pipeline, pipeline.Pipeline)
+        with counted((trainer.pipeline._reports,)) as found:
+            for iteration in range(2, 202):
+                trainer.step(iteration, trainer._view(iteration))
+        assert found == {}
+        filed = trainer.exterior and trainer.exterior.views._filed
+        assert len(filed or ()) == (len(task.views) if kind == "block" else 0)
+
+
+def groups_of(recipe: Recipe) -> dict[str, Any]:
+    """The settings of a recipe that training has."""
+    groups: dict[str, Any] = {"sky": {"count": 20}}
+    for key, value in RECIPES[recipe].items():
+        group, _, name = key.partition(".")
+        if group in TrainConfig.model_fields:
+            groups[group] = groups.get(group, {}) | {name: value} if name else value
+    return groups
 
 
 def test_the_host_sleeps_while_it_waits_for_an_iteration(

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from panolog.scene.images import packed_bytes
+from panolog.scene.tensors.transfer import packed_bytes
 from panolog.workers.events import Checkpoint, CheckpointWritten, Event
 from panolog.workers.tasks import COARSE
 from panolog.workers.training import checkpoint, saving

@@ -41,7 +41,7 @@ def read_viewpoints(
     """The viewpoints of a run's model or of a task's; None where no cameras are known, if none is named.
 
     Cameras are those that train the task, before there is a plan all, each towards the next; of a run that
-    knows none, as one without blocks of an earlier version, those that train the scene. The page begins at the
+    knows none, as one without blocks of an earlier version, those that train the scene. It begins at the
     panorama `camera`, else at the most central of them, towards the farthest.
 
     Args: camera, the name of a panorama of the plan, or of the scene if `locate` is `here`; locate says where
