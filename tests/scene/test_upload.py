@@ -19,8 +19,8 @@ from panolog.scene.images import CudaUpload, PanoramaCache, Staged, Upload, View
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.scene.tensors import transfer
-from tests.fake_cuda import Torch
 from tests.on_device import needs_a_card
+from tests.renderer.cuda.fake_cuda import Torch
 from tests.scenes import HEIGHT, WIDTH, write_scene
 
 VIEW = 3 * WIDTH * HEIGHT  # bytes of a view without layers

@@ -81,7 +81,7 @@ function begin(page, walk, flight) {
   };
 }
 
-/** @param {Page} page @param {string} url  The URL with what tells a later model from those before. */
+/** @param {Page} page @param {string} url  The URL that differs for each model of a training. */
 const fresh = (page, url) => `${url}?${page.iteration ?? "done"}-${page.total}`;
 
 /**

@@ -32,7 +32,7 @@ from panolog.workers.training.loss import Loss, loss_of
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.task_config import CacheConfig
 from panolog.workers.training.trainer import TrainSpec, train
-from tests.fake_cuda import Torch
+from tests.renderer.cuda.fake_cuda import Torch
 from tests.workers.small import WIDTH, small_scene
 from tests.workers.trainings import block_of, coarse_of, notices, same, trained
 
