@@ -33,7 +33,7 @@ def written(folder: Path) -> dict[str, Any]:
 
 
 def test_a_page_begins_at_the_panorama_that_is_named(folder: RunFolder) -> None:
-    with pytest.raises(InputError, match="has no plan yet"):
+    with pytest.raises(InputError, match="has no cameras yet"):
         read_viewpoints(folder, None, "0.jpg")
     assert read_viewpoints(folder, None) is None
     save_plan(folder)
