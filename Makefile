@@ -11,7 +11,7 @@ INPUTS := Makefile pyproject.toml constraints.txt CMakeLists.txt $(shell find re
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
 ifeq ($(TORCH),cpu)
-export PIP_EXTRA_INDEX_URL := https://download.pytorch.org/whl/cpu
+export PIP_EXTRA_INDEX_URL := $(PIP_EXTRA_INDEX_URL) https://download.pytorch.org/whl/cpu
 endif
 
 # Most tests wait for processes that they started: one more of them than cores keeps two cores busy.

@@ -15,6 +15,7 @@ PACKAGES = {  # a module: its name for people, and the extra of pyproject.toml
     "fastapi": ("FastAPI", "dashboard"),
     "matplotlib": ("matplotlib", "dashboard"),  # which `prepare` brings as well
     "plotly": ("plotly", "dashboard"),
+    "starlette": ("Starlette", "dashboard"),
     "uvicorn": ("uvicorn", "dashboard"),
     "OpenEXR": ("OpenEXR", "export"),
     "pyproj": ("pyproj", "export"),

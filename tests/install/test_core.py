@@ -43,7 +43,7 @@ def panolog_without_extras(*arguments: object, cwd: Path) -> subprocess.Complete
     [
         ("scene sfm raw -o scene", "this needs pycolmap: pip install 'panolog[prepare]'"),
         ("run raw -o run", "this needs pycolmap: pip install 'panolog[prepare]'"),
-        ("dashboard .", "this needs uvicorn: pip install 'panolog[dashboard]'"),
+        ("dashboard .", "this needs Starlette: pip install 'panolog[dashboard]'"),
         ("run scene -o run --address auto", "this needs Ray: pip install 'panolog[cluster]'"),
         ("export model.ply -o model.spz", "this needs zstandard: pip install 'panolog[export]'"),
     ],

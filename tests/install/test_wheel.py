@@ -65,7 +65,7 @@ def test_the_core_trains_and_says_what_it_lacks(python: Path, tmp_path: Path) ->
     program = python.with_name("panolog")
     for command, said in (
         (["scene", "sfm", "scene/images", "-o", "made"], "pycolmap: pip install 'panolog[prepare]'"),
-        (["dashboard"], "uvicorn: pip install 'panolog[dashboard]'"),
+        (["dashboard"], "Starlette: pip install 'panolog[dashboard]'"),
     ):
         ended = call(program, *command, cwd=tmp_path)
         assert (ended.returncode, ended.stderr.splitlines()[-1]) == (2, f"panolog: this needs {said}")

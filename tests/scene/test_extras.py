@@ -1,20 +1,24 @@
 """What is said where a package of an extra is missing, and that the extras are those of pyproject.toml."""
 
+import ast
 import re
 import sys
+from collections.abc import Mapping
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
 
 from panolog.scene.errors import PACKAGES, MissingPackageError, explained, require
+from tests.structure.rules import ROOMS, ROOT
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
-PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 
 
@@ -32,7 +36,13 @@ def distributions(extra: str) -> set[str]:
 
 def distribution(module: str) -> str:
     """What brings a module; a few do not list theirs, and have its name."""
-    return packages_distributions().get(module, [module])[0].lower()
+    return known().get(module, [module])[0].lower()
+
+
+@cache
+def known() -> Mapping[str, list[str]]:
+    """The distributions of each module that is installed."""
+    return packages_distributions()
 
 
 def test_each_package_is_of_the_extra_that_is_named_and_not_of_the_core() -> None:
@@ -47,6 +57,21 @@ def test_each_package_of_the_four_extras_is_known() -> None:
     for extra in ("prepare", "cluster", "dashboard", "export"):
         assert distributions(extra) <= ours
         assert distributions(extra) <= distributions("all")
+
+
+def test_every_package_that_a_module_imports_is_declared() -> None:
+    names = [*PROJECT["dependencies"], *(it for extra in EXTRAS.values() for it in extra), "markupsafe"]
+    declared = {re.split(r"[^\w.-]", name)[0].lower() for name in names}
+    declared |= {"cuda", "mlflow"}  # namespaces of cuda-core and mlflow-skinny
+    imported: dict[str, Path] = {}
+    for file in (path for room in ROOMS for path in (ROOT / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            found = [it.name for it in node.names] if isinstance(node, ast.Import) else []
+            found += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            imported |= {name.partition(".")[0]: file for name in found}
+    for module in set(imported) - {"panolog"} - sys.stdlib_module_names:
+        ours = {distribution(module), module, module.replace("_", "-")}
+        assert not ours.isdisjoint(declared), (module, imported[module])
 
 
 def test_a_missing_package_is_one_line_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
