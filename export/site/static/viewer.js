@@ -81,7 +81,7 @@ function begin(page, walk, flight) {
   };
 }
 
-/** @param {Page} page @param {string} url  The URL that differs for each model of a training. */
+/** @param {Page} page @param {string} url  The URL with what distinguishes a later model. */
 const fresh = (page, url) => `${url}?${page.iteration ?? "done"}-${page.total}`;
 
 /**

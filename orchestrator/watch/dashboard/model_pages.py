@@ -128,7 +128,7 @@ class ModelPages:
                 return
             before, self._sites[key] = self._sites[key], self._sites[newest]
             self._sites.move_to_end(key)
-            if newest not in known:  # no page has its address
+            if newest not in known:  # its address was given to no one
                 del self._sites[newest]
                 self._sources.pop(newest, None)
                 self._keys = {what: key if its == newest else its for what, its in self._keys.items()}

@@ -88,7 +88,7 @@ def test_all_is_there_without_network(browser: Browser, report: Path) -> None:
         page.context.set_offline(True)
         page.reload()
         expect(page.locator("#status")).to_have_text("driver lost")
-        expect(page.locator("#stages li")).to_have_count(7)
+        expect(page.locator("#stages li")).to_have_count(8)
         expect(page.locator("#facts")).to_contain_text("Gaussians kept")
         expect(page.locator("#block-table tbody tr[data-block]")).to_have_count(3)
         expect(page.locator("#block-table")).to_contain_text("out of memory")
