@@ -14,6 +14,7 @@ from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians
 
 TILE = 16  # pixels, kTile in csrc/footprint.h
+_CLEAR = (1, 0, 0, 0, 0)  # a pixel of a layer in which there is nothing
 _SPLAT = 16  # floats, sizeof(Splat) in csrc/formulas.h
 SLACK = 0.05  # of a distance, which own Gaussians may move without compositing in a wrong order
 FAINT = 1 / 255  # summed weight in a tile's pixels, up to which a splat is not composited among own Gaussians
@@ -27,8 +28,9 @@ class Baked:
     rays: Tensor  # (16 M,) float32; (0,) with affine projection
     places: Tensor  # (T,) int32, the row of a tile in the layers, -1 where it is not active
     spans: Tensor  # (T, 2) float32, world units: distances between which the splats composite
-    front: Tensor  # (A, 5, 16, 16) float16: transmittance, r, g, b, inverse depth times `unit`
-    back: Tensor  # the same, what is behind all others
+    fronts: Tensor  # (F,) int64, the rows of the layers where there is something in front
+    front: Tensor  # (F, 5, 16, 16) float16: transmittance, r, g, b, inverse depth times `unit`
+    back: Tensor  # (A, 5, 16, 16) the same, what is behind all others
     unit: float  # world units
 
     def tensors(self) -> dict[str, Tensor]:
@@ -47,12 +49,12 @@ class Baked:
 
     def arrays(self) -> list[Tensor]:
         """For `ops.rasterize`."""
-        layers = []
-        for layer in (self.front, self.back):
-            values = layer.float()
-            values[:, 4].div_(self.unit)
-            layers.append(values)
-        return [self.splats, self.rays, self.places, self.spans, *layers]
+        front, back = torch.zeros_like(self.back, dtype=torch.float32), self.back.float()
+        front[:, 0].fill_(1)
+        front[self.fronts] = self.front.float()
+        for layer in (front, back):
+            layer[:, 4].div_(self.unit)
+        return [self.splats, self.rays, self.places, self.spans, front, back]
 
     def active(self, width: int, height: int) -> Tensor:
         """(height, width) bool, the pixels of active tiles."""
@@ -96,12 +98,15 @@ def bake(
     span = torch.from_numpy(spans).view(-1, 2)
     active = span[:, 0] <= span[:, 1]
     chosen = [array[rows].flatten() if len(array) else array.flatten() for array in chosen]
+    before = _tiles(layers[0], active, unit)
+    fronts = (before != before.new_tensor(_CLEAR).view(5, 1, 1)).flatten(1).any(1).nonzero()[:, 0]
     return Baked(
         splats=chosen[0],
         rays=chosen[1],
         places=torch.where(active, active.cumsum(0) - 1, -1).to(torch.int32),
         spans=span,
-        front=_tiles(layers[0], active, unit),
+        fronts=fronts,
+        front=before[fronts],
         back=_tiles(layers[1], active, unit),
         unit=unit,
     )

@@ -25,7 +25,7 @@ from panolog.workers.training.task_config import CacheConfig
 
 _RELEASE = 8  # views: what baking one leaves free is not what the next one needs
 CHECKED = 4  # views, at most, on which what is baked is compared with the full render
-BAKED = 32  # bytes of a pixel of a baked view, about: its layers, and some of the splats among own Gaussians
+BAKED = 24  # bytes of a pixel of a baked view, at most about: its layers, and splats among own Gaussians
 READING = 2  # baked views that are read from their file at a time: that in use and the next
 PASSING = AHEAD + 1  # on a GPU besides those that stay there: those of iterations in flight, and the next
 

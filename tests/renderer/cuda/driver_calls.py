@@ -90,7 +90,8 @@ def surrounded(exact: bool, at: Camera) -> Baked:
     tiles = math.prod(parts.tiles_of(at.width, at.height))
     splat, layer = torch.zeros(parts.SPLAT_FLOATS), torch.zeros(1, 5, parts.TILE, parts.TILE).half()
     places = torch.full((tiles,), -1, dtype=torch.int32)
-    return Baked(splat, splat[: len(splat) * exact], places, torch.zeros(tiles, 2), layer, layer, 1.0)
+    fronts, spans = torch.zeros(1, dtype=torch.int64), torch.zeros(tiles, 2)
+    return Baked(splat, splat[: len(splat) * exact], places, spans, fronts, layer, layer, 1.0)
 
 
 def every_kernel(launch: Checked) -> None:
