@@ -7,6 +7,7 @@ from panolog.export.compressed_ply import read_compressed_ply
 from panolog.export.frame import Frame
 from panolog.export.sog.read import read_sog
 from panolog.export.splats import Splats
+from panolog.export.spz import read_spz
 from panolog.scene.errors import FormatError
 from panolog.scene.files import StrPath
 from panolog.scene.gaussians import concatenate
@@ -33,8 +34,6 @@ def read_model(path: Path) -> Splats:
     if head.startswith(b"ply"):
         return read_compressed_ply(path)
     if head.startswith(_SPZ):
-        from panolog.export.spz import read_spz  # noqa: PLC0415  # its zstandard comes with an extra
-
         return read_spz(path)
     if zipfile.is_zipfile(path):
         return read_sog(path)

@@ -19,7 +19,6 @@ PACKAGES = {  # a module: its name for people, and the extra of pyproject.toml
     "uvicorn": ("uvicorn", "dashboard"),
     "OpenEXR": ("OpenEXR", "export"),
     "pyproj": ("pyproj", "export"),
-    "zstandard": ("zstandard", "export"),
 }
 
 

@@ -33,13 +33,17 @@ from panolog.scene.image_files import (
     resize_used,
 )
 from panolog.scene.model import Panorama, Scene
+from panolog.scene.tensors.decoded import DecodedLayers
 from panolog.scene.tensors.transfer import CudaMover, Moving, pack
 
 _THREADS = min(4, os.cpu_count() or 1)  # on the CPU: decoding keeps up with training long before this
 MOST_THREADS = 8  # for a GPU: each holds a pinned view and has one more on the GPU
 PASSING = 2  # views on a GPU beyond one for each thread: the one in use, and a preview's
 _LAYERS = ("image", "mask", "sky", "inverse_depth", "exposure")
+# Of a budget that not all views fit in, for the files of layers: a tenth of a view each.
+_LAYERS_SHARE = 0.5
 CURVE, TOE = 2.4, 0.055  # of sRGB (IEC 61966-2-1), above its linear part
+_grey, _unchanged = partial(decode, flags=cv2.IMREAD_GRAYSCALE), partial(decode, flags=cv2.IMREAD_UNCHANGED)
 _LOG = logging.getLogger(__name__)
 
 
@@ -166,7 +170,11 @@ class PanoramaCache:
         self._decoded: OrderedDict[int, View] = OrderedDict()  # those that have left a GPU, likewise
         # One thread for each decode: OpenCV's own would fight with the trainer's for the cores.
         self._pool = ThreadPoolExecutor(self.threads, "decode", initializer=cv2.setNumThreads, initargs=(1,))
-        largest = max((view_bytes(panorama, width) for panorama in self._panoramas.values()), default=1)
+        sizes = [view_bytes(panorama, width) for panorama in self._panoramas.values()]
+        largest = max(sizes, default=1)
+        layered = any(panorama.files[1:] for panorama in self._panoramas.values())
+        kept = int(budget * _LAYERS_SHARE) if layered and sum(sizes) > budget else 0
+        self._layers, budget = DecodedLayers(kept, locate), budget - kept
         self._budget, self._room = max(1, budget // largest), 0 if self._cpu else room // largest  # views
         self._capacity = self._budget if self._cpu else passing_views(self.threads)
         _LOG.info(
@@ -229,7 +237,7 @@ class PanoramaCache:
         self, panorama: Panorama, row: int, width: int, decoded: View | None, keep: bool
     ) -> tuple[View | None, Staged]:
         """Decodes a view, unless it is, and begins to move it to the device."""
-        view = load_view(panorama, row, width, self._locate) if decoded is None else decoded
+        view = load_view(panorama, row, width, self._locate, self._layers) if decoded is None else decoded
         return view if keep else None, self._upload.stage(view)
 
     def _leave(self, row: int, loaded: _Loaded) -> None:
@@ -247,14 +255,19 @@ def passing_views(threads: int) -> int:
     return min(threads, MOST_THREADS) + PASSING
 
 
-def load_view(panorama: Panorama, row: int, width: int, locate: Locate = here) -> View:
+def load_view(
+    panorama: Panorama, row: int, width: int, locate: Locate = here, layers: DecodedLayers | None = None
+) -> View:
     """Decodes one panorama and what belongs to it, found with `locate`, at (width / 2, width) pixels.
+
+    Args: layers, which may have some already.
 
     Raises:
         SceneError: one of its files cannot be decoded.
     """
     image, opaque = decode_with_alpha(locate(panorama.image), width)
-    return replace(_load_layers(panorama, row, width, locate, opaque), image=torch.from_numpy(image))
+    found = _load_layers(panorama, row, width, layers or DecodedLayers(locate=locate), opaque)
+    return replace(found, image=torch.from_numpy(image))
 
 
 def load_layers(panorama: Panorama, row: int, width: int, locate: Locate = here) -> View:
@@ -262,24 +275,24 @@ def load_layers(panorama: Panorama, row: int, width: int, locate: Locate = here)
     opaque = decode_used(locate(panorama.image)) if panorama.transparent else None
     if opaque is not None:
         opaque = resize_used(opaque, (width, width // 2))
-    return _load_layers(panorama, row, width, locate, opaque)
+    return _load_layers(panorama, row, width, DecodedLayers(locate=locate), opaque)
 
 
 def _load_layers(
-    panorama: Panorama, row: int, width: int, locate: Locate, used: NDArray[np.bool_] | None
+    panorama: Panorama, row: int, width: int, layers: DecodedLayers, used: NDArray[np.bool_] | None
 ) -> View:
     """`load_layers` of a panorama, of whose pixels (width / 2, width) some are used, or all of them."""
     size = (width, width // 2)
     sky = depth = None
     if panorama.mask:
-        given = resize_used(decode_mask(locate(panorama.mask)), size)
+        given = resize_used(layers.pixels(panorama.mask, decode_mask) > 0, size)
         used = given if used is None else given & used
     mask = None if used is None else torch.from_numpy(used)
     if panorama.sky_mask:
-        foreground = _foreground(locate(panorama.sky_mask))
+        foreground = _foreground(panorama.sky_mask, layers)
         sky = torch.from_numpy(resize(foreground, size) < WHITE)
     if panorama.depth:
-        raw = decode(locate(panorama.depth), cv2.IMREAD_UNCHANGED)
+        raw = layers.pixels(panorama.depth, _unchanged)
         depth = torch.from_numpy(_resize_depth(raw, size))
     if panorama.movers is not None:
         moving = cv2.resize(panorama.movers.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
@@ -289,9 +302,9 @@ def _load_layers(
     return View(row, torch.zeros((0, 0, 3), dtype=torch.uint8), mask, sky, depth, exposure)
 
 
-def _foreground(path: Path) -> NDArray[np.uint8]:
+def _foreground(path: Path, layers: DecodedLayers) -> NDArray[np.uint8]:
     """A sky mask, 255 or 1 = no sky. Raises ImageError for a map of classes, where all would be sky."""
-    values = decode(path, cv2.IMREAD_GRAYSCALE)
+    values = layers.pixels(path, _grey)
     most = int(values.max())
     if 1 < most < WHITE:
         raise ImageError(
@@ -304,6 +317,8 @@ def _foreground(path: Path) -> NDArray[np.uint8]:
 def _resize_depth(raw: NDArray[np.uint16], size: tuple[int, int]) -> NDArray[np.float32]:
     """Raw inverse depth to [0, 1] at `size`; 0 has no value, so only valid pixels enter a mean."""
     values = raw.astype(np.float32) / np.float32(65535)
+    if size == (raw.shape[1], raw.shape[0]):
+        return values
     weight = resize((raw > 0).astype(np.float32), size)
     total = resize(values, size)
     valid = weight >= 0.5  # at an edge the pixel goes to whichever has most of it

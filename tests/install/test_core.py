@@ -45,7 +45,10 @@ def panolog_without_extras(*arguments: object, cwd: Path) -> subprocess.Complete
         ("run raw -o run", "this needs pycolmap: pip install 'panolog[prepare]'"),
         ("dashboard .", "this needs Starlette: pip install 'panolog[dashboard]'"),
         ("run scene -o run --address auto", "this needs Ray: pip install 'panolog[cluster]'"),
-        ("export model.ply -o model.spz", "this needs zstandard: pip install 'panolog[export]'"),
+        (
+            "export model.ply -o out --3dtiles --epsg 25832",
+            "this needs pyproj: pip install 'panolog[export]'",
+        ),
     ],
 )
 def test_a_command_says_which_extra_it_needs(command: str, said: str, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import os
 import threading
 import weakref
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from panolog.scene import images
-from panolog.scene.errors import ImageError
+from panolog.scene import image_files, images
+from panolog.scene.errors import ImageError, SceneError
+from panolog.scene.image_files import decode
 from panolog.scene.images import CudaUpload, PanoramaCache, Staged, Upload, View, load_view, passing_views
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.scene.tensors import transfer
+from panolog.scene.tensors.decoded import DecodedLayers
 from tests.on_device import needs_a_card
 from tests.renderer.cuda.fake_cuda import Torch
 from tests.scenes import HEIGHT, WIDTH, write_scene
@@ -116,6 +119,51 @@ def test_views_are_decoded_and_moved_again_only_where_there_is_no_room(
     moves = [recorder.staged[row] for row in EPOCHS[0]]
     assert moves[:staying] == [1] * staying and (max(moves) > 1) == (staying < len(ROWS))
     assert recorder.most <= staying + passing_views(1) + 1  # one more until the last of its users lets it go
+
+
+def test_layers_are_decoded_once_although_views_have_no_room(
+    layered: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each picture is decoded in each epoch; of layers as many stay as there is room for."""
+    files: Counter[str] = Counter()
+
+    def counted(path: Path, *rest: Any) -> NDArray[Any]:
+        files[path.parent.name] += 1
+        return decoded(path, *rest)
+
+    decoded = image_files._decoded
+    monkeypatch.setattr(image_files, "_decoded", counted)
+    order, view = [row for epoch in EPOCHS for row in epoch], 9 * WIDTH * HEIGHT
+    expected = {row: load_view(layered.panoramas[row], row, WIDTH).layers() for row in ROWS}
+    found: list[list[int]] = []
+    for budget in (0, view, 6 * view - 1):
+        files.clear()
+        with PanoramaCache(layered, ROWS, WIDTH, budget, device="cuda", upload=Recorder()) as cache:
+            for row in order:
+                for name, layer in cache.get(row).layers().items():
+                    assert torch.equal(layer, expected[row][name]), name
+        found.append([files[folder] for folder in ("masks", "skymasks", "depths")])
+    none, some, every = found
+    assert every == [len(ROWS)] * 3
+    assert sum(every) < sum(some) < sum(none)
+
+
+def test_pixels_that_are_kept_are_those_of_the_file(tmp_path: Path) -> None:
+    random = np.random.default_rng(2)
+    wide = random.integers(0, 2**16, (7, 11), np.uint16)
+    wide[0, :3] = 0, 255, 65535
+    unchanged = partial(decode, flags=cv2.IMREAD_UNCHANGED)
+    for name, pixels in (("wide", wide), ("narrow", wide.astype(np.uint8))):
+        path = tmp_path / f"{name}.png"
+        cv2.imwrite(str(path), pixels)
+        layers = DecodedLayers(10_000)
+        first = layers.pixels(path, unchanged)
+        path.unlink()
+        again = layers.pixels(path, unchanged)
+        assert again.dtype == first.dtype == pixels.dtype
+        assert np.array_equal(again, pixels) and np.array_equal(first, pixels)
+    with pytest.raises(SceneError, match="wide"):
+        DecodedLayers(10_000).pixels(tmp_path / "wide.png", unchanged)
 
 
 def test_cores_decide_how_many_threads_decode_for_a_gpu(scene: Scene) -> None:
