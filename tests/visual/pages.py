@@ -165,7 +165,7 @@ SHOTS = (
     _run("finished", _camera_around),
     _run("live", _failed_block),
     _run("failed", _drawn, "desk-light", "desk-dark", "phone-light"),
-    Shot("waiting", lambda site: site.run_url("waiting"), _drawn, ("desk-dark", "phone-light"), whole=False),
+    _run("waiting", _drawn, "desk-dark", "phone-light"),
     _run("preparing", _prepared, "desk-light", "phone-light"),
     Shot("confirm", lambda site: site.run_url("live"), _confirm, ("desk-dark", "phone-light"), whole=False),
     Shot("missing", lambda site: f"{site.served.url}/runs/0123456789abcdef", _missing, ("phone-light",)),
