@@ -23,7 +23,7 @@ from panolog.scene.errors import DeviceError
 from panolog.scene.files import user_folder, write_bytes
 
 if TYPE_CHECKING:
-    from cuda.core import Program
+    from cuda.core import Program, ProgramOptions
 
 T = TypeVar("T")
 
@@ -114,9 +114,16 @@ def program(module: str, arch: str, **options: Any) -> "Program":
     """
     if target(arch)[0] != arch:
         raise DeviceError(f"NVRTC does not know {arch}: pip install -U nvidia-cuda-nvrtc")
-    from cuda.core import Program, ProgramOptions  # noqa: PLC0415  # optional: only rendering on a GPU needs it
+    from cuda.core import Program  # noqa: PLC0415  # optional: only rendering on a GPU needs it
 
-    settings = ProgramOptions(
+    return Program((CSRC / "cuda" / f"{module}.cu").read_text(), "c++", settings(module, arch, **options))
+
+
+def settings(module: str, arch: str, **options: Any) -> "ProgramOptions":
+    """With what csrc/cuda/{module}.cu is compiled for a real or a virtual architecture ("sm_89", "compute_89")."""
+    from cuda.core import ProgramOptions  # noqa: PLC0415  # optional, as above
+
+    return ProgramOptions(
         name=f"{module}.cu",
         arch=arch,
         std="c++17",
@@ -124,7 +131,6 @@ def program(module: str, arch: str, **options: Any) -> "Program":
         **MODULES[module],
         **options,
     )
-    return Program((CSRC / "cuda" / f"{module}.cu").read_text(), "c++", settings)
 
 
 @functools.cache

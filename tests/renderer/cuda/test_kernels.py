@@ -31,6 +31,7 @@ from tests.renderer.cuda.machine import (
     results,
     surrounded,
 )
+from tests.renderer.cuda.ptx import PROGRAMS, emulated_ptx
 from tests.renderer.hard_scenes import camera, cloud, directions, placed, scenes
 
 pytestmark = pytest.mark.system
@@ -40,7 +41,14 @@ NAMES = [f"{name}, exact" if exact else name for name, exact in SCENES]
 both = pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
 
 
-@pytest.fixture(params=["emulation", pytest.param("card", marks=ON_A_CARD)])
+MACHINES = (
+    "emulation",
+    *(pytest.param(name, marks=pytest.mark.nightly) for name in PROGRAMS),  # each takes a minute
+    pytest.param("card", marks=ON_A_CARD),
+)
+
+
+@pytest.fixture(params=MACHINES)
 def machine(request: pytest.FixtureRequest) -> Machine:
     if request.param == "card":
         from panolog.renderer.cuda.card import Card  # noqa: PLC0415  # needs cuda-core
@@ -48,7 +56,10 @@ def machine(request: pytest.FixtureRequest) -> Machine:
         card = Card.of(torch.cuda.current_device())
         card.device.set_current()
         return Machine(card.launch, "cuda")
-    return emulated(EmulatedLaunch(seed=zlib.crc32(request.node.name.encode())))
+    seed = zlib.crc32(request.node.name.encode())
+    if program := PROGRAMS.get(request.param):
+        return emulated(emulated_ptx(program, seed=seed))
+    return emulated(EmulatedLaunch(seed=seed))
 
 
 def test_cuda_has_every_op_with_the_same_arguments() -> None:

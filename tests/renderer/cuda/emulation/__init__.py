@@ -67,6 +67,7 @@ class EmulatedLaunch:
         flush: bool = False,
         into: Path | None = None,
         kernels: Collection[str] | None = None,
+        instrument: bool = True,
     ) -> None:
         """`contract` and `flush` round as a card may: with fused multiply-adds, with denormals as zero.
 
@@ -77,6 +78,7 @@ class EmulatedLaunch:
             flush: in the modules that NVRTC compiles with fast arithmetic.
             into: where libraries are built, whatever the compiler warns of; without it once for all tests.
             kernels: which of `folder` run, the others being those of csrc/cuda; without it all.
+            instrument: those of `folder` have no checks of their accesses yet.
         """
         self.folder = folder
         self.seed = seed
@@ -84,6 +86,7 @@ class EmulatedLaunch:
         self.flush = flush
         self.into = into
         self.kernels = kernels
+        self.instrument = instrument
         self.memory = _Memory()
 
     def __call__(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
@@ -91,7 +94,8 @@ class EmulatedLaunch:
         own = self.kernels is None or kernel in self.kernels
         source = (self.folder if own else CSRC / "cuda") / f"{module}.cu"
         rounding = MODULES.get(module, {})
-        code = library(source, self.contract and rounding.get("fma", True), self.into if own else None)
+        contract = self.contract and rounding.get("fma", True)
+        code = library(source, contract, self.into if own else None, self.instrument or not own)
         run = getattr(code, f"run_{kernel}")
         run.argtypes, run.restype = (_Launch,), ctypes.c_char_p
         kinds, values = zip(*map(_raw, in_order(source, kernel, arguments)), strict=True)

@@ -24,15 +24,13 @@ COMMON = (
 RUNTIME = (*COMMON, "-O2", "-Wno-clobbered", "-Werror")
 KERNELS = (
     *COMMON,
-    "-O1",
     "-fno-threadsafe-statics",
     "-fno-strict-aliasing",  # float4 is the memory of other structs
     "-ftrivial-auto-var-init=pattern",
-    "-fsanitize=thread",
-    "-fsanitize=bounds,alignment",
     "-Wno-unused-function",
     "-Wno-unknown-pragmas",
 )
+INSTRUMENTED = ("-O1", "-fsanitize=thread", "-fsanitize=bounds,alignment")
 CONTRACTED = ("-ffp-contract=fast", "-fexpensive-optimizations", "-mfma")
 GUARD = 4096  # bytes after each shared variable
 
@@ -52,14 +50,21 @@ def included(source: Path, folders: tuple[Path, ...]) -> list[Path]:
 
 
 @functools.cache
-def library(kernels: Path, contract: bool, into: Path | None) -> ctypes.CDLL:
+def library(kernels: Path, contract: bool, into: Path | None, instrument: bool = True) -> ctypes.CDLL:
     """A .cu file as a shared library, built where it is missing.
 
     Args: `contract`: with fused multiply-adds. `into`: a folder in which warnings are no errors.
+    `instrument`: the compiler adds the checks of accesses.
     Raises CalledProcessError if it does not compile.
     """
     runtime = _runtime()
-    flags = (*KERNELS, *(CONTRACTED if contract else ("-ffp-contract=off",)), "-w" if into else "-Werror")
+    checks = INSTRUMENTED if instrument else ("-O2",)
+    flags = (
+        *KERNELS,
+        *checks,
+        *(CONTRACTED if contract else ("-ffp-contract=off",)),
+        "-w" if into else "-Werror",
+    )
     folders = (kernels.parent, kernels.parent.parent, CSRC, CSRC / "cuda", HERE)
     names = re.findall(r"__launch_bounds__\(\d+\)\s+(\w+)\(", kernels.read_text())
     exports = "".join(f"CUDA_HOST_EXPORT({name})\n" for name in names)
