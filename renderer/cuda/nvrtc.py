@@ -120,7 +120,7 @@ def program(module: str, arch: str, **options: Any) -> "Program":
 
 
 def settings(module: str, arch: str, **options: Any) -> "ProgramOptions":
-    """With what csrc/cuda/{module}.cu is compiled for a real or a virtual architecture ("sm_89", "compute_89")."""
+    """With what a kernel file is compiled for a real or a virtual architecture ("sm_89", "compute_89")."""
     from cuda.core import ProgramOptions  # noqa: PLC0415  # optional, as above
 
     return ProgramOptions(
