@@ -295,8 +295,8 @@ inline Shuffled shuffle(Shuffle how, uint32_t value, uint32_t by, uint32_t limit
   constexpr const char* kNames[] = {"shfl.up", "shfl.down", "shfl.bfly", "shfl.idx"};
   const int lane = int(threadIdx.x % emulation::kWarp), clamp = int(limits & 31), segment = int(limits >> 8 & 31);
   const int first = lane & segment, last = first | (clamp & ~segment), steps = int(by & 31);
-  const int from = how == kUp     ? lane - steps
-                   : how == kDown ? lane + steps
+  const int from = how == kUp      ? lane - steps
+                   : how == kDown  ? lane + steps
                    : how == kIndex ? first | (steps & ~segment)
                                    : lane ^ steps;
   const bool inside = how == kUp ? from >= last : from <= last;
