@@ -110,7 +110,9 @@ PANOLOG_HD void bound_ray(const RayGeometry<T>& q, T room, const T tangent[3], c
   const T lowest = atan2(down, sqrt(flat_down * flat_down + select(down < 0, across * across, 0)));
   const T highest = atan2(up, sqrt(flat_up * flat_up + select(up < 0, 0, across * across)));
   const T middle = atan2(sine, cosine);
-  const T reach = select(around, 4, largest<T>(lowest - middle, middle - highest));
+  const T below = select(around & (sine > 0), 0.5f * kPi, lowest) - middle;  // over a pole, all rows up to it
+  const T above = middle - select(around & (sine < 0), -0.5f * kPi, highest);
+  const T reach = select(wide, 4, largest<T>(below, above));
   s.reach = cam.height / kPi * reach + 0.01f;
 }
 
