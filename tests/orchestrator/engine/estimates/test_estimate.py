@@ -25,7 +25,7 @@ from panolog.workers.device_memory import CONTEXT
 from panolog.workers.events import IterationCost
 from panolog.workers.metrics import LPIPS_BYTES
 from panolog.workers.tasks import Stage
-from panolog.workers.training.exterior import PASSING, READING
+from panolog.workers.training.exterior import BAKED, PASSING, READING
 from tests.orchestrator.calibrated import MEBI, calibrated
 from tests.workers.small import WIDTH, small_scene
 
@@ -146,7 +146,7 @@ def test_a_block_with_a_baked_exterior_trains_what_its_cell_has(tmp_path: Path) 
     assert stage(own.estimate(), Stage.COARSE) == stage(whole.estimate(), Stage.COARSE)
     assert after.gaussians < before.gaussians - 5_000  # no sky
     assert after.seconds is not None and before.seconds is not None and after.seconds < before.seconds
-    layer = 32 * 64 * 32
+    layer = BAKED * 64 * 32
     more = own.host(1_000, 4, 10_000) - whole.host(1_000, 4, 10_000)
     assert more == (4 + READING) * layer + 10_000 * SPLAT
     small = {**settings, "stage2": {"exterior": "baked"}, "cache": {"memory": 3 * layer / 2**30}}
