@@ -142,7 +142,7 @@ def test_on_a_card_nothing_waits_but_the_rasterizer(tmp_path: Path, monkeypatch:
         *_, scored = score(spec)
     assert isinstance(scored, Scored) and not scored.scores.any()
     del found["cpu"]  # of poses, which are there, and once of the scores
-    assert found == {"tolist": 1}
+    assert found == {"tolist": 1, "to": 8}  # once: the model's six tensors, labels and sizes
 
 
 def test_the_loss_is_of_colours_as_the_exposure_has_them(scene: Scene) -> None:

@@ -176,6 +176,5 @@ def test_a_queue_runs_the_program(here: Path) -> None:
     assert (ended.exit_code, ended.stdout) == (1, "")
     started, failed = ended.stderr.splitlines()
     assert started == f"panolog: started 1: {here}/run"
-    assert (
-        failed.startswith(f"panolog: failed 1: {here}/run") and f"{gone}: there is no such folder" in failed
-    )
+    assert failed.startswith(f"panolog: failed 1: {here}/run")
+    assert f"{gone}: there is no such file or folder" in failed

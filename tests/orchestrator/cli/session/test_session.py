@@ -10,6 +10,7 @@ from dataclasses import replace
 from itertools import chain, repeat
 from pathlib import Path
 from shutil import copytree
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -214,7 +215,8 @@ def test_an_unforeseen_error_is_one_line_and_recorded(
     killed: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, line: str
 ) -> None:
     monkeypatch.setattr(session, "_workers", lambda *_: nullcontext(calibrating(fails(error))))
-    monkeypatch.setattr(session, "_exported", lambda _, on_change: on_change)
+    metrics = "panolog.orchestrator.engine.cluster.run_metrics.RunMetrics"
+    monkeypatch.setattr(metrics, lambda _, on_change: SimpleNamespace(show=on_change))
     answer = call("resume", killed, "--resumed-after", "killed by signal 9")
     assert (answer.exit_code, answer.stdout) == (1, "")
     assert "Traceback" not in answer.stderr

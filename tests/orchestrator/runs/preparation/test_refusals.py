@@ -140,8 +140,8 @@ def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
         "one": "1 panoramas .*; at least 2 are needed",
         "flat": "64 x 40 pixels are not 2:1",
         "sizes": "all panoramas must have one size",
-        "none": "there is no",
-        "missing": "there is no such folder",
+        "none": "the folder is empty",
+        "missing": "there is no such file or folder",
         "text.mp4": "cannot be opened as a video|no video",
         "flat.avi": "are not 2:1",
     }
