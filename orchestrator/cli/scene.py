@@ -130,6 +130,7 @@ def sfm(
         pairing=pairs,
         mapper=mapper,
         partial=partial,
+        parts=partial,
         gps=gps,
         distance=distance,
         parallax=PARALLAX if parallax is None else parallax,
