@@ -91,6 +91,7 @@ class TaskId:
         return TaskId(Stage.DISTRICT, index)
 
     @staticmethod
+    @lru_cache(maxsize=2**15)
     def block(index: int) -> "TaskId":
         """The training of a block."""
         return TaskId(Stage.BLOCK, index)
