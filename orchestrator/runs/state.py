@@ -237,7 +237,8 @@ def _apply(state: RunState, stored: Stored) -> RunState:
     if isinstance(record, OfTask) and record.task is not None:
         task = state.task(record.task)
         if changes := _changes(task, record, stored.time):
-            state.tasks[task.id] = replace(task, **changes)
+            state.tasks[task.id] = changed = object.__new__(TaskState)
+            vars(changed).update(vars(task) | changes)  # `replace` sets thirty fields: most of a replay
             state = replace(state, step="") if state.step else state
     return state
 
@@ -316,9 +317,8 @@ def _end(task: TaskState, record: TaskFailed | TaskYielded) -> dict[str, Any]:
         changes |= {"shortages": task.shortages + 1, "starved": record.memory}
     else:
         changes["failures"] = (*task.failures, machines.Misfortune(record.kind, (record.node, record.card)))
-    if record.kind == Failure.LOST:
-        return changes | {"losses": task.losses + 1}
-    return changes | {"errors": task.errors + 1}
+    count = "losses" if record.kind == Failure.LOST else "errors"
+    return changes | {count: getattr(task, count) + 1}
 
 
 def _with_nodes(state: RunState, record: Record, time: float) -> RunState:
@@ -326,7 +326,7 @@ def _with_nodes(state: RunState, record: Record, time: float) -> RunState:
     where = state.task(record.task).where if isinstance(record.task, TaskId) else ()
     if isinstance(record, NodeQuarantined):
         _excuse(state, record)
-    if isinstance(record, NodeLeaving):
+    elif isinstance(record, NodeLeaving):
         state.notices[Noticed(None, machines.leave_text(record))] = None
     known = machines.follow(state.nodes, record, where, time)
     return state if known is state.nodes else replace(state, nodes=known)
