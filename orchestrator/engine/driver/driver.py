@@ -18,6 +18,7 @@ from panolog.orchestrator.engine.driver.ending import end_recorded
 from panolog.orchestrator.engine.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.engine.driver.journal import Journal, Patience
 from panolog.orchestrator.engine.driver.machines import Machines
+from panolog.orchestrator.engine.driver.policy import outcome
 from panolog.orchestrator.engine.driver.purse import Purse
 from panolog.orchestrator.engine.driver.requests import Requests, Stop
 from panolog.orchestrator.engine.driver.results import Deliver, OnPlan, Results
@@ -221,9 +222,9 @@ class Driver:
         self._news = self._news or changed
         if self._news or nodes != self._nodes or self._clock.monotonic() >= self._again:
             self._nodes, self._news, self._again = nodes, False, math.inf
-            if (end := job.outcome(self._state)) is not None:
-                return end
             ready = job.ready(self._state)
+            if (end := outcome(self._state, ready)) is not None:
+                return end
             if not self._attempts and (why := quarantine.hopeless(self._state, ready, nodes)):
                 return Outcome.FAILED, why
             self._start_ready(ready)

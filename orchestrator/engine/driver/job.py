@@ -19,7 +19,6 @@ from panolog.orchestrator.engine.stages.scenes import learnt_scene
 from panolog.orchestrator.engine.stages.surroundings import Surroundings
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.records import Outcome
 from panolog.orchestrator.runs.state import RunState
 from panolog.partition.cells import Volume
 from panolog.partition.districts import Districts
@@ -83,22 +82,13 @@ class Job:
 
     def ready(self, state: RunState) -> tuple[TaskId, ...]:
         """The tasks that may start now: `policy.ready`."""
-        return policy.ready(state, **self._stages)
-
-    def outcome(self, state: RunState) -> tuple[Outcome, str] | None:
-        """How the run has ended: `policy.outcome`."""
-        return policy.outcome(state, **self._stages)
-
-    @property
-    def _stages(self) -> policy.Stages:
-        districts = 1 if self.districts is None else self.districts.count
-        config = self.config
-        return {
-            "shards": len(self.shards),
-            "refine": config.refine,
-            "districts": districts,
-            "deliver": config.deliver,
-        }
+        return policy.ready(
+            state,
+            shards=len(self.shards),
+            refine=self.config.refine,
+            districts=1 if self.districts is None else self.districts.count,
+            deliver=self.config.deliver,
+        )
 
     def views(self, task: TaskId) -> tuple[int, ...]:
         """The rows of the scene's panoramas that train a district, or Stage I as one."""

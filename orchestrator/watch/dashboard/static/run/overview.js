@@ -79,16 +79,16 @@ function makeStage() {
 /**
  * @param {HTMLElement} node
  * @param {StageView} stage
- * @param {number} now the time up to which the stage is known, by the server's clock
+ * @param {number} since seconds for which it has run since the message
  * @param {boolean} live
  * @param {number | null} first when the run began
  */
-function fillStage(node, stage, now, live, first) {
+function fillStage(node, stage, since, live, first) {
   const running = stage.status === "running";
   node.dataset.status = live || !running ? stage.status : "waiting";
   const [name, note, progress] = childrenOf(node);
   setText(name, stage.label);
-  const time = stage.began && (stage.ended || running) ? duration((stage.ended ?? now) - stage.began) : "";
+  const time = stage.seconds === null ? "" : duration(stage.seconds + (running ? since : 0));
   const tally = stage.tasks > 1 && stage.status !== "done" ? `${stage.done} of ${stage.tasks}` : "";
   const from = stage.began ? `from ${clock(stage.began, first ?? undefined)}` : "";
   setText(note, [live || !running ? stage.status : "last state: running", tally, time, from].filter(Boolean).join(" · "));
@@ -122,7 +122,7 @@ export function overview() {
       childrenOf(node).forEach((child, i) => setText(child, fact[i]));
     });
     showCost(summary.money);
-    reconcile(byId("stages"), run.stages, (stage) => stage.name, makeStage, (node, stage) => fillStage(node, stage, running ? run.now + since : run.latest ?? run.now, live, run.began));
+    reconcile(byId("stages"), run.stages, (stage) => stage.name, makeStage, (node, stage) => fillStage(node, stage, running ? since : 0, live, run.began));
   }
 
   setInterval(show, REFRESH);

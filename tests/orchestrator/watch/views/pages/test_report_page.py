@@ -1,6 +1,7 @@
 """The report in a real browser, opened from disk without a network, wide and narrow, light and dark."""
 
 import shutil
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -10,11 +11,13 @@ from playwright.sync_api import Browser, Page, expect
 
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.runs.records import Noticed, TaskFailed
+from panolog.orchestrator.runs.records import Noticed, Outcome, RunEnded, TaskFailed
+from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import write_report
 from panolog.orchestrator.watch.views.palette import SEAM_GRADES
 from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE, TaskId
+from tests.orchestrator.history import AGAIN, BEGAN, model
 from tests.orchestrator.watch.dashboard.browser import DESK, PHONE, SMALL, opened, unreachable
 from tests.orchestrator.watch.dashboard.served import (
     EVIL,
@@ -22,6 +25,7 @@ from tests.orchestrator.watch.dashboard.served import (
     progressed,
     serving,
     started,
+    write_run,
     write_whole_run,
 )
 from tests.orchestrator.watch.views.models import save_model
@@ -81,6 +85,18 @@ def _colors(page: Page, selector: str) -> tuple[int, int, int]:
     assert picture is not None
     blue, green, red = picture.reshape(-1, 3).mean(axis=0).round().astype(int).tolist()
     return blue, green, red
+
+
+def test_no_time_counts_in_which_no_driver_was_at_work(browser: Browser, tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    with closing(Database(folder.database)) as database:
+        database.store([(0.0, BEGAN), (0.0, started(COARSE)), (10.0, RunEnded(Outcome.INTERRUPTED))])
+        database.store([(7000.0, AGAIN), (7000.0, started(COARSE)), (7015.0, model(COARSE))])
+        database.store([(7015.0, RunEnded(Outcome.FAILED, "no"))])
+    report = write_report(folder, tmp_path / "page.html", running=False)
+    with opened(browser, report.as_uri()) as page:
+        expect(page.locator("#facts")).to_contain_text("Elapsed0:25")
+        expect(page.locator("#stages li[data-key='coarse']")).to_contain_text("done · 0:25")
 
 
 def test_all_is_there_without_network(browser: Browser, report: Path) -> None:
