@@ -27,6 +27,7 @@ GET /api/runs/{id}/exposure           ExposureCurve
 GET /api/runs/{id}/findings           Findings: metrics of held-out panoramas, seams, refined poses, movers
 GET /api/runs/{id}/findings/{name}    PNG or JPEG, one of `Findings.pictures`
 GET /api/runs/{id}/point_cloud.ply    the model, to save
+GET /api/runs/{id}/downloads/{kind}   a file of it that was made, to save
 GET /api/runs/{id}/report.html[?save=1]the report, to read in a sandbox of its own, or to save
 GET /api/compare?run=ID&run=ID…       Comparison of two to eight runs; of one that cannot be read the error
 GET /api/compare/curves?run=ID&run=ID…
@@ -44,6 +45,8 @@ POST /api/queue                       {"action": "move"|"remove"|"retry", "entry
 POST /api/runs/{id}/viewer            {"task": null|"coarse"|"block/003", "camera": null|name} → {"url"} of a
                                       page with the model in 3D, which takes seconds to make. It begins at the
                                       panorama of that name in the plan: `PlanCamera.name`
+POST /api/runs/{id}/downloads         {"kind": "sog"|"spz"|"ply"|"html"} → {"url"} of a file of the model,
+                                      which takes seconds to make
 GET /models/{key}/…                   its files, and photographs; the key grants them
 
 A POST needs `X-PanoLOG: 1` and the content type application/json.
@@ -73,7 +76,8 @@ from panolog.orchestrator.watch.dashboard.dependencies import (
 )
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry, read_below
 from panolog.orchestrator.watch.dashboard.messages import CameraView
-from panolog.orchestrator.watch.dashboard.model_pages import ModelPages, page_policy
+from panolog.orchestrator.watch.dashboard.models.downloads import Downloads, Kind
+from panolog.orchestrator.watch.dashboard.models.pages import ModelPages, page_policy
 from panolog.orchestrator.watch.dashboard.queues.panel import QueueAction
 from panolog.orchestrator.watch.dashboard.responses import json_response, model_download, report_download
 from panolog.orchestrator.watch.dashboard.watch import Watch, error_line
@@ -119,6 +123,14 @@ class ViewerRequest(BaseModel):
 
     task: str | None = None
     camera: str | None = None
+
+
+class DownloadRequest(BaseModel):
+    """The body of a POST to /downloads."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    kind: Kind
 
 
 @router.get("/api/runs")
@@ -361,6 +373,26 @@ async def post_viewer(request: Request, registry: Registry, id: str) -> Response
         raise HTTPException(409, error_line(error, registry.root)) from error
     start = "" if body.camera is None else f"#camera={quote(body.camera, safe='')}"
     return json_response(request, encode({"url": f"/models/{key}/{start}"}))
+
+
+@router.post("/api/runs/{id}/downloads")
+async def post_download(request: Request, registry: Registry, id: str) -> Response:
+    """Makes a file of the run's model."""
+    body = await body_of(request, DownloadRequest)
+    watch = await fresh_watch(registry, id)
+    downloads: Downloads = request.app.state.downloads
+    try:
+        await downloads.make(watch.entry, body.kind)
+    except (InputError, OSError) as error:
+        raise HTTPException(409, error_line(error, registry.root)) from error
+    return json_response(request, encode({"url": f"/api/runs/{id}/downloads/{body.kind}"}))
+
+
+@router.get("/api/runs/{id}/downloads/{kind}")
+async def get_download(request: Request, run: Run, kind: Kind) -> Response:
+    """One of these files."""
+    downloads: Downloads = request.app.state.downloads
+    return await respond(request, 404, downloads.file, run.entry, kind)
 
 
 @router.get("/models/{key}/{path:path}")

@@ -25,6 +25,14 @@ const POSSIBLE = {
   retry: ["failed", "waiting", "running"],
 };
 
+/** The files that are made of a model on request: kind, name, and what for. */
+const FILES = [
+  ["sog", "SOG", "for SuperSplat, PlayCanvas, Spark: a twentieth of the size"],
+  ["spz", "SPZ", "for Scaniverse, Spark, Babylon.js; without the sky"],
+  ["ply", "Upright PLY", "for every other viewer: y down, as they expect it"],
+  ["html", "Page", "the 3D view as one file, which opens without a server"],
+];
+
 /** @param {number[]} blocks one at least */
 const blocksLabel = (blocks) => (blocks.length > 1 ? `${blocks.length} blocks` : taskLabel(`block/${blocks[0]}`));
 
@@ -102,6 +110,31 @@ export function actions(path) {
     return el("a", { class: "button", href: `/api/${path}/${file}`, download: page ? null : "", target: page ? "_blank" : null, rel: "noopener" }, label);
   };
 
+  /** Makes a file of the model and saves it. @param {string} kind @param {HTMLElement} button */
+  async function save(kind, button) {
+    button.setAttribute("aria-busy", "true");
+    setMessage(byId("why"), "Making the file: this takes seconds, or minutes of a large model.");
+    try {
+      const { url } = await post(`${path}/downloads`, { kind });
+      setMessage(byId("why"), "");
+      location.assign(url);
+    } catch (error) {
+      setMessage(byId("why"), `No file: ${messageOf(error)}`);
+    } finally {
+      button.removeAttribute("aria-busy");
+    }
+  }
+
+  /** The model in all formats, those that are made on request first. */
+  function downloads() {
+    const made = FILES.map(([kind, name, use]) => {
+      const button = el("button", { type: "button", on: { click: () => save(kind, button) } }, name);
+      return el("li", {}, button, el("span", { class: "muted small" }, use));
+    });
+    const raw = el("li", {}, link("point_cloud.ply", "Raw PLY"), el("span", { class: "muted small" }, "for training and GIS: the run's own axes, on its side in viewers"));
+    return el("details", { class: "menu" }, el("summary", { class: "button" }, "Download"), el("ul", {}, ...made, raw));
+  }
+
   return {
     viewer,
     key: () => JSON.stringify(given),
@@ -128,7 +161,7 @@ export function actions(path) {
           status === "running" && paused.length > 0 && unpause(paused),
           status === "running" ? button("stop", [], refusal("stop")) : status !== "done" && button("resume", [], refusal("resume")),
           model && viewer(null),
-          result.model && link("point_cloud.ply", "Download PLY"),
+          result.model && downloads(),
           result.report && link("report.html", "Report"),
         ];
       });
