@@ -27,7 +27,7 @@ SETTINGS = (
     *("--set", f"deadlines.message={SILENCE_S}", "--set", f"deadlines.hello={HELLO_S}"),
     *("--set", f"quarantine.failures={QUARANTINE}", "--set", f"disk.retry={RETRY_S}"),
 )
-_TIMEOUT_S = 1800.0  # for a run, also on a busy machine
+_TIMEOUT_S = 3600.0  # for a run, also on a busy machine
 _REFUSED = "exit code 2:"  # as `resume` does where run.json is not as it was
 _POLL_S = 0.1  # between two looks at the run
 

@@ -36,14 +36,6 @@ def cuda_resources(found: Found, _: Path) -> None:
     assert {"project_forward", "composite_backward", "loss_gradient", "adam_step"} <= names
 
 
-def driver_scale(found: Found, _: Path) -> None:
-    measured = found["report"]
-    assert measured["events"] >= 12 * 8
-    assert measured["lost"] == 0
-    assert set(measured["status"]) == {"function", "command"}
-    assert all(times["median"] > 0 for times in measured["status"].values())
-
-
 def paper(found: Found, folder: Path) -> None:
     results = {result["variant"]: result for result in found["results"]}
     assert list(results) == ["paper", "no-g2ps", "no-sky", "no-depth", "tau-0.7", "tau-0.8", "tau-0.9"]
@@ -115,7 +107,6 @@ PAPER = (
 PROGRAMS: list[tuple[Callable[[Found, Path], None], str, str]] = [
     (chaos, "chaos", "--runs 1 --seed 4 --faults driver,eio"),
     (cuda_resources, "cuda_resources", "--arch sm_89"),
-    (driver_scale, "driver_scale", "--quick --folder {folder}"),
     (paper, "paper", PAPER),
     (performance, "performance", "--quick -o {folder}/performance.md"),
     (scale, "scale", f"--quick -o {{folder}} --only {PARTS}"),

@@ -80,7 +80,7 @@ class Demands:
 
     def _seconds(self, task: TaskId) -> Callable[[str], float]:
         if task.stage not in (Stage.BLOCK, Stage.ROUND):
-            return _one
+            return lambda _: 1.0
         block = self._sizes.plan(self._state)[task.number]
         return predictor(self._model, block.cameras, block.gaussians)
 
@@ -104,7 +104,8 @@ class Sizes:
         """Those of one task. Args: state of the run, which has the plan when blocks are trained."""
         match task.stage:
             case Stage.DISTRICT | Stage.COARSE:
-                return self._coarse
+                stage = self._estimate.stages[0]
+                return stage.device or stage.host
             case Stage.BLOCK | Stage.ROUND:
                 return self._of_blocks(state)[task.number]
             case Stage.REPAIR:  # part of two blocks, on panoramas of both
@@ -120,11 +121,6 @@ class Sizes:
     def _estimator(self) -> Estimator:
         job = self._job
         return Estimator(job.scene, job.config, basis_of(job.folder, job.scene, job.config), ())
-
-    @cached_property
-    def _coarse(self) -> int:
-        stage = self._estimate.stages[0]
-        return stage.device or stage.host
 
     def expected(self, stage: Stage, state: RunState) -> tuple[float, int] | None:
         """Seconds of all tasks of a stage, one after another, and how many these are; None if not known."""
@@ -169,7 +165,7 @@ class Sizes:
     @cached_property
     def _rendering(self) -> int:
         """Scoring and evaluation with the whole model, whichever is larger."""
-        estimator, work = self._estimator, (self._gaussians, self._cameras)
+        estimator, work = self._estimator, (self._gaussians, len(self._job.scene.train))
         needs = [estimator.rendering(*work), estimator.scoring(*work)]
         return max(device or host for host, device in needs)
 
@@ -178,10 +174,6 @@ class Sizes:
         """What Stage I came to; where a limit has ended it, what was made of it."""
         model = self._job.folder.model(COARSE)
         return ply_header(model if model.exists() else self._job.folder.point_cloud)[0]
-
-    @property
-    def _cameras(self) -> int:
-        return len(self._job.scene.train)
 
 
 def image_cache(cache: CacheConfig, where: Placement, node: Node, need: int, shortages: int) -> CacheConfig:
@@ -198,7 +190,3 @@ def image_cache(cache: CacheConfig, where: Placement, node: Node, need: int, sho
         if device is None:
             device = max(0.0, USABLE * where.memory - need) / 2**30
     return cache.model_copy(update={"memory": memory, "device": device})
-
-
-def _one(_: str) -> float:
-    return 1.0

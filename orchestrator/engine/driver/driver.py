@@ -130,9 +130,6 @@ class Driver:
     def _later(self) -> Specs:  # of the stages after Stage I
         return Specs(self._job.learnt, self._pool)
 
-    def _specs_at(self, stage: Stage) -> Specs:
-        return self._specs if stage in (Stage.DISTRICT, Stage.COARSE) else self._later
-
     def run(self) -> RunState:
         """Runs until the run has ended, which the caller has begun.
 
@@ -258,7 +255,8 @@ class Driver:
             self._again = self._clock.monotonic() + _LOOK_S
 
     def _start(self, task: TaskId, where: Placement) -> None:
-        spec = self._journal.until_done(lambda: self._specs_at(task.stage).of(task))
+        specs = self._specs if task.stage in (Stage.DISTRICT, Stage.COARSE) else self._later
+        spec = self._journal.until_done(lambda: specs.of(task))
         state, iteration = self._state.task(task), 0
         if isinstance(spec, TrainSpec) and spec.checkpoint is not None:
             iteration = checkpoint.iteration_of(self._job.folder.checkpoint(task))

@@ -248,12 +248,10 @@ class Specs:
 
     def passes(self) -> tuple[tuple[str, ...], ...]:
         """The tasks of each pass over the blocks' union."""
-        tasks = {Stage.ROUND: self._rounds, Stage.REPAIR: self._repairs}
+        blocks = np.flatnonzero(self.plan.trained).tolist()
+        tasks = {Stage.ROUND: lambda: map(TaskId.round, blocks), Stage.REPAIR: self._repairs}
         found = (tuple(map(str, tasks[stage]())) for stage in self._job.config.passes.stages)
         return tuple(filter(None, found))
-
-    def _rounds(self) -> Iterator[TaskId]:
-        return map(TaskId.round, np.flatnonzero(self.plan.trained).tolist())
 
     def _repairs(self) -> Iterator[TaskId]:
         near = self.repaired

@@ -32,17 +32,13 @@ USABLE = 0.9  # of a node's free memory: the rest is for Ray and what the estima
 Placed = tuple[TaskId, Placement]
 
 
-def _equal(_: str) -> float:
-    return 1.0
-
-
 @dataclass(frozen=True)
 class Demand:
     """A task that could start."""
 
     task: TaskId
     memory: int  # bytes that it needs, roughly: of a GPU, or of a node if it runs on the CPU
-    seconds: Callable[[str], float] = _equal  # by kind of place
+    seconds: Callable[[str], float] = lambda _: 1.0  # by kind of place
     alone: bool = False  # it has run out of memory: nothing else may run on its device
     more_than: int = 0  # bytes of memory that were not enough
     avoid: Mapping[str, float] = field(default_factory=dict)  # how often it has failed, by Node.id and card

@@ -171,8 +171,9 @@ def spend(spending: Spending, stored: Stored) -> Spending:
         case BudgetSet():
             return replace(spending, budget=record, since=time, near=None, reached=None)
         case BudgetNear() | BudgetReached():
-            name = "near" if isinstance(record, BudgetNear) else "reached"
-            return replace(spending, **{name: record})
+            if isinstance(record, BudgetNear):
+                return replace(spending, near=record)
+            return replace(spending, reached=record)
         case RunEnded():
             machines |= {id: _closed(machine, time) for id, machine in machines.items()}
         case RunBegan(previous=before):  # one that was killed has recorded no end
@@ -180,7 +181,7 @@ def spend(spending: Spending, stored: Stored) -> Spending:
             machines |= {id: replace(_closed(machine, end), tasks=0) for id, machine in machines.items()}
             running.clear()
         case _:
-            if share := running.pop(record.task, None):
+            if record.task is not None and (share := running.pop(record.task, None)):
                 machine = machines[share.node].until(time)
                 machines[share.node] = replace(machine, tasks=machine.tasks - 1)
     if isinstance(record, TaskStarted) and record.node_id in machines:

@@ -54,6 +54,8 @@ class SimulatedPool(InProcess):
         self.sent: Counter[TaskId] = Counter()  # events of progress, by task
         self.late = 0.0  # longest wait of a message of a block, seconds
         self.cpu = 0.0  # seconds used by the simulation itself
+        self.turn = 0.0  # most seconds of CPU, all in all, between two looks for messages
+        self._looked = time.thread_time()
         self._rate, self._seconds = rate, seconds
         self._random = np.random.default_rng(0)
         self._running: dict[TaskId, _Running] = {}
@@ -87,6 +89,7 @@ class SimulatedPool(InProcess):
     def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
         """The tasks, but those in `but`, whose next message is due; waits at most `seconds` for one."""
         began = time.thread_time()
+        self.turn = max(self.turn, began - self._looked) if self.late else 0.0
         first = min(
             (task.due for name, task in self._running.items() if name not in but), default=float("inf")
         )
@@ -95,7 +98,8 @@ class SimulatedPool(InProcess):
             time.sleep(min(seconds, first - now))
             now = time.monotonic()
         due = [name for name, task in self._running.items() if name not in but and task.due <= now]
-        self.cpu += time.thread_time() - began
+        self._looked = time.thread_time()
+        self.cpu += self._looked - began
         return due
 
     def take(self, name: TaskId) -> Message:
