@@ -48,8 +48,8 @@ class SceneCheck:
             return "verdict: poses, points and panoramas fit together"
         if self.misplaced:
             return (
-                f"verdict: {len(self.misplaced)} of {self.panoramas} panoramas fit no more than by chance; correct their "
-                "poses or leave them out, or training yields fog around them"
+                f"verdict: {len(self.misplaced)} of {self.panoramas} panoramas fit no more than by chance; "
+                "correct their poses or leave them out, or training yields fog around them"
             )
         count = f"{len(self.problems)} problems" if len(self.problems) > 1 else "a problem"
         return f"verdict: {count}; fix that first, or training yields fog"

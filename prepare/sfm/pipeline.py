@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import SUFFIXES, PanoramaFile, look_into, masks_among
+from panolog.prepare.sfm.features import MEMORY
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
 from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
@@ -53,6 +54,7 @@ def make_scene(
     settings: SfmSettings,
     progress: StageProgress,
     with_masks: WithMasks = lambda _, layers: layers,
+    memory: int = MEMORY,
 ) -> SfmReport:
     """Makes a scene of `source`, a folder or a video, in the new folder `output`, with its report.
 
@@ -62,6 +64,7 @@ def make_scene(
     Raises:
         SceneError: the source is wrong, or its panoramas share too little; there is no `output` then, and
             what was done is kept for the next call.
+        RunError: a process was killed again and again, most likely for want of memory.
         OSError: a file cannot be read or written.
     """
     require_new(output)
@@ -94,6 +97,7 @@ def make_scene(
         mapper=settings.mapper,
         partial=settings.partial,
         progress=progress,
+        memory=memory,
         places=places,
     )
     world = _georeference(found, settings)

@@ -15,7 +15,7 @@ from panolog.prepare.sfm.consistency.contradictions import (
     is_trusted,
 )
 from panolog.prepare.sfm.consistency.solve import Solution, solve
-from panolog.prepare.sfm.features import find_features
+from panolog.prepare.sfm.features import MEMORY, find_features
 from panolog.prepare.sfm.links import Link, find_links
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing, best_matches, choose_pairs, match_pairs
@@ -64,10 +64,12 @@ def reconstruct(
     partial: bool,
     progress: StageProgress,
     places: NDArray[np.float64] | None = None,
+    memory: int = MEMORY,
 ) -> Reconstruction:
     """Features, matches, poses and points of `panoramas`. Results are kept in `folder`, for the next call.
 
     Args: partial, accept poses for half of them or fewer, and the consistent part of contradictory ones;
+        memory, bytes that may be used;
         places, (K, 3) where they were taken, by a known trajectory, NaN where it is not.
     Raises: SceneError, a file is damaged or of another size, the panoramas share too little, or their poses
         contradict their matches.
@@ -82,7 +84,7 @@ def reconstruct(
     allowed = max_error(size[0])
     work.open([_VERSION, allowed, [[(str(path), *file_state(path)) for path in paths] for paths in masks]])
     with silence_colmap():
-        features = find_features(work, masks, progress)
+        features = find_features(work, masks, progress, memory)
         if features == 0:
             where = panoramas[0].path.parent
             raise SceneError(f"{where}: no features in any panorama; are they masked, or empty?")
