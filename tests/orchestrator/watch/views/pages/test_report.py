@@ -84,6 +84,21 @@ def test_a_finished_run_is_one_self_contained_page(done: RunFolder) -> None:
     assert report["views/0"].startswith("data:image/jpeg;base64,")
 
 
+def test_a_reader_elsewhere_sees_no_path_and_what_is_next_to_the_report(
+    done: RunFolder, tmp_path: Path
+) -> None:
+    scene = read_info(done).scene.path
+    done.page.write_text("a page")
+    within = Report(write_report(done))
+    elsewhere = Report(write_report(done, tmp_path / "page.html"))
+    done.page.unlink()
+    for report in (within, elsewhere):
+        assert str(done.root) not in report.text and scene not in report.text
+        assert report.run.info["scene"]["path"] == Path(scene).name
+    assert (within.run.result.view, within.run.result.model) == (True, True)
+    assert (elsewhere.run.result.view, elsewhere.run.result.model) == (False, False)
+
+
 def test_its_answers_are_those_of_the_dashboard(done: RunFolder) -> None:
     """Each is one of a model of the dashboard's messages, for all cameras, blocks and tasks of the run."""
     report = Report(write_report(done))
