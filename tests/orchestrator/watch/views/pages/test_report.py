@@ -21,7 +21,7 @@ from panolog.orchestrator.engine.scheduling.pool import Failed
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
+from panolog.orchestrator.runs.info import SceneRef, make_info, read_info, write_info
 from panolog.orchestrator.runs.records import Noticed, RunBegan, Stored, TaskFailed
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.dashboard.messages import (
