@@ -73,8 +73,7 @@ export class Walk {
     button("back").addEventListener("click", () => this.step(-1));
     button("on").addEventListener("click", () => this.step(1));
     input("along").addEventListener("input", () => {
-      this.pause();
-      this._leave();
+      this.leave();
       this.place = Number(input("along").value);
       this._flight.set(this._pose());
       this._say();
@@ -84,9 +83,9 @@ export class Walk {
       if (Math.abs(near - this.place) < 0.02) this.go(this.cameras[near]);
     });
     button("photograph").addEventListener("click", () => {
-      const shown = pressed("photograph") && (this._arrived !== null || !this.current);
-      press("photograph", !shown);
-      if (!shown) this._show();
+      press("photograph", !pressed("photograph"));
+      if (pressed("photograph") && this.current) this._show();
+      else if (pressed("photograph")) this.go(this.cameras[nearest(this.cameras, this._flight.position)]);
     });
     input("strength").addEventListener("input", () => {
       if (!pressed("photograph")) button("photograph").click();
@@ -105,6 +104,7 @@ export class Walk {
     this._waited = 0;
     this._turned = [0, 0];
     this._leave();
+    press("photograph", false);
     if (this.place >= this.cameras.length - 1) this.place = 0;
     this._mark();
     this._flight.travel(this._pose(), still.matches ? 0 : 0.6);
@@ -128,7 +128,7 @@ export class Walk {
     if (camera) this.go(camera);
   }
 
-  /** @param {Camera} camera @param {boolean} [atOnce]  Goes there and shows its photograph; at once, the model. */
+  /** @param {Camera} camera @param {boolean} [atOnce]  Goes there, and shows its photograph if that is on; at once, the model. */
   go(camera, atOnce = false) {
     this.pause();
     this._leave();
@@ -141,10 +141,11 @@ export class Walk {
     this._flight.travel(camera, atOnce || still.matches ? 0 : TRAVEL, () => atOnce || this._show());
   }
 
-  /** The user moves the view away. */
+  /** The user moves the view away: what is shown there is the model. */
   leave() {
     this.pause();
     this._leave();
+    press("photograph", false);
   }
 
   _leave() {
@@ -214,6 +215,7 @@ export class Walk {
   _fade(seconds) {
     const there = this._arrived !== null && this._arrived === this.current && pressed("photograph");
     const wanted = there ? Number(input("strength").value) / 100 : 0, { opacity } = this._picture;
+    at("tag").hidden = opacity === 0;
     if (opacity === wanted) return;
     const by = still.matches ? 1 : seconds / FADE;
     this._picture.setOpacity(opacity < wanted ? Math.min(wanted, opacity + by) : Math.max(wanted, opacity - by));

@@ -22,12 +22,14 @@ GET /api/runs/{id}/previews[?task=]   PreviewList: the latest of each task, or a
 GET /api/runs/{id}/previews/{event}   JPEG, the render above the photograph
 GET /api/runs/{id}/views              HeldOutViews
 GET /api/runs/{id}/views/{number}     JPEG, the render above the photograph
+GET /api/runs/{id}/cover/{event}      JPEG, the render of such a picture, small: `RunRow.cover` names one
 GET /api/runs/{id}/preparation/{name} PNG or JPEG, what a step of the preparation has made: `PictureView.name`
 GET /api/runs/{id}/exposure           ExposureCurve
 GET /api/runs/{id}/findings           Findings: metrics of held-out panoramas, seams, refined poses, movers
 GET /api/runs/{id}/findings/{name}    PNG or JPEG, one of `Findings.pictures`
 GET /api/runs/{id}/point_cloud.ply    the model, to save
 GET /api/runs/{id}/downloads/{kind}   a file of it that was made, to save
+GET /api/runs/{id}/view.html          the model in 3D as one file, in a sandbox of its own
 GET /api/runs/{id}/report.html[?save=1]the report, to read in a sandbox of its own, or to save
 GET /api/compare?run=ID&run=ID…       Comparison of two to eight runs; of one that cannot be read the error
 GET /api/compare/curves?run=ID&run=ID…
@@ -79,7 +81,12 @@ from panolog.orchestrator.watch.dashboard.messages import CameraView
 from panolog.orchestrator.watch.dashboard.models.downloads import Downloads, Kind
 from panolog.orchestrator.watch.dashboard.models.pages import ModelPages, page_policy
 from panolog.orchestrator.watch.dashboard.queues.panel import QueueAction
-from panolog.orchestrator.watch.dashboard.responses import json_response, model_download, report_download
+from panolog.orchestrator.watch.dashboard.responses import (
+    json_response,
+    model_download,
+    page_download,
+    report_download,
+)
 from panolog.orchestrator.watch.dashboard.watch import Watch, error_line
 from panolog.orchestrator.watch.views import queries
 from panolog.orchestrator.watch.views.comparison.compare import compare
@@ -261,6 +268,12 @@ async def get_view(request: Request, run: Run, number: _EventId) -> Response:
     return await respond(request, 404, pictures.view, run.entry, number)
 
 
+@router.get("/api/runs/{id}/cover/{event}")
+async def get_cover(request: Request, run: Run, event: _EventId) -> Response:
+    """A small picture of it."""
+    return await respond(request, 404, pictures.cover, run.entry, event)
+
+
 @router.get("/api/runs/{id}/preparation/{name}")
 async def get_preparation_picture(request: Request, run: Run, name: str) -> Response:
     """What a step of the preparation has made."""
@@ -289,6 +302,12 @@ async def get_finding_picture(request: Request, run: Run, name: str) -> Response
 async def get_model(request: Request, run: Run) -> Response:
     """The merged model."""
     return await respond(request, 404, model_download, run.entry)
+
+
+@router.get("/api/runs/{id}/view.html")
+async def get_view_page(request: Request, run: Run) -> Response:
+    """The model in 3D."""
+    return await respond(request, 404, page_download, run.entry)
 
 
 @router.get("/api/runs/{id}/report.html")

@@ -52,6 +52,13 @@ def model_download(entry: RunEntry) -> Download:
     return Download(handle, "application/octet-stream", {}, f"{file_name(entry)}.ply")
 
 
+def page_download(entry: RunEntry) -> Download:
+    """The model in 3D, as a page to show. Raises InputError if there is none."""
+    handle = open_below(entry.folder.page, entry.folder.root)
+    policy = f"{_SANDBOX}; connect-src data: blob:; worker-src blob:"
+    return Download(handle, "text/html; charset=utf-8", {"Content-Security-Policy": policy}, None)
+
+
 def report_download(entry: RunEntry, save: bool) -> Download:
     """The report, to save or to show. Raises InputError if there is none."""
     handle = open_below(entry.folder.report, entry.folder.root)

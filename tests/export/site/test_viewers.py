@@ -76,31 +76,36 @@ def center(image: NDArray[np.float64], channel: int) -> tuple[float, float]:
     return float(columns.mean() / image.shape[1]), float(rows.mean() / image.shape[0])
 
 
-def supersplat(folder: Path, file: str) -> NDArray[np.float64]:
-    """What SuperSplat's viewer shows of a file in a folder that has the site's settings.
-
-    Args: file, its name below `folder`/site.
-    """
+def lay_out(folder: Path) -> None:
+    """Both viewers in a folder; the models that they show are below `folder`/site."""
     shutil.copytree(peer("@playcanvas/supersplat-viewer") / "public", folder, dirs_exist_ok=True)
+    for name, package in (("three", "three"), ("spark", "@sparkjsdev/spark")):
+        (folder / name).symlink_to(peer(package))
+    shutil.copy(Path(__file__).with_name("spark.html"), folder)
     (folder / "favicon.ico").touch()  # which a browser requests
-    address = f"index.html?content=site/{file}&settings=site/settings.json&noanim&noui"
+
+
+def supersplat_address(file: str) -> str:
+    """Where SuperSplat's viewer shows a file of the site, from the site's start."""
+    return f"index.html?content=site/{file}&settings=site/settings.json&noanim&noui"
+
+
+def supersplat(folder: Path, file: str) -> NDArray[np.float64]:
+    """What SuperSplat's viewer shows of a file of the site in a folder."""
+    lay_out(folder)
     shown = "window.firstFrame = () => { window.shown = true; }"
-    with serving(folder) as url, software_page(url + address, first=shown) as page:
+    with serving(folder) as url, software_page(url + supersplat_address(file), first=shown) as page:
         page.wait_for_function("window.shown", timeout=300_000)
         return picture(page)
 
 
 def spark(folder: Path, file: str) -> NDArray[np.float64]:
     """What Spark shows of a file, of those with y down as its own example shows models of 3DGS."""
-    for name, package in (("three", "three"), ("spark", "@sparkjsdev/spark")):
-        (folder / name).symlink_to(peer(package))
-    shutil.copy(Path(__file__).with_name("spark.html"), folder / "index.html")
-    (folder / "favicon.ico").touch()
+    lay_out(folder)
     turned = "" if file.endswith(".spz") else "&turned"
-    with serving(folder) as url, software_page(f"{url}?{file}{turned}") as page:
-        page.wait_for_function("window.frames_drawn > 3", timeout=300_000)
+    with serving(folder) as url, software_page(f"{url}spark.html?site/{file}{turned}") as page:
         # Spark sorts in a worker, and draws the result in a later frame.
-        page.wait_for_function("(start) => window.frames_drawn > start + 20", arg=3, timeout=300_000)
+        page.wait_for_function("window.frames_drawn > 20", timeout=300_000)
         return picture(page)
 
 
@@ -118,5 +123,6 @@ def test_supersplat_shows_files_upright(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["sog", "ply", "spz"])
 def test_spark_shows_files_upright(tmp_path: Path, kind: str) -> None:
-    exported(tmp_path)
+    site(tmp_path / "site")
+    exported(tmp_path / "site")
     seen_upright(spark(tmp_path, FILES[kind]))

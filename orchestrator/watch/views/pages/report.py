@@ -24,7 +24,12 @@ from panolog.orchestrator.watch.views.pages.findings import (
 )
 from panolog.orchestrator.watch.views.pages.shell import RUN, data_url, write_snapshot
 from panolog.orchestrator.watch.views.plan_map import read_points
-from panolog.orchestrator.watch.views.preparation import picture_path, version_of, view_preparation
+from panolog.orchestrator.watch.views.preparation import (
+    PreparationView,
+    picture_path,
+    version_of,
+    view_preparation,
+)
 from panolog.orchestrator.watch.views.queries import Filter, events, series, spread
 from panolog.orchestrator.watch.views.run_view import RunView, view_run
 from panolog.orchestrator.watch.views.site.photographs import WIDE, small_copy
@@ -57,7 +62,8 @@ def write_report(folder: RunFolder, output: Path | None = None, *, running: bool
     prepared = view_preparation(folder, history.state, running=running)
     view = view_run(history, info, running=running, root=folder.root, preparation=prepared)
     answers = dict(_answers(folder, view, read_findings(folder)))
-    write_snapshot(path, RUN, answers, {"run": _message(folder, view)})
+    message = _message(folder, view, next_to=path.absolute().parent == folder.root.absolute())
+    write_snapshot(path, RUN, answers, {"run": message}, _own_paths(folder, info, prepared))
     return path
 
 
@@ -77,17 +83,31 @@ def report_or_notice(folder: RunFolder) -> list[Record]:
     return []
 
 
-def _message(folder: RunFolder, view: RunView) -> dict[str, Any]:
-    """The message of the stream with all about the run: RunPage of the dashboard."""
+def _own_paths(folder: RunFolder, info: dict[str, Any], prepared: PreparationView | None) -> list[str]:
+    """Paths of this machine that a reader elsewhere needs to know no more of than their names."""
+    found = [
+        str(folder.root.absolute()),
+        str(info["scene"]["path"]),
+        *([prepared.source] if prepared else []),
+    ]
+    return sorted((path for path in found if Path(path).is_absolute()), key=len, reverse=True)
+
+
+def _message(folder: RunFolder, view: RunView, *, next_to: bool) -> dict[str, Any]:
+    """The message of the stream with all about the run: RunPage of the dashboard.
+
+    Args: next_to, whether the report is in the run's folder, so that links lead to what is there.
+    """
     root = folder.root.absolute()
     return dict(view) | {
         "id": _ID,
         "name": root.name,
-        "path": str(root),
+        "path": root.name,
         "actions": {"allowed": False, "why": None, "available": (), "failed": None},
         "result": {
-            "model": False,
+            "model": next_to and folder.point_cloud.is_file(),
             "report": False,
+            "view": next_to and folder.page.is_file(),
             "exposure": version_of(folder.exposure),
             "map": folder.known_plan.exists(),
             "findings": findings_version(folder),

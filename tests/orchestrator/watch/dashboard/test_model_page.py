@@ -209,6 +209,7 @@ def test_what_a_run_has_written_is_shown_with_the_scenes_photographs(
         with opened(browser, served.url + url, width=SIZE[0], height=SIZE[1]) as page:
             ready(page)
             page.evaluate("panolog.walk.go(panolog.walk.cameras[2])")
+            page.click("#photograph")
             until(page, "panolog.walk._picture.opacity === 1")
             assert np.allclose(shown(page)[SIZE[1] // 2, SIZE[0] // 2], (250, 20, 10), atol=8)
         later = time.time() + 100

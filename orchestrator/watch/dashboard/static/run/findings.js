@@ -2,7 +2,7 @@
 
 /** @import { Findings, HeldOutMetrics, MovedCamera, MoverShare, RunPage, Seam } from "../shared/messages.js" */
 /** @import { Choose } from "./run.js" */
-import { get, urlOf } from "panolog/shared/api.js";
+import { get, snapshot, urlOf } from "panolog/shared/api.js";
 import { byId, childrenOf, el, table } from "panolog/shared/dom.js";
 import { METRICS, count, fixed } from "panolog/shared/format.js";
 
@@ -32,7 +32,8 @@ function quality({ mean, views, lpips_reason: reason }, pictured, choose) {
   const name = ([view]) => (pictured.has(view) ? el("button", { type: "button", class: "row-name", on: { click: () => choose.view(view) } }, view) : view);
   return [
     all && note(`On average ${all}.`, fitted && ` After a fit of each render's colours ${fitted}.`),
-    reason && note(reason),
+    note("PSNR is how far colours are off, in decibels: six more are half the error. SSIM compares structure, 1 is equal; LPIPS what a network sees, 0 is equal. WS-PSNR and WS-SSIM count each pixel by the area that it has on the sphere, because a panorama enlarges what is above and below."),
+    reason && !snapshot && note(reason),
     rows.length > 0 && listed(counted(rows.length, "held-out panorama"), table(rows, [
       ["Panorama", name],
       ...METRICS.map(({ key, label, digits }) => /** @type {const} */ ([label, (/** @type {typeof rows[number]} */ [, values]) => fixed(values[key], digits), "number"])),

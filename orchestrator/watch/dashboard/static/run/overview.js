@@ -60,11 +60,9 @@ function showCost(money) {
 
 /** What to do about a run that ended before it was done. @param {RunPage} run @returns {[string, string] | null} */
 function hint({ summary: { status, stage }, progress, eta, latest, path }) {
+  if (snapshot) return status === "running" ? [`The run was still running when this was written: ${percent(progress)} done${eta === null ? "" : `, about ${duration(eta)} left`}.`, ""] : null;
   const resume = `panolog resume ${shellWord(path)}`;
   const kept = stage === "prepare" ? "What is done is kept" : "The checkpoints are kept";
-  if (snapshot && status === "running") {
-    return [`The run was still running when this was written: ${percent(progress)} done${eta === null ? "" : `, about ${duration(eta)} left`}. To write it again:`, `panolog report ${shellWord(path)}`];
-  }
   const last = latest ? ` Last update: ${clock(latest)}, ${ago(latest)}.` : "";
   if (status === "stopped") return [`${kept}.${last} To resume the run:`, resume];
   if (status === "limited") return ["A limit has ended the training early; the model is what there was. To complete the run, also with a higher limit:", `${resume} --max-cost none --deadline none`];

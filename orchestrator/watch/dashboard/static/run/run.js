@@ -13,6 +13,7 @@ import { log } from "panolog/run/log.js";
 import { planMap } from "panolog/run/map.js";
 import { machines, overview, settings } from "panolog/run/overview.js";
 import { preparation } from "panolog/run/preparation.js";
+import { report } from "panolog/run/report.js";
 import { blockStatuses, trainingRows } from "panolog/run/rows.js";
 import { selection } from "panolog/run/selection.js";
 import { views } from "panolog/run/views.js";
@@ -40,6 +41,8 @@ const choose = {
   /** @param {string} task */
   curve(task) {
     charts.toggle(task, true);
+    const folded = document.querySelector("#curves.folded .fold");
+    if (folded instanceof HTMLElement) folded.click();
     byId("curves").scrollIntoView();
   },
   /** @param {string} task */
@@ -93,7 +96,8 @@ function show(sent) {
   byId("missing").hidden = true;
   const rows = trainingRows(run);
   head.update(run, lost);
-  if (!snapshot) acts.update(run);
+  if (snapshot) report(path, run);
+  else acts.update(run);
   prepared.update(run, lost === null);
   map.update(run, blockStatuses(run));
   table.update(rows, run.summary.status === "running");

@@ -4,7 +4,7 @@
 import { connectionLine, stream } from "panolog/shared/api.js";
 import { addHeadings, bar, byId, compare, el, first, markSorted, matches, pill, reconcile, setBar, setPill, setText } from "panolog/shared/dom.js";
 import { showQueue } from "panolog/runs/queue.js";
-import { ago, bytes, duration, fixed, percent, shellWord, short } from "panolog/shared/format.js";
+import { ago, bytes, count, duration, fixed, percent, shellWord, short } from "panolog/shared/format.js";
 
 /** @param {RunRow} run */
 const title = (run) => (run.name === "." ? "this folder" : run.name);
@@ -52,13 +52,24 @@ function makeRow(run) {
   const link = el("a", { href: `/runs/${run.id}`, class: "run-name" });
   const cells = COLUMNS.map((column) => {
     const cell = el("td", { class: column.number ? "number" : null, "data-label": column.label, "data-column": column.key });
-    if (column.key === "name") cell.append(link, el("span", { class: "scene" }));
+    const cover = el("img", { class: "cover", alt: "", width: 112, height: 56, loading: "lazy", hidden: true });
+    if (column.key === "name") cell.append(cover, el("div", {}, link, el("span", { class: "scene" }), el("span", { class: "made" })));
     if (column.key === "status") cell.append(pill("unread"));
     if (column.key === "progress") cell.append(bar(0, "progress"), el("span", { class: "share" }));
     return cell;
   });
   const box = el("input", { type: "checkbox", on: { change: () => choose(run.id, box.checked) } });
   return el("tr", {}, el("td", { "data-column": "choose" }, box), cells);
+}
+
+/** What a run was made with, and how long it has taken. @param {RunRow} run */
+function made({ width, iterations, blocks, seconds }) {
+  return [
+    width === null ? "" : `${count(width)} px wide`,
+    iterations === null ? "" : `${count(iterations)} iterations`,
+    blocks === null ? "" : blocks > 1 ? `${count(blocks)} blocks` : "1 block",
+    seconds === null ? "" : duration(seconds),
+  ].filter(Boolean).join(" · ");
 }
 
 /** Which runs are compared, in the order in which they were chosen. @param {string} id @param {boolean} on */
@@ -85,6 +96,11 @@ function fillRow(row, run) {
   const box = /** @type {HTMLInputElement} */ (first("input", row));
   box.checked = chosen.has(run.id);
   box.setAttribute("aria-label", `Compare ${title(run)}`);
+  const cover = /** @type {HTMLImageElement} */ (first(".cover", row));
+  const picture = run.cover === null ? null : `/api/runs/${run.id}/cover/${run.cover}`;
+  cover.hidden = picture === null;
+  if (picture !== null && cover.getAttribute("src") !== picture) cover.src = picture;
+  setText(first(".made", row), made(run));
   const below = first(".scene", row);
   setText(below, run.error ?? (run.scene ? `scene ${run.scene}` : ""));
   below.classList.toggle("error", Boolean(run.error));
