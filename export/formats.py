@@ -48,12 +48,16 @@ def _source(model: ChosenModel, part: Part, frame: Frame | None = None, scale: f
     return found
 
 
-def _whole(model: ChosenModel) -> Part:
-    return "all" if model.sky else "scene"
+def _for_viewers(model: ChosenModel) -> ModelSource:
+    """As viewers show it: y down, and with the sky in the same file."""
+    upside_down = model.place.upside_down
+    if not model.sky:
+        return _source(model, "scene", upside_down)
+    return _source(model, "all", upside_down).with_near_sky()
 
 
 def _sog(model: ChosenModel, path: Path) -> list[Path]:
-    write_sog(path, _source(model, _whole(model), model.place.upside_down))
+    write_sog(path, _for_viewers(model))
     return [path]
 
 
@@ -68,7 +72,7 @@ def _spz(model: ChosenModel, path: Path) -> list[Path]:
 
 
 def _compressed_ply(model: ChosenModel, path: Path) -> list[Path]:
-    write_compressed_ply(path, _source(model, _whole(model), model.place.upside_down))
+    write_compressed_ply(path, _for_viewers(model))
     return [path]
 
 
@@ -76,7 +80,7 @@ def _ply(model: ChosenModel, path: Path) -> list[Path]:
     """As trainers write it, and y down: viewers turn it."""
     if path.resolve() == model.ply.resolve():
         raise InputError(f"{path}: is the model itself; give the upright one another name")
-    found, sky = _source(model, _whole(model), model.place.upside_down), 0
+    found, sky = _for_viewers(model), 0
     if model.sky:
         sky = found.part("sky").count
     exact, first = ply_exact(model.ply), found.count - sky
