@@ -54,7 +54,7 @@ class SimulatedPool(InProcess):
         self.sent: Counter[TaskId] = Counter()  # events of progress, by task
         self.late = 0.0  # longest wait of a message of a block, seconds
         self.cpu = 0.0  # seconds used by the simulation itself
-        self.turn = 0.0  # most seconds of CPU, all in all, between two looks for messages
+        self.turn = 0.0  # most seconds of CPU between two looks for messages, while blocks run
         self._looked = time.thread_time()
         self._rate, self._seconds = rate, seconds
         self._random = np.random.default_rng(0)
@@ -89,7 +89,8 @@ class SimulatedPool(InProcess):
     def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
         """The tasks, but those in `but`, whose next message is due; waits at most `seconds` for one."""
         began = time.thread_time()
-        self.turn = max(self.turn, began - self._looked) if self.late else 0.0
+        if any(name.stage is Stage.BLOCK for name in self._running):
+            self.turn = max(self.turn, began - self._looked)
         first = min(
             (task.due for name, task in self._running.items() if name not in but), default=float("inf")
         )

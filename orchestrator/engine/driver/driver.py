@@ -67,7 +67,7 @@ from panolog.workers.training.trainer import TrainSpec
 
 _WAIT_S = 0.5  # after which the display is refreshed without a message
 _TURN_S = 0.05  # the same while something large is written
-_STARTS_S = 1.0  # of a turn in which tasks are started: what blocks begin with may take minutes to cut
+_STARTS_S = 0.5  # of a turn in which tasks are started: what blocks begin with may take minutes to cut
 _REVIEW_S = 60.0  # after which it is decided anew whether a task waits for another node than where it failed
 _LOOK_S = 10.0  # the same while machines are on their way
 _ENDS = (Trained, Scored, Ended, Failed)  # after these messages another task may start
