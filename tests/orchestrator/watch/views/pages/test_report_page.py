@@ -207,7 +207,7 @@ def test_a_finished_one_begins_with_a_picture_and_is_short(browser: Browser, tmp
     save_model(folder, COARSE)
     _measure(folder)
     names, values = ("good.jpg", "better.jpg", "bad.jpg"), (21.0, 26.0, 18.0)
-    views = {
+    views: dict[str, dict[str, float | None]] = {
         name: {"psnr": psnr, "ssim": 0.9, "ws_psnr": psnr} for name, psnr in zip(names, values, strict=True)
     }
     for name in names:
