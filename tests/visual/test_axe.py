@@ -7,7 +7,11 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page
 
+from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
 from tests.export.peers import peer
+from tests.orchestrator.watch.dashboard.browser import opened
+from tests.orchestrator.watch.views.pictures import ready
+from tests.orchestrator.watch.views.sites import run_with, serving
 from tests.visual.browser import fixed_browser, fixed_page, wait_until_quiet
 from tests.visual.pages import SHOTS, Shot, Site, site
 
@@ -47,6 +51,14 @@ def test_axe_finds_nothing(here: Site, page: Page, shot: Shot) -> None:
     shot.open(here, page)
     wait_until_quiet(page, 400)
     assert findings(page) == []
+
+
+def test_axe_finds_nothing_in_the_3d_page(browser: Browser, tmp_path: Path) -> None:
+    write_folder(site_of_run(run_with(tmp_path), Wanted()), tmp_path / "web")
+    with serving(tmp_path / "web") as url, opened(browser, url) as page:
+        ready(page)
+        page.click("#list")
+        assert findings(page) == []
 
 
 def test_axe_would_find_a_fault(here: Site, page: Page) -> None:

@@ -57,13 +57,11 @@ A POST needs `X-PanoLOG: 1` and the content type application/json.
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
-from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from panolog.export.site.write import DESCRIPTION
 from panolog.orchestrator.watch.dashboard import maps, pictures, stream
 from panolog.orchestrator.watch.dashboard.dependencies import (
     ComparedRuns,
@@ -78,8 +76,6 @@ from panolog.orchestrator.watch.dashboard.dependencies import (
 )
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry, read_below
 from panolog.orchestrator.watch.dashboard.messages import CameraView
-from panolog.orchestrator.watch.dashboard.models.downloads import Downloads, Kind
-from panolog.orchestrator.watch.dashboard.models.pages import ModelPages, page_policy
 from panolog.orchestrator.watch.dashboard.queues.panel import QueueAction
 from panolog.orchestrator.watch.dashboard.responses import (
     json_response,
@@ -121,23 +117,6 @@ class QueueRequest(BaseModel):
     action: QueueAction
     entry: Annotated[int, Field(ge=1, lt=2**63)]
     before: Annotated[int, Field(ge=1, lt=2**63)] | None = None
-
-
-class ViewerRequest(BaseModel):
-    """The body of a POST to /viewer."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    task: str | None = None
-    camera: str | None = None
-
-
-class DownloadRequest(BaseModel):
-    """The body of a POST to /downloads."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    kind: Kind
 
 
 @router.get("/api/runs")
@@ -188,7 +167,7 @@ def _camera_view(run: Watch, row: int) -> CameraView | None:
         return None
     camera, scores = found
     try:
-        pictures.open_panorama(_scene_of(run), camera.name).close()
+        pictures.open_panorama(scene_of(run), camera.name).close()
         why = None
     except InputError as error:
         why = str(error)
@@ -199,10 +178,10 @@ def _panorama(cache: pictures.PanoramaCache, run: Watch, row: int) -> Response:
     camera = maps.camera_of(run.entry, row)
     if camera is None:
         raise InputError("the plan of this run has no such panorama")
-    return cache.small(_scene_of(run), camera.name)
+    return cache.small(scene_of(run), camera.name)
 
 
-def _scene_of(run: Watch) -> Path:
+def scene_of(run: Watch) -> Path:
     """The folder that the run has recorded, or the outline of the URL.
 
     Raises InputError if it has recorded none, or this machine has not read what is at the URL.
@@ -376,58 +355,3 @@ async def post_queue(request: Request, registry: Registry) -> Response:
         raise HTTPException(409, error_line(error, registry.root)) from error
     await registry.list.refresh()
     return json_response(request, encode({"accepted": True}), 202)
-
-
-@router.post("/api/runs/{id}/viewer")
-async def post_viewer(request: Request, registry: Registry, id: str) -> Response:
-    """Makes a page with the run's model, or a task's, in 3D."""
-    body = await body_of(request, ViewerRequest)
-    watch = await fresh_watch(registry, id)
-    pages: ModelPages = request.app.state.pages
-    try:
-        if body.camera is not None:
-            await registry.call(maps.require_camera, watch.entry, body.camera)
-        key = await pages.make(watch.entry, body.task, _scene_folder(watch))
-    except (InputError, OSError) as error:
-        raise HTTPException(409, error_line(error, registry.root)) from error
-    start = "" if body.camera is None else f"#camera={quote(body.camera, safe='')}"
-    return json_response(request, encode({"url": f"/models/{key}/{start}"}))
-
-
-@router.post("/api/runs/{id}/downloads")
-async def post_download(request: Request, registry: Registry, id: str) -> Response:
-    """Makes a file of the run's model."""
-    body = await body_of(request, DownloadRequest)
-    watch = await fresh_watch(registry, id)
-    downloads: Downloads = request.app.state.downloads
-    try:
-        await downloads.make(watch.entry, body.kind)
-    except (InputError, OSError) as error:
-        raise HTTPException(409, error_line(error, registry.root)) from error
-    return json_response(request, encode({"url": f"/api/runs/{id}/downloads/{body.kind}"}))
-
-
-@router.get("/api/runs/{id}/downloads/{kind}")
-async def get_download(request: Request, run: Run, kind: Kind) -> Response:
-    """One of these files."""
-    downloads: Downloads = request.app.state.downloads
-    return await respond(request, 404, downloads.file, run.entry, kind)
-
-
-@router.get("/models/{key}/{path:path}")
-async def get_model_page(request: Request, key: str, path: str) -> Response:
-    """A file of one of these pages."""
-    pages: ModelPages = request.app.state.pages
-    if path == DESCRIPTION:
-        await pages.renew(key)
-    policy = page_policy(request.headers.get("host", ""), key)
-    return await respond(request, 404, pages.file, key, path, policy, request.app.state.panoramas)
-
-
-def _scene_folder(run: Watch) -> Path | None:
-    """Where the photographs of a run are, if that is on this machine."""
-    try:
-        scene = _scene_of(run)
-    except InputError:
-        return None
-    return scene if scene.is_absolute() and scene.is_dir() else None

@@ -91,9 +91,7 @@ class RunRow(ViewModel):
         summary, scene, made = page.summary, page.info.get("scene"), page.preparation
         source = made.source if made else str(scene.get("path", "")) if isinstance(scene, dict) else ""
         model, config = summary.model, page.info.get("config")
-        length = {
-            name: config.get(name) if isinstance(config, dict) else None for name in ("width", "iterations")
-        }
+        settings = config if isinstance(config, dict) else {}
         return RunRow(
             id=page.id,
             name=page.name,
@@ -110,7 +108,8 @@ class RunRow(ViewModel):
             created=_epoch(page.info.get("created")) or page.began,
             latest=page.latest,
             seconds=summary.seconds,
-            **{name: value if isinstance(value, int) else None for name, value in length.items()},
+            width=_whole(settings.get("width")),
+            iterations=_whole(settings.get("iterations")),
             blocks=len(summary.blocks) or None,
             cover=cover,
         )
@@ -119,6 +118,11 @@ class RunRow(ViewModel):
     def unread(entry: RunEntry) -> "RunRow":
         """The row of a run of which only its place is known."""
         return RunRow(id=entry.id, name=entry.name)
+
+
+def _whole(value: Any) -> int | None:
+    """A number in run.json."""
+    return value if isinstance(value, int) else None
 
 
 def _epoch(moment: Any) -> float | None:

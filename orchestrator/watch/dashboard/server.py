@@ -24,6 +24,7 @@ from panolog.orchestrator.watch.dashboard.guard import Access, Guard
 from panolog.orchestrator.watch.dashboard.maps import MapCache
 from panolog.orchestrator.watch.dashboard.models.downloads import Downloads
 from panolog.orchestrator.watch.dashboard.models.pages import ModelPages
+from panolog.orchestrator.watch.dashboard.models.routes import router as model_router
 from panolog.orchestrator.watch.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.watch.dashboard.registry import RunRegistry
 from panolog.orchestrator.watch.views.pages.encoding import encode
@@ -62,6 +63,7 @@ def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
     app.state.registry, app.state.pages, app.state.downloads = registry, pages, downloads
     app.state.maps, app.state.panoramas = MapCache(), PanoramaCache()
     app.include_router(router)
+    app.include_router(model_router)
     app.add_api_route("/", _index)
     app.add_api_route("/runs/{id}", _run)
     app.add_api_route("/compare", _compare)

@@ -46,6 +46,7 @@ _LINES = 24  # blocks that have curves: the first ones
 _POINTS = 300  # of a curve
 _EVENTS = 1_000  # the latest
 _PICTURES = 12  # held-out panoramas that are shown, from the worst to the best
+_INSTALL = "pip install"  # in notices for who has made the run, and not for who reads its report
 _SCORES = 100_000  # of all cameras, up to which each camera and block has its own
 
 
@@ -98,8 +99,10 @@ def _message(folder: RunFolder, view: RunView, *, next_to: bool) -> dict[str, An
 
     Args: next_to, whether the report is in the run's folder, so that links lead to what is there.
     """
-    root = folder.root.absolute()
+    root, summary = folder.root.absolute(), view.summary
+    notices = tuple(notice for notice in summary.notices if _INSTALL not in notice.message)
     return dict(view) | {
+        "summary": summary.model_copy(update={"notices": notices}),
         "id": _ID,
         "name": root.name,
         "path": root.name,
@@ -134,7 +137,8 @@ def _answers(folder: RunFolder, view: RunView, found: Findings) -> Iterator[tupl
     if folder.database.exists():
         without = Filter(without=frozenset({Progressed.__name__}))
         latest = events(folder.database, without, _EVENTS)
-        yield f"{_PATH}/events", latest | {"more": False, "next": None}
+        shown = [event for event in latest["events"] if _INSTALL not in str(event.get("message"))]
+        yield f"{_PATH}/events", {"events": shown, "more": False, "next": None}
         yield from _curves(folder, view)
     yield from _held_out(folder, found)
 

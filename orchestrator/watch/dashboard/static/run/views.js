@@ -73,7 +73,7 @@ export function views(path) {
       /** @type {PreviewList} */
       const { previews } = await get(`${path}/previews?task=${encodeURIComponent(value)}`).catch(() => ({ previews: [] }));
       state.frames = previews.sort((a, b) => a.event - b.event).map((preview) => ({
-        url: urlOf(`${path}/previews/${preview.event}`) ?? "", text: `${preview.view}, iteration ${count(preview.iteration)}${HATCHED.some((stage) => value.startsWith(stage)) ? " · hatched: not trained by this block" : ""}`,
+        url: urlOf(`${path}/previews/${preview.event}`) ?? "", text: `${preview.view}, iteration ${count(preview.iteration)}${HATCHED.some((stage) => value.startsWith(stage)) ? " · what is hatched is not trained by this block" : ""}`,
       }));
     }
     const last = state.frames.length - 1;

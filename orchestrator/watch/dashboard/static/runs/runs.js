@@ -53,6 +53,7 @@ function makeRow(run) {
   const cells = COLUMNS.map((column) => {
     const cell = el("td", { class: column.number ? "number" : null, "data-label": column.label, "data-column": column.key });
     const cover = el("img", { class: "cover", alt: "", width: 112, height: 56, loading: "lazy", hidden: true });
+    cover.addEventListener("error", () => { cover.hidden = true; }); // a copy of a run may lack its pictures
     if (column.key === "name") cell.append(cover, el("div", {}, link, el("span", { class: "scene" }), el("span", { class: "made" })));
     if (column.key === "status") cell.append(pill("unread"));
     if (column.key === "progress") cell.append(bar(0, "progress"), el("span", { class: "share" }));
@@ -98,8 +99,10 @@ function fillRow(row, run) {
   box.setAttribute("aria-label", `Compare ${title(run)}`);
   const cover = /** @type {HTMLImageElement} */ (first(".cover", row));
   const picture = run.cover === null ? null : `/api/runs/${run.id}/cover/${run.cover}`;
-  cover.hidden = picture === null;
-  if (picture !== null && cover.getAttribute("src") !== picture) cover.src = picture;
+  if (picture !== null && cover.getAttribute("src") !== picture) {
+    cover.hidden = false;
+    cover.src = picture;
+  }
   setText(first(".made", row), made(run));
   const below = first(".scene", row);
   setText(below, run.error ?? (run.scene ? `scene ${run.scene}` : ""));

@@ -52,6 +52,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_model(folder, COARSE)
     append(folder, *(progressed(COARSE, iteration) for iteration in range(51, 100)))
     append(folder, started(TaskId.block(1)), TaskFailed(TaskId.block(1), 1, "out of memory " * 9, final=True))
+    append(folder, Noticed(EVAL, "LPIPS needs the package lpips: pip install lpips"))
     append(folder, *(Noticed(COARSE, f"{EVIL} {number}") for number in range(8)))
     _measure(folder)
     path = write_report(folder, folder.root.parent / "page.html", running=False)
@@ -133,6 +134,7 @@ def test_all_is_there_without_network(browser: Browser, report: Path) -> None:
         expect(page.locator("#movers")).to_contain_text("1 of 2 panoramas have some, 1.50 %")
         expect(page.locator("#events")).to_contain_text("given up")
         expect(page.locator("#setting-table")).to_contain_text("iterations")
+        assert "pip install" not in str(page.locator("body").text_content())
         expect(page.locator("#map-plot")).to_be_hidden()
         expect(page.locator("#quality")).not_to_contain_text("LPIPS needs")  # it is of no use to a reader
         _unfold(page)
@@ -221,7 +223,7 @@ def test_a_finished_one_begins_with_a_picture_and_is_short(browser: Browser, tmp
     save_model(folder, COARSE)
     _measure(folder)
     names, values = ("good.jpg", "better.jpg", "bad.jpg"), (21.0, 26.0, 18.0)
-    views = {
+    views: dict[str, dict[str, float | None]] = {
         name: {"psnr": psnr, "ssim": 0.9, "ws_psnr": psnr} for name, psnr in zip(names, values, strict=True)
     }
     for name in names:
