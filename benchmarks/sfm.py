@@ -63,7 +63,7 @@ def measure(scene: Scene) -> list[Accuracy]:
 
 def _ours(scene: Scene, panoramas: Sequence[PanoramaFile]) -> Accuracy:
     with tempfile.TemporaryDirectory(prefix="sfm-") as folder:
-        begin = _clocks()
+        begin = clocks()
         found = reconstruct(
             panoramas,
             {},
@@ -72,34 +72,46 @@ def _ours(scene: Scene, panoramas: Sequence[PanoramaFile]) -> Accuracy:
             mapper="incremental",
             partial=True,
             progress=no_progress,
-        )
-        spent = _clocks() - begin
+        )[0]
+        spent = clocks() - begin
     return _accuracy("panolog scene sfm", scene, found.model, len(found.contradictions), spent)
 
 
 def _plain(scene: Scene, panoramas: tuple[PanoramaFile, ...]) -> Accuracy:
+    begin = clocks()
+    found = by_colmap(panoramas, (scene.width, scene.height))["incremental"]
+    spent = clocks() - begin
+    if found is None:
+        return Accuracy("COLMAP", 0, None, None, None, None, *spent.tolist())
+    return _accuracy("COLMAP", scene, found, None, spent)
+
+
+def by_colmap(
+    panoramas: tuple[PanoramaFile, ...], size: tuple[int, int], mappers: Sequence[str] = ("incremental",)
+) -> dict[str, SparseModel | None]:
+    """The largest reconstruction of panoramas by COLMAP's defaults, of each mapper; size, (width, height)."""
     import pycolmap  # noqa: PLC0415
 
+    made: dict[str, SparseModel | None] = dict.fromkeys(mappers)
     with tempfile.TemporaryDirectory(prefix="sfm-") as folder, silence_colmap():
         work = Workspace(Path(folder), panoramas)
         work.open(None)
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = "EQUIRECTANGULAR"
-        begin = _clocks()
         pycolmap.extract_features(
             work.database, work.images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader
         )
         pycolmap.match_exhaustive(work.database)
-        models = pycolmap.incremental_mapping(work.database, work.images, work.models)
-        spent = _clocks() - begin
-        if not models:
-            return Accuracy("COLMAP", 0, None, None, None, None, *spent.tolist())
-        best = max(models.values(), key=lambda model: model.num_reg_images())
-        found = from_colmap(best, work.numbers, (scene.width, scene.height))
-    return _accuracy("COLMAP", scene, found, None, spent)
+        for mapper in mappers:
+            run = pycolmap.global_mapping if mapper == "global" else pycolmap.incremental_mapping
+            models = run(work.database, work.images, work.models)
+            if models:
+                best = max(models.values(), key=lambda model: model.num_reg_images())
+                made[mapper] = from_colmap(best, work.numbers, size)
+    return made
 
 
-def _clocks() -> Array:
+def clocks() -> Array:
     """(2,) seconds: of the clock, and of all cores on this process and the ended ones that it started."""
     own, ended = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return np.array([time.perf_counter(), own.ru_utime + own.ru_stime + ended.ru_utime + ended.ru_stime])

@@ -131,6 +131,7 @@ def sfm(
         pairing=pairs,
         mapper=mapper,
         partial=partial,
+        parts=partial,
         gps=gps,
         distance=distance,
         parallax=PARALLAX if parallax is None else parallax,

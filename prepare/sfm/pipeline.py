@@ -1,6 +1,8 @@
 """`panolog scene sfm`: from a folder of panoramas or a 360° video to a scene."""
 
+import hashlib
 import shutil
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +37,7 @@ class SfmSettings:
     pairing: Pairing = "auto"
     mapper: Mapper = "incremental"
     partial: bool = False  # accept poses for half of the panoramas or fewer
+    parts: bool = False  # write each other part as a scene next to that of the largest
     gps: bool = True  # take metres and north from EXIF
     distance: tuple[str, str, float] | None = None  # names of two panoramas, and metres between them
     parallax: float = PARALLAX  # degrees between two frames of a video
@@ -70,7 +73,7 @@ def make_scene(
     require_new(output)
     known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
     layers: LayerFiles
-    folder, notes = workspace_folder(output.resolve()), list[str]()
+    folder, notes, copies = workspace_folder(output.resolve()), list[str](), list[str]()
     if _image_folder(source).resolve() in output.resolve().parents:
         raise SceneError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
     if source.is_file():
@@ -85,7 +88,7 @@ def make_scene(
         panoramas = tuple(PanoramaFile(folder / "frames", file.name, file) for file in files)
         layers = {MASKS: find_layer(folder / "frames", MASKS, [file.name for file in files])}
     else:
-        given, layers = panoramas_in_folder(source)
+        given, layers, copies = without_copies(*panoramas_in_folder(source))
         panoramas = complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n))
     layers = with_masks(panoramas, layers)
     places = None if known is None else _places(known, source, folder, panoramas)
@@ -100,17 +103,45 @@ def make_scene(
         memory=memory,
         places=places,
     )
-    world = _georeference(found, settings)
-    if places is not None and settings.trajectory is not None:
-        world = _along(world, found, places[list(found.model.rows)], settings.trajectory)
-    found = replace(found, model=found.model.moved(world.similarity))
+    left_out = (*copies, *_left_out(source))
+    reports = [
+        _report(part, number, settings, places, notes, left_out)
+        for number, part in enumerate(found if settings.parts else found[:1], start=1)
+    ]
     made = any(panorama.path.is_relative_to(folder) for panorama in panoramas)
     link = settings.link and not made  # the workspace is removed, with the frames and whole panoramas in it
-    write_scene(output, _scene(found, world), link=link, progress=lambda d, n: progress("scene", d, n))
-    report = SfmReport(found, world, (*notes, *world.notes), _left_out(source))
-    write_report(output, report)
+    for report in reversed(reports):  # the first stands for all: it comes last
+        _write(output, report, link, progress)
     shutil.rmtree(folder, ignore_errors=True)
-    return report
+    return reports[0]
+
+
+def _report(
+    part: Reconstruction,
+    number: int,
+    settings: SfmSettings,
+    places: NDArray[np.float64] | None,
+    notes: Sequence[str],
+    left_out: tuple[str, ...],
+) -> SfmReport:
+    """A part in its world; places, (K, 3) where a trajectory has the panoramas."""
+    world = _georeference(part, settings, number == 1)
+    if places is not None and settings.trajectory is not None:
+        world = _along(world, part, places[list(part.model.rows)], settings.trajectory)
+    moved = replace(part, model=part.model.moved(world.similarity))
+    return SfmReport(moved, world, (*notes, *world.notes), left_out, number)
+
+
+def _write(output: Path, report: SfmReport, link: bool, progress: StageProgress) -> None:
+    """Writes the scene of a part, with its report."""
+    scene, new = part_folder(output, report.number), _scene(report.found, report.world)
+    write_scene(scene, new, link=link, progress=lambda d, n: progress("scene", d, n))
+    write_report(scene, report)
+
+
+def part_folder(output: Path, number: int) -> Path:
+    """Where the part of that number becomes a scene: the first in SCENE, the second in SCENE-2."""
+    return output if number == 1 else output.with_name(f"{output.name}-{number}")
 
 
 def panoramas_in_folder(source: Path) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
@@ -140,6 +171,31 @@ def panoramas_in_folder(source: Path) -> tuple[tuple[PanoramaFile, ...], LayerFi
     return tuple(PanoramaFile(root, name, file) for name, file in zip(names, files, strict=True)), layers
 
 
+def without_copies(
+    panoramas: Sequence[PanoramaFile], layers: LayerFiles
+) -> tuple[tuple[PanoramaFile, ...], LayerFiles, list[str]]:
+    """The panoramas whose files differ, their layers, and a line for each other one: it shows nothing more.
+
+    Raises: SceneError, fewer than two differ.
+    """
+    sizes = Counter(panorama.path.stat().st_size for panorama in panoramas)
+    first, kept, lines = dict[bytes, str](), list[int](), list[str]()
+    for row, panorama in enumerate(panoramas):
+        if sizes[panorama.path.stat().st_size] > 1:
+            digest = hashlib.sha256(panorama.path.read_bytes()).digest()
+            if digest in first:
+                lines.append(f"{panorama.name}: is a copy of {first[digest]}, left out")
+                continue
+            first[digest] = panorama.name
+        kept.append(row)
+    if len(kept) < MIN_CAMERAS:
+        raise SceneError(
+            f"{panoramas[0].root}: all panoramas are copies of {panoramas[0].name}; give different ones"
+        )
+    chosen = {layer: [files[row] for row in kept] for layer, files in layers.items()}
+    return tuple(panoramas[row] for row in kept), chosen, lines
+
+
 def _left_out(source: Path) -> tuple[str, ...]:
     """`FolderContent.left_out` of a source; nothing of a video."""
     return tuple(look_into(_image_folder(source)).left_out)  # a file has nothing below it
@@ -150,13 +206,13 @@ def _image_folder(source: Path) -> Path:
     return next((source / name for name in ("images", "imgs") if (source / name).is_dir()), source)
 
 
-def _georeference(found: Reconstruction, settings: SfmSettings) -> Georeference:
-    """The frame of the world: gravity, GPS, a known distance."""
+def _georeference(found: Reconstruction, settings: SfmSettings, first: bool) -> Georeference:
+    """The frame of the world: gravity, GPS, a known distance, if it is in this part or this is the first."""
     panoramas = [found.panoramas[row] for row in found.model.rows]
     exifs = [read_exif(panorama.path) for panorama in panoramas]
     scale = None
-    if settings.distance is not None:
-        names = [panorama.name for panorama in panoramas]
+    names = [panorama.name for panorama in panoramas]
+    if settings.distance is not None and (first or set(settings.distance[:2]) <= set(names)):
         scale = scale_from_distance(names, found.model.centers, *settings.distance)
     return georeference(
         found.model.rotations,

@@ -72,11 +72,12 @@ def _draw_cameras(axes: Axes, places: NDArray[np.float64], found: Reconstruction
 def _draw_links(axes: Axes, places: NDArray[np.float64], found: Reconstruction, weak: float) -> None:
     """The links across which the scale may jump, and the pairs whose poses contradict their matches."""
     of_row = dict(zip(found.model.rows, places, strict=True))
-    for pair in found.contradictions:
+    inside = [pair for pair in found.contradictions if of_row.keys() >= set(pair.between)]
+    for pair in inside:
         ends = np.array([of_row[row] for row in pair.between])
         axes.plot(ends[:, 0], ends[:, 1], color=_RED, lw=1.5, ls=(0, (2, 2)), zorder=5)
-    if found.contradictions:
-        names = " and ".join(found.panoramas[row].name for row in found.contradictions[0].between)
+    if inside:
+        names = " and ".join(found.panoramas[row].name for row in inside[0].between)
         axes.set_title(f"{names} contradict each other", loc="right", color=_RED, fontsize=8)
     for link in found.links:
         if link.scale_error < weak:

@@ -8,13 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import PanoramaFile
-from panolog.prepare.sfm.consistency.contradictions import (
-    Contradiction,
-    consistent_part,
-    is_repetitive,
-    is_trusted,
-)
-from panolog.prepare.sfm.consistency.solve import Solution, solve
+from panolog.prepare.sfm.consistency.contradictions import Contradiction
+from panolog.prepare.sfm.consistency.solve import Solver
 from panolog.prepare.sfm.features import MEMORY, find_features
 from panolog.prepare.sfm.links import Link, find_links
 from panolog.prepare.sfm.mapping import Mapper
@@ -29,6 +24,7 @@ from panolog.scene.write import StageProgress
 
 _VERSION = 2  # of features and matches: those of another version are not used
 _NEAREST = 12  # panoramas that each is matched with where a trajectory says how far they are
+_LEAST = 8  # panoramas of a part, or most of them: fewer agree by chance where all is alike
 FIRM = 20  # points seen by three panoramas: two also see points from false matches
 
 LayerFiles = dict[str, list[Path | None]]  # by the name of the layer, for each picture
@@ -36,15 +32,16 @@ LayerFiles = dict[str, list[Path | None]]  # by the name of the layer, for each 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """Poses and points of panoramas, and how they came about."""
+    """Poses and points of panoramas, or of a part of them, and how they came about."""
 
     panoramas: tuple[PanoramaFile, ...]  # all, in order
     layers: LayerFiles
     size: tuple[int, int]  # width and height of each
     model: SparseModel
     links: list[Link]  # between parts of it, the weakest first; their rows are those of `from_colmap`
-    contradictions: list[Contradiction]
+    contradictions: list[Contradiction]  # in it, and between it and what was left out for them
     missing: dict[int, tuple[int, int]]  # rows without a pose: the row with most matches, and how many
+    others: list[tuple[int, ...]]  # rows of the other parts, each right, but not connected to this one
     features: int
     pairs: int
 
@@ -65,14 +62,13 @@ def reconstruct(
     progress: StageProgress,
     places: NDArray[np.float64] | None = None,
     memory: int = MEMORY,
-) -> Reconstruction:
+) -> list[Reconstruction]:
     """Features, matches, poses and points of `panoramas`. Results are kept in `folder`, for the next call.
 
-    Args: partial, accept poses for half of them or fewer, and the consistent part of contradictory ones;
-        memory, bytes that may be used;
+    Args: partial, accept parts of which none has more than half of them; memory, bytes that may be used;
         places, (K, 3) where they were taken, by a known trajectory, NaN where it is not.
-    Raises: SceneError, a file is damaged or of another size, the panoramas share too little, or their poses
-        contradict their matches.
+    Returns: the parts that are each without a contradiction, the largest first.
+    Raises: SceneError, a file is damaged or of another size, or the panoramas share too little.
     """
     size = check_images([panorama.path for panorama in panoramas])
     names = [panorama.name for panorama in panoramas]
@@ -91,61 +87,44 @@ def reconstruct(
         near = near_pairs(places, _NEAREST) if places is not None else []
         pairs = choose_pairs(work, pairing, progress, near)
         match_pairs(work, pairs, allowed, progress)
-        solved = solve(work, size, mapper, allowed, progress, places)
-    found = from_colmap(solved.model, work.numbers, size) if solved is not None else None
+        solver = Solver(work, size, mapper, allowed, progress, places)
+        least = min(len(panoramas), max(3, min(_LEAST, len(panoramas) // 2 + 1)))
+        solved = solver.parts(least, doubtful=partial)
+    models = [from_colmap(part.model, work.numbers, size) for part in solved]
+    models = [model for model in models if model.points_seen_by(min(3, len(panoramas))) >= FIRM]
     shared = best_matches(work)
-    if solved is None or found is None or not _is_sound(found, len(panoramas), partial):
-        raise SceneError(_refusal(work, found, shared))
-    agreed = consistent_part(found.rows, solved.contradictions, solved.skeleton, solved.evidence)
-    if not is_trusted(solved.contradictions, solved.skeleton, found.rows):
-        if not partial:
-            raise SceneError(_doubt(work, solved, found.rows, len(agreed)))
-        found = found.part(agreed)
-    sigma = float(np.median(np.concatenate(found.errors(size[0])))) * 2 * np.pi / size[0]
-    seen = [rows for rows, _ in found.sightings]
-    return Reconstruction(
-        panoramas=tuple(panoramas),
-        layers=layers,
-        size=size,
-        model=found,
-        links=find_links(found.centers, found.points, seen, sigma),
-        contradictions=[it for it in solved.contradictions if set(it.between) <= set(found.rows)],
-        missing={row: shared[row] for row in range(len(names)) if row not in found.rows},
-        features=features,
-        pairs=len(pairs),
-    )
-
-
-def _is_sound(found: SparseModel, panoramas: int, partial: bool) -> bool:
-    """Whether there are enough firm points, and poses of most panoramas."""
-    return found.points_seen_by(min(3, panoramas)) >= FIRM and (partial or 2 * len(found.rows) > panoramas)
-
-
-def _doubt(work: Workspace, solved: Solution, rows: Sequence[int], agreed: int) -> str:
-    """One line: which panoramas contradict each other or may have moved in two ways, and what to do."""
-    names, folder = [panorama.name for panorama in work.panoramas], work.panoramas[0].path.parent
-    if is_repetitive(solved.skeleton, rows):
-        rivalled = [edge for edge in sorted(solved.skeleton.rivalled) if set(edge) <= set(rows)]
-        one, other = (names[row] for row in rivalled[0])
-        return (
-            f"{folder}: {len(rivalled)} pairs of neighbours, first {one} and {other}, fit two motions of the "
-            "camera about equally well, as where everything repeats; take panoramas closer to each other, "
-            "say where they were taken with --trajectory, or accept the "
-            f"{agreed} of {len(names)} that agree with --partial"
+    if not models or not (partial or 2 * len(models[0].rows) > len(panoramas)):
+        raise SceneError(_refusal(work, models, shared, solver.cuts))
+    against = [*solver.cuts, *(it for part in solved for it in part.contradictions)]
+    return [
+        Reconstruction(
+            panoramas=tuple(panoramas),
+            layers=layers,
+            size=size,
+            model=model,
+            links=_links(model, size[0]),
+            contradictions=[it for it in against if set(it.between) & set(model.rows)],
+            missing={row: shared[row] for row in range(len(names)) if row not in model.rows},
+            others=[other.rows for other in models if other is not model],
+            features=features,
+            pairs=len(pairs),
         )
-    contradictions = solved.contradictions
-    worst = contradictions[0]
-    one, other = (names[row] for row in worst.between)
-    return (
-        f"{folder}: the poses contradict the matches of {len(contradictions)} pairs, "
-        f"most of all {one} and {other} ({worst.points} of {worst.matches} points fit), as where "
-        "windows repeat; "
-        "name the panoramas in the order of the walk or take more between these, or accept the "
-        f"{agreed} of {len(names)} that agree with --partial"
-    )
+        for model in models
+    ]
 
 
-def _refusal(work: Workspace, found: SparseModel | None, shared: Sequence[tuple[int, int]]) -> str:
+def _links(model: SparseModel, width: int) -> list[Link]:
+    """Between parts of a model of panoramas of that width in pixels, the weakest first."""
+    sigma = float(np.median(np.concatenate(model.errors(width)))) * 2 * np.pi / width
+    return find_links(model.centers, model.points, [rows for rows, _ in model.sightings], sigma)
+
+
+def _refusal(
+    work: Workspace,
+    found: Sequence[SparseModel],
+    shared: Sequence[tuple[int, int]],
+    cuts: Sequence[Contradiction],
+) -> str:
     """One line: which panoramas have no pose, and what to do."""
     names = [panorama.name for panorama in work.panoramas]
     best = max(range(len(names)), key=lambda row: shared[row][1])
@@ -153,16 +132,25 @@ def _refusal(work: Workspace, found: SparseModel | None, shared: Sequence[tuple[
     pair = (
         f"{names[best]} and {names[other]} share most, {count} features" if count else "no two share features"
     )
-    if found is None or len(found.rows) <= 2:
+    if not found and cuts:
+        worst = max(cuts, key=lambda it: it.matches - it.points)
+        first, second = (names[row] for row in worst.between)
+        return (
+            f"{work.panoramas[0].path.parent}: the poses contradict the matches of {len(cuts)} pairs, most "
+            f"of all {first} and {second} ({worst.points} of {worst.matches} points fit), as where windows "
+            "repeat; name the panoramas in the order of the walk, take more between these, or accept parts "
+            "with --partial"
+        )
+    if not found:
         return (
             f"{work.panoramas[0].path.parent}: the {len(names)} panoramas could not be connected ({pair}); "
             "take them closer to each other, or leave out those of other places (features are kept in "
             f"{work.folder})"
         )
-    lost = [name for row, name in enumerate(names) if row not in found.rows]
+    lost = [name for row, name in enumerate(names) if row not in found[0].rows]
     more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
+    parts = ", ".join(str(len(model.rows)) for model in found)
     return (
-        f"{work.panoramas[0].path.parent}: only {len(found.rows)} of {len(names)} panoramas were connected, "
-        f"not {', '.join(lost[:3])}{more}; take more between them, or accept a partial reconstruction with "
-        "--partial"
+        f"{work.panoramas[0].path.parent}: of {len(names)} panoramas only {parts} were connected, the first "
+        f"without {', '.join(lost[:3])}{more}; take more between them, or accept these parts with --partial"
     )

@@ -25,6 +25,7 @@ class SfmReport:
     world: Georeference
     notes: tuple[str, ...]  # of the source and of the world, one line each
     left_out: tuple[str, ...] = ()  # what of the source was not read, one line for each kind
+    number: int = 1  # of the part
 
     def as_json(self) -> dict[str, Any]:
         """As `--json` prints it. Errors are in pixels of the panoramas, scale errors relative."""
@@ -52,6 +53,7 @@ class SfmReport:
                 {"name": self._name(row), "most_shared_with": self._name(other), "matches": count}
                 for row, (other, count) in self.found.missing.items()
             ],
+            "parts": [[self._name(row) for row in rows] for rows in self.found.others],
             "weak_links": [self._link(link) for link in self.found.links if link.scale_error >= WEAK],
             "contradictions": [
                 {
@@ -74,7 +76,15 @@ class SfmReport:
             f"{content['points']:,} points, seen by {content['track_length']:.1f} panoramas, "
             f"{content['error']:.2f} pixels off"
         )
+        for part in content["parts"]:
+            yield (
+                f"another part: {part[0]} to {part[-1]}, {len(part)} panoramas that agree, but are not "
+                "connected to these. More panoramas between help; --partial writes each part as a scene"
+            )
+        elsewhere = {name for part in content["parts"] for name in part}
         for image in content["missing"]:
+            if image["name"] in elsewhere:
+                continue
             yield (
                 f"no pose: {image['name']} (shares at most {image['matches']} features, "
                 f"with {image['most_shared_with']})"

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
+from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, directions
 from panolog.prepare.sfm.consistency.motion import Motion
 
 Array = NDArray[np.float64]
@@ -60,6 +60,19 @@ def deviations(found: Posed, evidence: Evidence, pair: Pair) -> Array:
             off[side] = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
     larger: Array = np.fmax(off[0], off[1])
     return larger
+
+
+def agrees(evidence: Evidence, pair: Pair, off: Array, bound: float) -> bool | None:
+    """Whether deviations (M,) of the matches of a pair, in degrees, are below a bound; None if few are known.
+
+    Most of them, or those all around: copies of houses may be more, but are not everywhere.
+    """
+    known = np.isfinite(off) if pair.moved is None else np.isfinite(off) & pair.moved
+    if known.sum() < FEW:
+        return None
+    fit, rays = known & (off <= bound), evidence.rays[pair.between[0]][pair.matches[:, 0]]
+    most = 2 * fit.sum() >= known.sum()
+    return bool(most or (fit.sum() >= FEW and directions(rays[fit]) >= directions(rays[known & ~fit])))
 
 
 def has_moved(found: Posed, between: tuple[int, int], motion: Motion | None) -> bool:

@@ -5,27 +5,41 @@ elsewhere in the other, one of the two poses is wrong: rows of equal windows hav
 on, and from there everything fits again, one window off. Neither residuals nor weak links show that.
 
 In the order of capture, neighbours are known. A pair that is farther off than a walk along them can drift
-only looks alike. Without an order nothing distinguishes such a pair from a true one, so it contradicts; nor
-does it where the order was followed only by a guess on the way from one to the other.
+only looks alike, but for where the order was followed only by a guess on the way from one to the other; and
+so does one if more is shared by pairs that agree across each step of that way.
+Without an order, a pair only looks alike if it covers clearly less than each pair on the best way from one
+to the other along pairs that agree.
 
 Where even neighbours have a second geometry that explains about as much as the first, nothing contradicts
 either. Single ones are decided by what lies around; where there are many, the whole is not trusted.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from panolog.prepare.sfm.consistency.agreement import FEW, Posed, deviations, has_moved
-from panolog.prepare.sfm.consistency.evidence import Evidence
-from panolog.prepare.sfm.consistency.skeleton import Edge, MotionOf, Skeleton, components, tree_path, unknown
+from panolog.prepare.sfm.consistency.agreement import Posed, agrees, deviations, has_moved
+from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
+from panolog.prepare.sfm.consistency.motion import Motion
+from panolog.prepare.sfm.consistency.skeleton import (
+    Edge,
+    Skeleton,
+    components,
+    tree_path,
+    widest_tree,
+)
 
 _AS_NEIGHBOURS = 0.9  # of the median coverage of the pairs that carry the reconstruction
-_UNORDERED = 0.6  # of it without an order: what looks alike is then not distinguished from what is near
+_MARGIN = (
+    0.85  # of the least coverage on the way between two, without an order: below it they only look alike
+)
+_SHARED = 0.75  # of the median share of features of the pairs that carry: copies of houses stand apart
 _DRIFTED = 20.0  # degrees that a walk may be off where it returns
 _RIVALLED = 0.3  # of the edges of the tree that may have a rival
 _MOST = 0.02  # contradictions for each panorama, but for those of the tree, of which there may be none
+
+MotionOf = Callable[[Pair], Motion | None]
 
 
 @dataclass(frozen=True)
@@ -38,34 +52,64 @@ class Contradiction:
 
 
 def find_contradictions(
-    evidence: Evidence, skeleton: Skeleton, found: Posed, bound: float, motion: MotionOf = unknown
+    evidence: Evidence, skeleton: Skeleton, found: Posed, bound: float, motion: MotionOf
 ) -> list[Contradiction]:
     """The contradictions in a reconstruction, the strongest first.
 
     Args: bound, degrees that points may be off; motion, of the camera between the panoramas of a pair, by
         which pairs that carry the reconstruction are judged where too few of their points are known.
     """
-    of_tree = [pair.coverage for pair in evidence.pairs if pair.between in skeleton.tree]
-    share = _AS_NEIGHBOURS if skeleton.ordered else _UNORDERED
-    strong = share * float(np.median(of_tree)) if of_tree else np.inf
-    contradictions = []
-    sides = components(skeleton.tree - skeleton.guessed, len(evidence.rays))
+    of_tree = [pair for pair in evidence.pairs if pair.between in skeleton.tree]
+    usual = [[it.coverage, it.share, it.parallax] for it in of_tree] or [[0.0] * 3]
+    covered, share, parallax = np.median(usual, axis=0).tolist()
+    contradictions, agreeing, against = [], list[Pair](), list[tuple[Pair, Contradiction, float]]()
     for pair in evidence.pairs:
         carries = pair.between in skeleton.tree
-        if not carries and pair.coverage < strong:
-            continue
         off = deviations(found, evidence, pair)
-        off = off[np.isfinite(off)]
-        if len(off) < FEW:
+        fits = agrees(evidence, pair, off, bound)
+        if fits is None:
             if carries and not has_moved(found, pair.between, motion(pair)):
                 contradictions.append(Contradiction(pair.between, len(pair.matches), 0))
-            continue
-        if np.median(off) <= bound:
-            continue
+        elif fits:
+            agreeing.append(pair)
+        else:
+            off = off[np.isfinite(off) if pair.moved is None else np.isfinite(off) & pair.moved]
+            fit = Contradiction(pair.between, len(off), int((off <= bound).sum()))
+            against.append((pair, fit, float(np.median(off))))
+    sides = components(skeleton.tree - skeleton.guessed, len(evidence.rays))
+    way = widest_tree(agreeing, len(evidence.rays))
+    likely = []
+    for pair, fit, median in against:
         guessed = sides[pair.between[0]] != sides[pair.between[1]]
-        if carries or guessed or not skeleton.ordered or np.median(off) < _DRIFTED:
-            contradictions.append(Contradiction(pair.between, len(off), int((off <= bound).sum())))
+        if skeleton.ordered:
+            counts = pair.coverage >= _AS_NEIGHBOURS * covered and (guessed or median < _DRIFTED)
+        else:
+            least = min((way[edge] for edge in tree_path(way, pair.between)), default=0.0)
+            counts = pair.coverage >= _MARGIN * least
+        nearer = max(1.0, parallax / pair.parallax) if pair.parallax else 1.0  # shares more, if it is true
+        if pair.between in skeleton.tree:
+            contradictions.append(fit)
+        elif counts and pair.share >= _SHARED * share * np.sqrt(nearer):
+            likely.append((pair, fit))
+    if likely and skeleton.ordered:
+        doubted = _outvoted(skeleton.tree, agreeing, [pair for pair, _ in likely])
+        ways = [tree_path(skeleton.tree, pair.between) for pair, _ in likely]
+        likely = [it for it, way_ in zip(likely, ways, strict=True) if not way_ or doubted & set(way_)]
+    contradictions += [fit for _, fit in likely]
     return sorted(contradictions, key=lambda it: (it.points - it.matches, it.between))
+
+
+def _outvoted(tree: frozenset[Edge], agreeing: Sequence[Pair], against: Sequence[Pair]) -> set[Edge]:
+    """The edges of a tree across which more is shared by pairs that contradict than by those that agree.
+
+    Where a motion is wrong, all pairs that lead across it contradict, but for those that are misled alike.
+    """
+    votes: dict[Edge, float] = dict.fromkeys(tree, 0.0)
+    for pairs, sign in ((agreeing, 1.0), (against, -1.0)):
+        for pair in pairs:
+            for edge in tree_path(tree, pair.between):
+                votes[edge] += sign * pair.share
+    return {edge for edge, vote in votes.items() if vote < 0}
 
 
 def is_repetitive(skeleton: Skeleton, rows: Collection[int]) -> bool:
@@ -77,10 +121,12 @@ def is_repetitive(skeleton: Skeleton, rows: Collection[int]) -> bool:
 def is_trusted(contradictions: Sequence[Contradiction], skeleton: Skeleton, rows: Collection[int]) -> bool:
     """Whether poses of panoramas can be used in spite of contradictions and of geometries that have rivals.
 
-    Where the order was followed by a guess, there may be no contradiction.
+    Where the order was followed by a guess, or the tree does not connect them, there may be no contradiction.
     """
+    sides = components(skeleton.among(rows).tree, max(rows) + 1)
+    guessed = len({int(sides[row]) for row in rows}) > 1
     broken = any(it.between in skeleton.tree for it in contradictions)
-    guessed = any(edge in skeleton.tree and set(edge) <= set(rows) for edge in skeleton.guessed)
+    guessed |= any(edge in skeleton.tree and set(edge) <= set(rows) for edge in skeleton.guessed)
     few = len(contradictions) <= (0 if guessed else max(1, _MOST * len(rows)))
     return few and not broken and not is_repetitive(skeleton, rows)
 

@@ -5,7 +5,7 @@ sees everything around it: ground, sky and what stands between. Where the featur
 found in others have no match in this pair, though they lie all around, the pair does not show one place.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +22,7 @@ _BANDS = np.sin(np.deg2rad([-30.0, -10.0, 10.0, 30.0]))  # of latitude: the bord
 _AROUND = 6  # cells in a row
 _CELLS = _AROUND * (len(_BANDS) + 1)
 _FULL = 6  # features of a cell that counts
+_SEVERAL = 3  # rays of a cell
 _FOUND = 0.25  # of the pair's share of matches: a cell with less lacks them
 
 
@@ -33,6 +34,14 @@ class Pair:
     matches: NDArray[np.int64]  # (M, 2) rows of their features
     coverage: float = 0.0  # share of the directions with features in which the pair has matches
     rivalled: bool = False  # by another geometry, which explains about as much
+    moved: NDArray[np.bool_] | None = None  # (M,) which matches no rotation alone explains; None is all
+    parallax: float = 0.0  # degrees between directions of these, but for the rotation: their median
+    share: float = 0.0  # of the features that any pair has found in a panorama, those that this one has
+
+    @property
+    def telling(self) -> NDArray[np.int64]:
+        """(T, 2) the matches that say where the panoramas stand: what is far away looks alike everywhere."""
+        return self.matches if self.moved is None else self.matches[self.moved]
 
     @property
     def apart(self) -> int:
@@ -46,6 +55,11 @@ class Evidence:
 
     rays: tuple[Array, ...]  # of each panorama (N, 3) directions of its features in camera axes
     pairs: tuple[Pair, ...]
+
+    def among(self, rows: Collection[int]) -> "Evidence":
+        """The pairs of these panoramas alone."""
+        inside = set(rows)
+        return replace(self, pairs=tuple(pair for pair in self.pairs if inside.issuperset(pair.between)))
 
 
 def read_evidence(work: Workspace, size: tuple[int, int]) -> Evidence:
@@ -75,15 +89,16 @@ def with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:
     used = [np.zeros(len(own), np.bool_) for own in rays]
     for pair in pairs:
         for side, row in enumerate(pair.between):
-            used[row][pair.matches[:, side]] = True
+            used[row][pair.telling[:, side]] = True
     known = [np.bincount(own[it], minlength=_CELLS) for own, it in zip(cells, used, strict=True)]
     return [
         replace(
             pair,
             coverage=min(
-                _share(known[row], np.bincount(cells[row][pair.matches[:, side]], minlength=_CELLS))
+                _share(known[row], np.bincount(cells[row][pair.telling[:, side]], minlength=_CELLS))
                 for side, row in enumerate(pair.between)
             ),
+            share=len(pair.telling) / max(1, min(int(known[row].sum()) for row in pair.between)),
         )
         for pair in pairs
     ]
@@ -98,15 +113,9 @@ def _share(known: NDArray[np.int64], matched: NDArray[np.int64]) -> float:
     return float((matched[full] > _FOUND * usual * known[full]).mean())
 
 
-def covered(rays: Array, known: NDArray[np.int64], found: NDArray[np.int64]) -> float:
-    """Share of the directions with features `known` in which at least half of them are `found` as well.
-
-    Args: rays (N, 3) of all features; known, found, rows of them.
-    """
-    cells = _cell(rays)
-    before, after = (np.bincount(cells[rows], minlength=_CELLS) for rows in (known, found))
-    full = before >= _FULL
-    return float((2 * after[full] >= before[full]).mean()) if full.any() else 0.0
+def directions(rays: Array) -> int:
+    """In how many parts of the sphere there are several of these rays (N, 3)."""
+    return int((np.bincount(_cell(rays), minlength=_CELLS) >= _SEVERAL).sum())
 
 
 def _cell(rays: Array) -> NDArray[np.int64]:

@@ -17,6 +17,8 @@ _TURN = np.deg2rad(3.0)  # between a rotation and those of the two parts of a wa
 _RIVAL = 0.3, 0.6  # of the matches and the coverage of a geometry: another with both may be the true one
 _CLEAR = 0.5  # between cosines of two geometries' continuity: less decides nothing
 _ASIDE = np.deg2rad(20.0)  # of a motion from the plane of the motions of the two parts
+_REFITS = 3  # of a rotation
+_STILL = 2.0  # errors of a feature: what a rotation explains to that says nothing of where the camera moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,10 +27,6 @@ class Motion:
 
     rotation: Array  # (3, 3)
     direction: Array  # (3,) of length 1
-
-    def reversed(self) -> "Motion":
-        """From the second camera to the first."""
-        return Motion(self.rotation.T, self.leaving)
 
     @property
     def leaving(self) -> Array:
@@ -46,21 +44,6 @@ class Motion:
         return bool(turned and self.direction @ other.direction >= np.cos(_ASIDE))
 
 
-def leads(first: Motion, second: Motion, direct: Motion) -> bool:
-    """Whether a motion and another after it lead where a third does.
-
-    Its rotation must be both rotations, and its direction a sum of both directions, neither of them negative:
-    a step past equal windows may be taken for one back, which no rotation shows.
-    """
-    ways = np.column_stack([second.rotation @ first.direction, second.direction])
-    parts, *_ = np.linalg.lstsq(ways, direct.direction, rcond=None)
-    nearest = [ways @ parts] if (parts > 0).all() else list(ways.T)
-    rotation = second.rotation @ first.rotation
-    return any(
-        Motion(rotation, way / max(float(np.linalg.norm(way)), 1e-12)).is_like(direct) for way in nearest
-    )
-
-
 class Geometries:
     """Epipolar geometries of pairs of a database, by RANSAC: the same for the same matches."""
 
@@ -69,6 +52,7 @@ class Geometries:
         self._ids = work.ids()
         with pycolmap.Database.open(work.database) as database:
             self._camera = database.read_all_cameras()[0]
+        self._evidence, self._error = evidence, max_error * 2 * np.pi / size[0]
         self._pixels = [project_to_fractions(rays) * size for rays in evidence.rays]
         self._options = pycolmap.TwoViewGeometryOptions()
         self._options.ransac.max_error, self._options.ransac.random_seed = max_error, 0
@@ -84,6 +68,15 @@ class Geometries:
             self._motions[pair.between] = pair, motion
         return motion
 
+    def marked(self, evidence: Evidence) -> Evidence:
+        """The pairs with which of their matches have moved, and the coverage of these."""
+        pairs = [self.mark(pair, self.motion(pair)) for pair in evidence.pairs]
+        return Evidence(evidence.rays, tuple(with_coverage(evidence.rays, pairs)))
+
+    def mark(self, pair: Pair, motion: Motion | None) -> Pair:
+        """A pair with which of its matches its motion has moved: none without one."""
+        return mark(self._evidence, pair, motion, self._error)
+
     def second(self, pair: Pair, least: float) -> Pair | None:
         """The pair with those of its other matches that fit one geometry; None with fewer than `least`."""
         known = {tuple(match) for match in pair.matches.tolist()}
@@ -93,8 +86,9 @@ class Geometries:
         rest = np.array([match for match in every if tuple(match) not in known], np.uint32)
         if len(rest) < max(FEWEST, least):
             return None
-        matches, _ = self._estimate(pair.between, rest)
-        return Pair(pair.between, matches) if len(matches) >= max(FEWEST, least) else None
+        matches, motion = self._estimate(pair.between, rest)
+        found = self.mark(Pair(pair.between, matches), motion)
+        return found if len(matches) >= max(FEWEST, least) else None
 
     def _estimate(
         self, between: tuple[int, int], matches: NDArray[np.uint32]
@@ -108,6 +102,33 @@ class Geometries:
         if pose is not None and (length := float(np.linalg.norm(pose.translation))) > 0:
             motion = Motion(np.asarray(pose.rotation.matrix()), np.asarray(pose.translation) / length)
         return np.asarray(found.inlier_matches, np.int64).reshape(-1, 2), motion
+
+
+def mark(evidence: Evidence, pair: Pair, motion: Motion | None, error: float) -> Pair:
+    """A pair with which of its matches a motion has moved, none without one, and how far.
+
+    Args: error, radians that a feature may be off.
+    """
+    if motion is None:
+        return replace(pair, moved=np.zeros(len(pair.matches), np.bool_), parallax=0.0)
+    one, other = (evidence.rays[row][pair.matches[:, side]] for side, row in enumerate(pair.between))
+    apart = _apart(one, other, motion.rotation, _STILL * error)
+    moved = apart > _STILL * error
+    parallax = float(np.rad2deg(np.median(apart[moved]))) if moved.any() else 0.0
+    return replace(pair, moved=moved, parallax=parallax)
+
+
+def _apart(one: Array, other: Array, rotation: Array, error: float) -> Array:
+    """(N,) radians from directions to others, (N, 3) both, but for the rotation that most have in common.
+
+    It is fitted to those within an error, from one that is near: that of a motion has made room for its
+    direction.
+    """
+    for _ in range(_REFITS):
+        fit = ((one @ rotation.T) * other).sum(axis=1) >= np.cos(error)
+        left, _, right = np.linalg.svd(other[fit].T @ one[fit])
+        rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return np.asarray(np.arccos(np.clip(((one @ rotation.T) * other).sum(axis=1), -1, 1)))
 
 
 class Judge(Protocol):

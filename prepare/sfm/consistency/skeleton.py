@@ -4,23 +4,20 @@ Neighbours in the order of capture show the same place. Where panoramas were not
 share most of the sphere do: `Evidence` measures how much of it they share, not by the number of matches.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
 
-from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair, covered
-from panolog.prepare.sfm.consistency.motion import Motion, leads
+from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair
 
 Edge = tuple[int, int]  # rows of two panoramas, ascending
 _ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
 _WEAK = 0.5  # of the median coverage of neighbours: they come before others that share more, but are doubted
 _AMONG_BEST = 0.75  # of the best coverage of either panorama
-_RETURNED = 0.75  # share of the directions in which a pair finds what the panorama between them leads to
 
 
 @dataclass(frozen=True)
@@ -29,32 +26,27 @@ class Skeleton:
 
     ordered: bool  # panoramas are in the order of capture
     tree: frozenset[Edge]
-    core: frozenset[Edge]  # the tree, and pairs two of its edges apart that find the same as these do
     guessed: frozenset[Edge] = frozenset()  # of the tree, where the order of capture does not decide
     rivalled: frozenset[Edge] = frozenset()  # of the tree, where another geometry explains about as much
 
-
-MotionOf = Callable[[Pair], Motion | None]
-
-
-def unknown(_: Pair) -> Motion | None:
-    """Of pairs without a database."""
-    return None
+    def among(self, rows: Collection[int]) -> "Skeleton":
+        """What of it connects these panoramas."""
+        wanted, sets = set(rows), (self.tree, self.guessed, self.rivalled)
+        inside = (frozenset(edge for edge in edges if wanted.issuperset(edge)) for edges in sets)
+        return Skeleton(self.ordered, *inside)
 
 
-def find_skeleton(
-    evidence: Evidence, places: NDArray[np.float64] | None = None, motion: MotionOf = unknown
-) -> Skeleton:
+def find_skeleton(evidence: Evidence, places: NDArray[np.float64] | None = None) -> Skeleton:
     """The skeleton of panoramas with these verified pairs.
 
     Args: places, (K, 3) where they were taken, if that is known, NaN where it is not. The nearest ones then
-        take the part of neighbours in order. motion, how the camera moved between the panoramas of a pair.
+        take the part of neighbours in order.
     """
     pairs, count = evidence.pairs, len(evidence.rays)
     if places is not None:
         near = sorted(_near(pairs, places), key=lambda it: (it[1], it[0]))
         tree = _strongest_tree(pairs, count, [edge for edge, _ in near])
-        return Skeleton(True, frozenset(tree), frozenset(tree | _over_one(evidence, tree, motion)))
+        return Skeleton(True, frozenset(tree))
     ordered = is_ordered(pairs, count)
     firm = _chain(pairs, LIKE_OTHERS) if ordered else frozenset()
     weak = _chain(pairs, _WEAK) - firm if ordered else frozenset()
@@ -62,57 +54,9 @@ def find_skeleton(
     return Skeleton(
         ordered,
         frozenset(tree),
-        frozenset(tree | _over_one(evidence, tree, motion)),
         frozenset(tree - firm) if ordered else frozenset(),
         frozenset(pair.between for pair in pairs if pair.rivalled and pair.between in tree),
     )
-
-
-def _over_one(evidence: Evidence, tree: set[Edge], motion: MotionOf) -> set[Edge]:
-    """Pairs of panoramas with one between them in the tree, where all three agree.
-
-    Equal windows match one window further on without breaking the epipolar geometry of a walk along them. So
-    what both edges of the tree lead to must be found by the pair itself, in all directions, and it must have
-    moved where they lead.
-    """
-    of_edge = {pair.between: pair for pair in evidence.pairs}
-    near: dict[int, list[int]] = {}
-    for a, b in tree:
-        near.setdefault(a, []).append(b)
-        near.setdefault(b, []).append(a)
-    found = set()
-    for middle, around in sorted(near.items()):
-        for a, c in combinations(sorted(around), 2):
-            pair = of_edge.get((a, c))
-            if pair is None:
-                continue
-            way = _table(of_edge, evidence, a, middle), _table(of_edge, evidence, middle, c)
-            there = np.where(way[0] >= 0, way[1][way[0]], -1)
-            led = np.flatnonzero(there >= 0)
-            direct = _table(of_edge, evidence, a, c)
-            same = led[direct[led] == there[led]]
-            if covered(evidence.rays[a], led, same) < _RETURNED:
-                continue
-            ways = [_motion(of_edge, motion, *edge) for edge in ((a, middle), (middle, c), (a, c))]
-            known = [way for way in ways if way is not None]
-            if len(known) < len(ways) or leads(*known):
-                found.add((a, c))
-    return found
-
-
-def _motion(of_edge: dict[Edge, Pair], motion: MotionOf, one: int, other: int) -> Motion | None:
-    found = motion(of_edge[min(one, other), max(one, other)])
-    return found.reversed() if found is not None and one > other else found
-
-
-def _table(of_edge: dict[Edge, Pair], evidence: Evidence, one: int, other: int) -> NDArray[np.int64]:
-    """(N,) for each feature of `one` the feature of `other` that a pair matches it with, -1 without."""
-    matches = of_edge[min(one, other), max(one, other)].matches
-    if one > other:
-        matches = matches[:, ::-1]
-    table = np.full(len(evidence.rays[one]), -1, np.int64)
-    table[matches[:, 0]] = matches[:, 1]
-    return table
 
 
 def is_ordered(pairs: Sequence[Pair], count: int) -> bool:
@@ -183,6 +127,17 @@ def components(edges: Iterable[Edge], count: int) -> NDArray[np.int32]:
     rows, columns = zip(*edges, strict=True) if (edges := sorted(edges)) else ((), ())
     graph = csr_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
     return np.asarray(connected_components(graph, directed=False)[1])
+
+
+def widest_tree(pairs: Iterable[Pair], count: int) -> dict[Edge, float]:
+    """The trees of pairs whose least coverage on the way between any two panoramas is largest, with these."""
+    coverage = {pair.between: pair.coverage for pair in pairs}
+    rows, columns = zip(*coverage, strict=True) if coverage else ((), ())
+    costs = 2.0 - np.array(list(coverage.values()))  # a graph takes 0 for no edge
+    graph = csr_array((costs, (rows, columns)), shape=(count, count))
+    tree = minimum_spanning_tree(graph).tocoo()
+    edges = zip(tree.row.tolist(), tree.col.tolist(), strict=True)
+    return {edge: coverage[edge] for edge in edges}
 
 
 def tree_path(tree: Iterable[Edge], ends: Edge) -> list[Edge]:

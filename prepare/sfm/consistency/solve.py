@@ -1,21 +1,28 @@
 """From verified pairs to a reconstruction that look-alikes cannot mislead.
 
 The skeleton alone is mapped first. It has no loops, so no look-alike can bend it. All other pairs are then
-judged by it: their points must be where they are seen, but for its drift. With those that are, the mapper
-starts again, and what its result contradicts is left out.
+judged by it: their points must be where they are seen, but for its drift. With those that are, and with all
+of panoramas that it has not reached, the mapper starts again, until its result contradicts none of them.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from panolog.prepare.sfm.consistency.agreement import FEW, Posed, deviations, posed
-from panolog.prepare.sfm.consistency.contradictions import Contradiction, find_contradictions
+from panolog.prepare.sfm.consistency.agreement import Posed, agrees, deviations, posed
+from panolog.prepare.sfm.consistency.contradictions import (
+    Contradiction,
+    consistent_part,
+    find_contradictions,
+    is_trusted,
+)
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, read_evidence
+from panolog.prepare.sfm.consistency.guided import Guide
 from panolog.prepare.sfm.consistency.motion import Geometries, look_again
-from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, find_skeleton, hops
+from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, components, find_skeleton, hops
 from panolog.prepare.sfm.mapping import Mapper, map_pairs
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
@@ -24,7 +31,7 @@ _CLOSE = 2.0  # degrees between where points are and where they are seen, for a 
 _DRIFT = 0.05  # degrees more for each panorama on the way between the two
 _FARTHEST = 6.0  # degrees at most: a window further on is farther off
 _PURE = 0.8  # share of the matches of a pair that fit, for those to count that cannot be judged
-_ROUNDS = 2  # of mapping with the pairs that fit
+_ROUNDS = 4  # of mapping with the pairs that fit
 
 Kept = dict[Edge, NDArray[np.int64]]  # matches (M, 2) of the pairs that are mapped
 
@@ -40,58 +47,119 @@ class Solution:
     found: Posed
     kept: Kept
 
+    @property
+    def trusted(self) -> bool:
+        """Whether its poses can be used as they are."""
+        return is_trusted(self.contradictions, self.skeleton, self.found.poses)
 
-def solve(
-    work: Workspace,
-    size: tuple[int, int],
-    mapper: Mapper,
-    max_error: float,
-    progress: StageProgress,
-    places: NDArray[np.float64] | None = None,
-) -> Solution | None:
-    """The reconstruction of the pairs that agree; None if there is none.
 
-    Args: size, (width, height) of the panoramas; max_error, pixels that an observation may be off; places,
-        (K, 3) where panoramas were taken, if that is known, else NaN.
-    """
-    ids, evidence = work.ids(), read_evidence(work, size)
-    geometries = Geometries(work, size, max_error, evidence)
-    evidence = look_again(evidence, geometries)
-    skeleton = find_skeleton(evidence, places, geometries.motion)
-    kept: Kept = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.core}
-    best: Solution | None = None
-    for turn in range(_ROUNDS + 1):
-        part = write_pairs(work, kept, "pairs.db")
-        model = map_pairs(part, mapper if turn else "incremental", max_error, progress)
-        if model is None:
-            break
-        found = posed(model, ids)
-        if best is not None and len(found.poses) < len(best.found.poses):
-            break
-        against = find_contradictions(evidence, skeleton, found, _CLOSE, geometries.motion)
-        best = Solution(model, against, evidence, skeleton, found, kept)
-        broken = {row for it in against if it.between in skeleton.tree for row in it.between}
-        if turn == 0 and broken:  # what bridges them misleads: the tree alone is left there
-            core = frozenset(it for it in skeleton.core if it in skeleton.tree or not broken & set(it))
-            skeleton = replace(skeleton, core=core)
-            kept = {it: matches for it, matches in kept.items() if it in core}
-            continue
-        again = _agreeing(best, drift=_DRIFT if turn == 0 else 0.0)
-        if again.keys() == kept.keys():
-            break
-        kept = again
-    return best
+class Solver:
+    """Reconstructs the panoramas of a database, or some of them."""
+
+    def __init__(
+        self,
+        work: Workspace,
+        size: tuple[int, int],
+        mapper: Mapper,
+        max_error: float,
+        progress: StageProgress,
+        places: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Args: size, (width, height) of the panoramas; max_error, pixels that an observation may be off;
+        places, (K, 3) where panoramas were taken, if that is known, else NaN.
+        """
+        self._work, self._mapper, self._max_error, self._progress = work, mapper, max_error, progress
+        self._ids, evidence = work.ids(), read_evidence(work, size)
+        self._geometries = Geometries(work, size, max_error, evidence)
+        evidence = look_again(self._geometries.marked(evidence), self._geometries)
+        self._skeleton = find_skeleton(evidence, places)
+        guide = Guide(work, evidence.rays, max_error * 2 * np.pi / size[0])
+        self._evidence = _thicker(evidence, self._skeleton, self._geometries, guide)
+        self.cuts: list[Contradiction] = []  # for which `parts` has left panoramas out
+
+    def parts(self, least: int, doubtful: bool = False) -> list[Solution]:
+        """Reconstructions of different panoramas, each without a contradiction, the largest first.
+
+        What contradicts itself is cut where it is weakest, and each side is reconstructed again.
+        Args: least, panoramas of a part; doubtful, also without an order: nothing says then which of the
+            pairs within a side that agree are wrong together.
+        """
+        todo, found = [set(range(len(self._ids)))], list[Solution]()
+        while todo:
+            rows = todo.pop()
+            part = self._part(rows, doubtful or self._skeleton.ordered) if len(rows) >= least else None
+            if part is not None and len(part.found.poses) >= least:
+                found.append(part)
+                todo += self._sides(rows - part.found.poses.keys())
+        return sorted(found, key=lambda part: -len(part.found.poses))
+
+    def _part(self, rows: Collection[int], cut: bool) -> Solution | None:
+        """The reconstruction of the most of these panoramas that agree; None if some do not, but to `cut`."""
+        while (found := self.solve(rows)) is not None and not found.trusted:
+            if not cut:
+                self.cuts += found.contradictions
+                return None
+            before = sorted(found.found.poses)
+            agreed = consistent_part(before, found.contradictions, found.skeleton, found.evidence)
+            rows = max(self._sides(agreed), key=len, default=set())
+            if len(rows) == len(before):
+                return None
+            self.cuts += [it for it in found.contradictions if not set(it.between) <= set(rows)]
+        return found
+
+    def _sides(self, rows: Collection[int]) -> list[set[int]]:
+        """The parts of these panoramas that the skeleton connects, but for guesses: nothing judges across."""
+        skeleton = self._skeleton.among(rows)
+        of = components(skeleton.tree - skeleton.guessed, len(self._ids))
+        return [{row for row in rows if of[row] == side} for side in sorted({int(of[row]) for row in rows})]
+
+    def solve(self, rows: Collection[int]) -> Solution | None:
+        """The reconstruction of these panoramas by the pairs that agree; None if there is none."""
+        evidence, skeleton = self._evidence.among(rows), self._skeleton.among(rows)
+        kept: Kept = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.tree}
+        best: Solution | None = None
+        for turn in range(_ROUNDS + 1):
+            part = write_pairs(self._work, kept, "pairs.db")
+            mapper = self._mapper if turn else "incremental"
+            model = map_pairs(part, mapper, self._max_error, self._progress)
+            if model is None:
+                break
+            found = posed(model, self._ids)
+            against = find_contradictions(evidence, skeleton, found, _CLOSE, self._geometries.motion)
+            new = Solution(model, against, evidence, skeleton, found, kept)
+            if best is None or (new.trusted, len(found.poses)) >= (best.trusted, len(best.found.poses)):
+                best = new
+            again = _agreeing(new, drift=_DRIFT if turn == 0 else 0.0)
+            if again.keys() == kept.keys():
+                break
+            kept = again
+        return best
+
+
+def _thicker(evidence: Evidence, skeleton: Skeleton, geometries: Geometries, guide: Guide) -> Evidence:
+    """The pairs of the skeleton with what matches along their motion."""
+
+    def thicker(pair: Pair) -> Pair:
+        motion = geometries.motion(pair) if pair.between in skeleton.tree else None
+        if motion is None:
+            return pair
+        matches = guide.along(pair.between, motion)
+        more = len(matches) >= len(pair.matches)
+        return geometries.mark(replace(pair, matches=matches), motion) if more else pair
+
+    return replace(evidence, pairs=tuple(map(thicker, evidence.pairs)))
 
 
 def _agreeing(solution: Solution, drift: float) -> Kept:
-    """The tree, pairs that fit the poses and points, and those of the skeleton that cannot be judged."""
-    evidence, core = solution.evidence, solution.skeleton.core
-    way = hops(core, len(evidence.rays))
+    """The tree, pairs that fit the poses and points, and all of panoramas that have no pose yet."""
+    evidence, tree, poses = solution.evidence, solution.skeleton.tree, solution.found.poses
+    way = hops(tree, len(evidence.rays))
     kept: Kept = {}
     for pair in evidence.pairs:
         bound = min(_CLOSE + drift * way[pair.between], _FARTHEST) if drift else _CLOSE
         matches = _fitting(solution.found, evidence, pair, bound)
-        if pair.between in solution.skeleton.tree or (matches is None and pair.between in core):
+        unjudged = matches is None and not set(pair.between) <= poses.keys()
+        if pair.between in tree or unjudged:
             kept[pair.between] = pair.matches
         elif matches is not None and len(matches):
             kept[pair.between] = matches
@@ -102,10 +170,9 @@ def _fitting(found: Posed, evidence: Evidence, pair: Pair, bound: float) -> NDAr
     """The matches (M, 2) of a pair that fit, none where most do not; None if it cannot be judged."""
     off = deviations(found, evidence, pair)
     known = np.isfinite(off)
-    if known.sum() < FEW:
-        return None
-    if np.median(off[known]) > bound:
-        return pair.matches[:0]
+    fits = agrees(evidence, pair, off, bound)
+    if not fits:
+        return None if fits is None else pair.matches[:0]
     fit = known & (off <= max(bound, _CLOSE))
     if fit.sum() >= _PURE * known.sum():
         fit |= ~known
@@ -116,6 +183,8 @@ def write_pairs(work: Workspace, kept: Kept, name: str) -> Workspace:
     """The same panoramas and features with these pairs alone, in a database of that name in the folder."""
     part = replace(work, name=name)
     part.database.unlink(missing_ok=True)
+    ids = work.ids()
+    used = {ids[row] for edge in kept for row in edge}
     with pycolmap.Database.open(work.database) as all_, pycolmap.Database.open(part.database) as some:
         for camera in all_.read_all_cameras():
             some.write_camera(camera, True)
@@ -125,8 +194,8 @@ def write_pairs(work: Workspace, kept: Kept, name: str) -> Workspace:
             some.write_frame(frame, True)
         for image in all_.read_all_images():
             some.write_image(image, True)
-            some.write_keypoints(image.image_id, all_.read_keypoints(image.image_id))
-        ids = work.ids()
+            if image.image_id in used:
+                some.write_keypoints(image.image_id, all_.read_keypoints(image.image_id))
         for (one, other), matches in sorted(kept.items()):
             a, b = ids[one], ids[other]
             geometry = all_.read_two_view_geometry(a, b)

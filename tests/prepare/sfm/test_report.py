@@ -1,6 +1,7 @@
 """What is reported of a reconstruction with faults."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -32,3 +33,12 @@ def test_json_and_plot_show_the_same(tmp_path: Path) -> None:
     assert panorama is not None
     red = (panorama[..., 2] > 150) & (panorama[..., 1] < 100) & (panorama[..., 0] < 60)
     assert red.sum() > 200  # the links, the pair and the panorama without a pose
+
+
+def test_another_part_is_named_once() -> None:
+    report = faulty()
+    report = replace(report, found=replace(report.found, others=[(3,)]))
+    assert report.as_json()["parts"] == [["d.jpg"]]
+    lines = list(report.lines())
+    assert lines[1].startswith("another part: d.jpg to d.jpg, 1 panoramas that agree")
+    assert not any(line.startswith("no pose") for line in lines)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from panolog.prepare.sfm.pipeline import SfmSettings, make_scene, panoramas_in_folder
+from panolog.prepare.sfm.pipeline import SfmSettings, make_scene, panoramas_in_folder, without_copies
 from panolog.scene.errors import InputError
 from panolog.scene.write import no_progress
 
@@ -14,7 +14,7 @@ from panolog.scene.write import no_progress
 def _pictures(folder: Path, *shapes: tuple[int, int]) -> None:
     folder.mkdir(parents=True)
     for number, shape in enumerate(shapes or [(64, 128)] * 2):
-        cv2.imwrite(str(folder / f"{number}.png"), np.full(shape, 90, np.uint8))
+        cv2.imwrite(str(folder / f"{number}.png"), np.full(shape, 90 + number, np.uint8))
 
 
 @pytest.mark.parametrize(
@@ -46,6 +46,25 @@ def test_refusals(what: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         make_scene(folder, output, SfmSettings(), no_progress)
     assert sorted(path.name for path in output.rglob("*")) == (["mine"] if what == "taken" else [])
+
+
+def test_copies_are_left_out_by_content_and_named(tmp_path: Path) -> None:
+    _pictures(tmp_path / "images", *[(64, 128)] * 3)
+    (tmp_path / "masks").mkdir()
+    for name in ("0", "2"):
+        cv2.imwrite(str(tmp_path / "masks" / f"{name}.png"), np.full((64, 128), 255, np.uint8))
+    (tmp_path / "images" / "3.png").write_bytes((tmp_path / "images" / "1.png").read_bytes())
+    panoramas, layers, lines = without_copies(*panoramas_in_folder(tmp_path))
+    assert [panorama.name for panorama in panoramas] == ["0.png", "1.png", "2.png"]
+    assert [mask is not None for mask in layers["masks"]] == [True, False, True]
+    assert lines == ["3.png: is a copy of 1.png, left out"]
+
+
+def test_copies_of_one_picture_are_refused(tmp_path: Path) -> None:
+    _pictures(tmp_path / "images", (64, 128))
+    (tmp_path / "images" / "1.png").write_bytes((tmp_path / "images" / "0.png").read_bytes())
+    with pytest.raises(InputError, match=r"all panoramas are copies of 0\.png"):
+        make_scene(tmp_path / "images", tmp_path / "scene", SfmSettings(), no_progress)
 
 
 @pytest.mark.system

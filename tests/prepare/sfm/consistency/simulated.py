@@ -45,7 +45,13 @@ def square(
         rows.append(seen)
     work = database_of(folder, keypoints)
     ids = work.ids()
+    words = random.integers(0, 90, (len(points), 128)).astype(np.float64)
+    words = (512 * words / np.linalg.norm(words, axis=1, keepdims=True)).round().astype(np.uint8)
+    look = np.where(copy_of >= 0, copy_of, len(points)).min(axis=0)  # of a point and of what looks like it
     with pycolmap.Database.open(work.database) as database:
+        for number, seen in zip(ids, rows, strict=True):
+            own = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, words[look[seen]])
+            database.write_descriptors(number, own)
         for a in range(count):
             for b in range(a + 1, count):
                 for turn in range(4):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from panolog.prepare.sfm.consistency.agreement import Posed, has_moved
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
-from panolog.prepare.sfm.consistency.motion import Motion, leads, look_again
+from panolog.prepare.sfm.consistency.motion import Motion, look_again
 
 Array = NDArray[np.float64]
 
@@ -20,23 +20,6 @@ def _motion(turn: float, *steps: tuple[float, float]) -> Motion:
     step = np.sum(steps, axis=0)
     shift = -rotation @ np.array([step[0], 0.0, step[1]])
     return Motion(rotation, shift / np.linalg.norm(shift))
-
-
-def test_three_motions_of_a_walk_fit_together() -> None:
-    first, second = _motion(10, (0, 2)), _motion(0, (0.2, 2))
-    there = first.rotation @ np.array([0.0, 0, 2]) + np.array([0.2, 0, 2])
-    direct = Motion(first.rotation, -there / np.linalg.norm(there))
-    assert leads(first, second, direct)
-    assert leads(second.reversed(), first.reversed(), direct.reversed())
-    assert not leads(first, second, Motion(direct.rotation, -direct.direction))  # to the house before
-    assert not leads(first, second, Motion(direct.rotation @ _motion(8, (0, 1)).rotation, direct.direction))
-
-
-def test_a_reversed_motion_has_the_opposite_direction() -> None:
-    motion = _motion(35, (1, 2))
-    assert motion.leaving == pytest.approx(np.array([1.0, 0, 2]) / np.sqrt(5))
-    assert motion.reversed().arriving == pytest.approx(-motion.leaving)
-    assert motion.reversed().reversed().direction == pytest.approx(motion.direction)
 
 
 class Known:

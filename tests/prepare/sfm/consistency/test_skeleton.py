@@ -12,7 +12,7 @@ from panolog.prepare.sfm.consistency.contradictions import (
     is_repetitive,
     is_trusted,
 )
-from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, covered
+from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, with_coverage
 from panolog.prepare.sfm.consistency.skeleton import Skeleton, find_skeleton, hops, tree_path
 
 NOTHING = np.empty((0, 2), np.int64)
@@ -72,11 +72,10 @@ def test_known_places_take_the_part_of_the_order() -> None:
 def test_coverage_counts_directions_and_not_features() -> None:
     around = np.linspace(-np.pi, np.pi, 60, endpoint=False) + 0.01
     rays = np.column_stack([np.sin(around), np.zeros(60), np.cos(around)])
-    known = np.arange(60)
-    assert covered(rays, known, known) == 1.0
-    assert covered(rays, known, known[:30]) == 0.5  # half of the horizon
-    assert covered(rays, known, known[::2]) == 1.0  # half of the features, all around
-    assert covered(rays, known[:0], known[:0]) == 0.0
+    every = np.repeat(np.arange(60)[:, None], 2, axis=1)
+    for matches, share in ((every, 1.0), (every[:30], 0.5), (every[::2], 1.0), (every[:0], 0.0)):
+        pairs = [Pair((0, 1), every), Pair((0, 2), matches), Pair((2, 3), every)]
+        assert with_coverage([rays] * 4, pairs)[1].coverage == share
 
 
 def test_ways_along_a_tree() -> None:
@@ -87,13 +86,15 @@ def test_ways_along_a_tree() -> None:
 
 
 def test_trust() -> None:
-    skeleton = Skeleton(True, frozenset({(0, 1), (1, 2)}), frozenset())
+    skeleton = Skeleton(True, frozenset((row, row + 1) for row in range(299)))
     other = [Contradiction((0, 2), 80, 3)]
     assert is_trusted([], skeleton, range(3))
     assert is_trusted(other, skeleton, range(3))
     assert not is_trusted([*other, Contradiction((0, 3), 80, 3)], skeleton, range(30))
     assert is_trusted([*other, Contradiction((0, 3), 80, 3)], skeleton, range(300))
     assert not is_trusted([Contradiction((1, 2), 80, 3)], skeleton, range(300))
+    split = replace(skeleton, tree=skeleton.tree - {(0, 1)})
+    assert is_trusted([], split, range(3)) and not is_trusted(other, split, range(3))
     guess = replace(skeleton, guessed=frozenset({(1, 2)}))  # believed only without a contradiction
     assert is_trusted([], guess, range(3)) and not is_trusted(other, guess, range(3))
 
@@ -101,7 +102,7 @@ def test_trust() -> None:
 def test_the_part_that_agrees_is_cut_where_the_tree_is_weakest() -> None:
     walk = {(row, row + 1): 0.9 for row in range(9)} | {(6, 7): 0.4}
     evidence = _evidence(walk, 10)
-    skeleton = Skeleton(True, frozenset(walk), frozenset(walk))
+    skeleton = Skeleton(True, frozenset(walk))
     for edge, part in (((2, 9), range(7)), ((3, 4), range(4, 10)), (None, range(10))):
         doubt = [] if edge is None else [Contradiction(edge, 80, 3)]
         assert consistent_part(range(10), doubt, skeleton, evidence) == list(part)

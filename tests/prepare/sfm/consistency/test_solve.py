@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from panolog.prepare.sfm.consistency.contradictions import consistent_part, is_trusted
-from panolog.prepare.sfm.consistency.solve import Solution, solve
+from panolog.prepare.sfm.consistency.solve import Solution, Solver
 from panolog.prepare.sfm.workspace import silence_colmap
 from panolog.scene.write import no_progress
 from tests.prepare.sfm.accuracy import drift, length
@@ -17,11 +16,15 @@ pytestmark = pytest.mark.system
 COUNT = 16  # panoramas, four for each side
 
 
-def _solve(place: Square) -> Solution:
+def _parts(place: Square) -> list[Solution]:
     with silence_colmap():
-        found = solve(place.work, SIZE, "incremental", 2.0, no_progress)
-    assert found is not None
-    return found
+        return Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+
+
+def _solve(place: Square) -> Solution:
+    found = _parts(place)
+    assert len(found) == 1
+    return found[0]
 
 
 def _error(place: Square, found: Solution) -> float:
@@ -35,7 +38,7 @@ def test_neighbours_in_order_outweigh_sides_that_look_the_same(tmp_path: Path) -
     found = _solve(place)
     assert found.skeleton.ordered
     assert _error(place, found) < 0.002 * length(place.centers)
-    assert is_trusted(found.contradictions, found.skeleton, range(len(place.centers)))
+    assert found.trusted
 
 
 def test_without_order_what_lies_around_tells_sides_apart(tmp_path: Path) -> None:
@@ -45,18 +48,19 @@ def test_without_order_what_lies_around_tells_sides_apart(tmp_path: Path) -> Non
     assert _error(place, found) < 0.1  # on a square of 16
 
 
-def test_what_nothing_tells_apart_is_not_trusted(tmp_path: Path) -> None:
+def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
     place = square(tmp_path, count=COUNT, ground=False, order=np.random.default_rng(4).permutation(COUNT))
-    found = _solve(place)
-    rows = sorted(found.found.poses)
-    assert not is_trusted(found.contradictions, found.skeleton, rows)
-    part = consistent_part(rows, found.contradictions, found.skeleton, found.evidence)
-    assert 0 < len(part) < len(rows)
-    assert not any(set(it.between) <= set(part) for it in found.contradictions)
+    with silence_colmap():
+        solver = Solver(place.work, SIZE, "incremental", 2.0, no_progress)
+        assert solver.parts(3) == [] and solver.cuts
+        found = solver.parts(3, doubtful=True)
+    rows = [set(part.found.poses) for part in found]
+    assert all(part.trusted for part in found)
+    assert 0 < sum(map(len, rows)) == len(set.union(*rows)) <= COUNT
 
 
 def test_equal_inputs_give_equal_poses(tmp_path: Path) -> None:
-    one, other = (_solve(square(tmp_path / name, count=12)) for name in ("a", "b"))
+    one, other = (_solve(square(tmp_path / name, count=COUNT)) for name in ("a", "b"))
     for row, (rotation, shift) in one.found.poses.items():
         assert np.array_equal(rotation, other.found.poses[row][0])
         assert np.array_equal(shift, other.found.poses[row][1])
