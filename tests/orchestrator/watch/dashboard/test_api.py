@@ -215,8 +215,12 @@ def test_pictures(served: Served) -> None:
         assert answer.headers["content-type"] == "image/jpeg"
         assert answer.content.startswith(b"\xff\xd8")
     assert served.errors(f"{path}/previews/{view['number']}", 404)
-    render = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)  # of the last cover
-    assert render is not None and render.shape[1] == 2 * render.shape[0] <= 320
+    whole, render = (
+        cv2.imdecode(np.frombuffer(served.client.get(f"{path}/{name}").content, np.uint8), cv2.IMREAD_COLOR)
+        for name in (f"views/{view['number']}", covers[1])
+    )
+    assert whole is not None and render is not None
+    assert render.shape[:2] == (whole.shape[0] // 2, whole.shape[1])
 
 
 def test_downloads(served: Served) -> None:
