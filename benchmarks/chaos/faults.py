@@ -23,8 +23,8 @@ from panolog.orchestrator.runs.state import replay
 from panolog.orchestrator.runs.store import read_milestones
 from panolog.workers.tasks import StrEnum
 
-SILENCE_S = 60.0  # deadlines.message; a worker reports every second
-HELLO_S = 600.0  # deadlines.hello, in which a worker starts also on a busy machine
+SILENCE_S = 30.0  # deadlines.message; a worker reports every second
+HELLO_S = 120.0  # deadlines.hello, in which a worker starts also on a busy machine
 RETRY_S = 1.0  # disk.retry
 QUARANTINE = 3  # quarantine.failures
 DAY_S = 86_400  # by which a clock jumps

@@ -72,24 +72,10 @@ def make_scene(
     """
     require_new(output)
     known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
-    layers: LayerFiles
     folder, notes, copies = workspace_folder(output.resolve()), list[str](), list[str]()
     if _image_folder(source).resolve() in output.resolve().parents:
         raise SceneError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
-    if source.is_file():
-        files = extract_frames(
-            source,
-            folder / "frames",
-            parallax=settings.parallax,
-            most=settings.frames,
-            progress=lambda done, total: progress("frames", done, total),
-            note=notes.append,
-        )
-        panoramas = tuple(PanoramaFile(folder / "frames", file.name, file) for file in files)
-        layers = {MASKS: find_layer(folder / "frames", MASKS, [file.name for file in files])}
-    else:
-        given, layers, copies = without_copies(*panoramas_in_folder(source))
-        panoramas = complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n))
+    panoramas, layers = _panoramas_of(source, folder, settings, notes, copies, progress)
     layers = with_masks(panoramas, layers)
     places = None if known is None else _places(known, source, folder, panoramas)
     found = reconstruct(
@@ -114,6 +100,31 @@ def make_scene(
         _write(output, report, link, progress)
     shutil.rmtree(folder, ignore_errors=True)
     return reports[0]
+
+
+def _panoramas_of(
+    source: Path,
+    folder: Path,
+    settings: SfmSettings,
+    notes: list[str],
+    copies: list[str],
+    progress: StageProgress,
+) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
+    """The panoramas of a source with their layers; adds to `notes` and `copies` what a user should read."""
+    if not source.is_file():
+        given, layers, found = without_copies(*panoramas_in_folder(source))
+        copies += found
+        return complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n)), layers
+    files = extract_frames(
+        source,
+        folder / "frames",
+        parallax=settings.parallax,
+        most=settings.frames,
+        progress=lambda done, total: progress("frames", done, total),
+        note=notes.append,
+    )
+    panoramas = tuple(PanoramaFile(folder / "frames", file.name, file) for file in files)
+    return panoramas, {MASKS: find_layer(folder / "frames", MASKS, [file.name for file in files])}
 
 
 def _report(
