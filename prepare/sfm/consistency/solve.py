@@ -86,7 +86,8 @@ def solve(
 def _agreeing(solution: Solution, drift: float) -> Kept:
     """The tree, pairs that fit the poses and points, and those of the skeleton that cannot be judged."""
     evidence, core = solution.evidence, solution.skeleton.core
-    way = hops(core, len(evidence.rays))
+    pairs = [pair.between for pair in evidence.pairs] if drift else []
+    way = hops(core, len(evidence.rays), pairs, _FARTHEST / max(drift, _DRIFT))
     kept: Kept = {}
     for pair in evidence.pairs:
         bound = min(_CLOSE + drift * way[pair.between], _FARTHEST) if drift else _CLOSE
