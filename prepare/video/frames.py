@@ -52,8 +52,7 @@ def extract_frames(
         folder: made if missing.
         parallax: degrees, above 0 and up to 45.
         most: maximum number of frames, at least 2; if there would be more, they are further apart.
-        progress: called after each frame of the first pass and each that is written; both numbers count
-            both passes.
+        progress: called after each frame of the first pass and each that is written; counts both passes.
         note: called with a line about each thing that was left out.
 
     Returns:
