@@ -61,14 +61,11 @@ def make_scene(
 ) -> SfmReport:
     """Makes a scene of `source`, a folder or a video, in the new folder `output`, with its report.
 
-    Args: with_masks, is given the panoramas and their layers before features are found, and returns the
-    layers with masks that it has made; those of a job that was interrupted must stay as they are.
+    Args: with_masks, gets the panoramas and their layers, and returns the layers with masks that it has made;
+        those of an interrupted job must stay as they are; memory, bytes that may be used.
 
-    Raises:
-        SceneError: the source is wrong, or its panoramas share too little; there is no `output` then, and
-            what was done is kept for the next call.
-        RunError: a process was killed again and again, most likely for want of memory.
-        OSError: a file cannot be read or written.
+    Raises SceneError if the source is wrong or its panoramas share too little: there is no `output` then, and
+    what was done is kept for the next call. RunError if a process is killed, OSError if a file fails.
     """
     require_new(output)
     known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
