@@ -27,7 +27,7 @@ const POSSIBLE = {
 
 /** The files that are made of a model on request: kind, name, and what for. */
 const FILES = [
-  ["sog", "SOG", "for SuperSplat, PlayCanvas, Spark: a twentieth of the size"],
+  ["sog", "SOG", "for SuperSplat, PlayCanvas, Spark: the smallest file"],
   ["spz", "SPZ", "for Scaniverse, Spark, Babylon.js; without the sky"],
   ["ply", "Upright PLY", "for every other viewer: y down, as they expect it"],
   ["html", "Page", "the 3D view as one file, which opens without a server"],
