@@ -128,7 +128,10 @@ export class Walk {
     if (camera) this.go(camera);
   }
 
-  /** @param {Camera} camera @param {boolean} [atOnce]  Goes there, and shows its photograph if that is on; at once, the model. */
+  /**
+   * Goes there, and shows its photograph if that is on; at once, the model.
+   * @param {Camera} camera @param {boolean} [atOnce]
+   */
   go(camera, atOnce = false) {
     this.pause();
     this._leave();

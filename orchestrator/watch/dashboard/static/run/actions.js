@@ -27,11 +27,13 @@ const POSSIBLE = {
 
 /** The files that are made of a model on request: kind, name, and what for. */
 const FILES = [
-  ["sog", "SOG", "for SuperSplat, PlayCanvas, Spark: a twentieth of the size"],
+  ["sog", "SOG", "for SuperSplat, PlayCanvas, Spark: the smallest file"],
   ["spz", "SPZ", "for Scaniverse, Spark, Babylon.js; without the sky"],
   ["ply", "Upright PLY", "for every other viewer: y down, as they expect it"],
   ["html", "Page", "the 3D view as one file, which opens without a server"],
 ];
+
+const RAW = "for training and GIS: the run's own axes, on its side in viewers";
 
 /** @param {number[]} blocks one at least */
 const blocksLabel = (blocks) => (blocks.length > 1 ? `${blocks.length} blocks` : taskLabel(`block/${blocks[0]}`));
@@ -131,7 +133,7 @@ export function actions(path) {
       const button = el("button", { type: "button", on: { click: () => save(kind, button) } }, name);
       return el("li", {}, button, el("span", { class: "muted small" }, use));
     });
-    const raw = el("li", {}, link("point_cloud.ply", "Raw PLY"), el("span", { class: "muted small" }, "for training and GIS: the run's own axes, on its side in viewers"));
+    const raw = el("li", {}, link("point_cloud.ply", "Raw PLY"), el("span", { class: "muted small" }, RAW));
     return el("details", { class: "menu" }, el("summary", { class: "button" }, "Download"), el("ul", {}, ...made, raw));
   }
 

@@ -6,6 +6,9 @@ import { get, snapshot, urlOf } from "panolog/shared/api.js";
 import { byId, childrenOf, el, table } from "panolog/shared/dom.js";
 import { METRICS, count, fixed } from "panolog/shared/format.js";
 
+const MEANING = "PSNR is how far colours are off, in decibels: six more are half the error. "
+  + "SSIM compares structure, 1 is equal; LPIPS what a network sees, 0 is equal. WS-PSNR and WS-SSIM count each pixel "
+  + "by the area that it has on the sphere, because a panorama enlarges what is above and below.";
 const OPEN = 24; // rows up to which a table is open
 
 /** @param {...import("../shared/dom.js").Child} text */
@@ -32,7 +35,7 @@ function quality({ mean, views, lpips_reason: reason }, pictured, choose) {
   const name = ([view]) => (pictured.has(view) ? el("button", { type: "button", class: "row-name", on: { click: () => choose.view(view) } }, view) : view);
   return [
     all && note(`On average ${all}.`, fitted && ` After a fit of each render's colours ${fitted}.`),
-    note("PSNR is how far colours are off, in decibels: six more are half the error. SSIM compares structure, 1 is equal; LPIPS what a network sees, 0 is equal. WS-PSNR and WS-SSIM count each pixel by the area that it has on the sphere, because a panorama enlarges what is above and below."),
+    note(MEANING),
     reason && !snapshot && note(reason),
     rows.length > 0 && listed(counted(rows.length, "held-out panorama"), table(rows, [
       ["Panorama", name],

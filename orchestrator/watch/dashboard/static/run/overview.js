@@ -60,7 +60,9 @@ function showCost(money) {
 
 /** What to do about a run that ended before it was done. @param {RunPage} run @returns {[string, string] | null} */
 function hint({ summary: { status, stage }, progress, eta, latest, path }) {
-  if (snapshot) return status === "running" ? [`The run was still running when this was written: ${percent(progress)} done${eta === null ? "" : `, about ${duration(eta)} left`}.`, ""] : null;
+  if (snapshot && status !== "running") return null;
+  const left = eta === null ? "" : `, about ${duration(eta)} left`;
+  if (snapshot) return [`The run was still running when this was written: ${percent(progress)} done${left}.`, ""];
   const resume = `panolog resume ${shellWord(path)}`;
   const kept = stage === "prepare" ? "What is done is kept" : "The checkpoints are kept";
   const last = latest ? ` Last update: ${clock(latest)}, ${ago(latest)}.` : "";

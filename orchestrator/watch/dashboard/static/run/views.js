@@ -70,10 +70,13 @@ export function views(path) {
     if (view) {
       state.frames = [{ url: urlOf(`${path}/views/${view.number}`) ?? "", text: heldOutText(view) }];
     } else {
+      const part = HATCHED.some((stage) => value.startsWith(stage));
+      const hatched = part ? " · what is hatched is not trained by this block" : "";
       /** @type {PreviewList} */
       const { previews } = await get(`${path}/previews?task=${encodeURIComponent(value)}`).catch(() => ({ previews: [] }));
       state.frames = previews.sort((a, b) => a.event - b.event).map((preview) => ({
-        url: urlOf(`${path}/previews/${preview.event}`) ?? "", text: `${preview.view}, iteration ${count(preview.iteration)}${HATCHED.some((stage) => value.startsWith(stage)) ? " · what is hatched is not trained by this block" : ""}`,
+        url: urlOf(`${path}/previews/${preview.event}`) ?? "",
+        text: `${preview.view}, iteration ${count(preview.iteration)}${hatched}`,
       }));
     }
     const last = state.frames.length - 1;

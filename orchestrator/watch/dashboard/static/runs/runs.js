@@ -54,7 +54,8 @@ function makeRow(run) {
     const cell = el("td", { class: column.number ? "number" : null, "data-label": column.label, "data-column": column.key });
     const cover = el("img", { class: "cover", alt: "", width: 112, height: 56, loading: "lazy", hidden: true });
     cover.addEventListener("error", () => { cover.hidden = true; }); // a copy of a run may lack its pictures
-    if (column.key === "name") cell.append(cover, el("div", {}, link, el("span", { class: "scene" }), el("span", { class: "made" })));
+    const below = ["scene", "made"].map((kind) => el("span", { class: kind }));
+    if (column.key === "name") cell.append(cover, el("div", {}, link, below));
     if (column.key === "status") cell.append(pill("unread"));
     if (column.key === "progress") cell.append(bar(0, "progress"), el("span", { class: "share" }));
     return cell;
