@@ -1,0 +1,45 @@
+"""Which pairs of a walk contradict its poses, where copies of houses match as well as neighbours."""
+
+import numpy as np
+import pytest
+
+from panolog.prepare.sfm.consistency.agreement import Posed
+from panolog.prepare.sfm.consistency.contradictions import find_contradictions
+from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
+from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton
+
+COUNT, AROUND = 6, 360
+
+
+def _contradictions(agreeing: list[Edge], against: list[Edge], ordered: bool, covers: float) -> set[Edge]:
+    """Of a walk within a ring of houses, each of which looks as that ten degrees further on.
+
+    Args: pairs that agree besides the neighbours, and pairs with copies; covers, the coverage of the latter.
+    """
+    random = np.random.default_rng(0)
+    turn = np.deg2rad(np.arange(AROUND))
+    points = np.column_stack([8 * np.sin(turn), random.uniform(-3, 3, AROUND), 8 * np.cos(turn)])
+    shifts = np.array([[0.1 * row, 0.0, 0.0] for row in range(COUNT)])
+    rays = [points + shift for shift in shifts]
+    same = np.repeat(np.arange(AROUND)[:, None], 2, axis=1)
+    copies = np.column_stack([same[:, 0], (same[:, 0] + 10) % AROUND])
+    walk = [(row, row + 1) for row in range(COUNT - 1)]
+    pairs = [Pair(edge, same, 0.9, share=0.3) for edge in (*walk, *agreeing)]
+    pairs += [Pair(edge, copies, covers, share=0.3) for edge in against]
+    unit = tuple(ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+    poses = {row: (np.eye(3), shift) for row, shift in enumerate(shifts)}
+    found = Posed(poses, dict.fromkeys(range(COUNT), points))
+    skeleton = Skeleton(ordered, frozenset(walk))
+    against_ = find_contradictions(Evidence(unit, tuple(pairs)), skeleton, found, 2.0, lambda _: None)
+    return {it.between for it in against_}
+
+
+@pytest.mark.parametrize("agreeing", [[], [(0, 2), (1, 3), (2, 4), (3, 5)]])
+def test_copies_count_where_they_outvote_what_agrees(agreeing: list[Edge]) -> None:
+    against: list[Edge] = [(1, 4), (2, 5)]
+    assert _contradictions(agreeing, against, True, 0.9) == (set() if agreeing else set(against))
+
+
+@pytest.mark.parametrize(("covers", "counts"), [(0.9, True), (0.7, False)])
+def test_without_an_order_copies_count_if_they_cover_as_much(covers: float, counts: bool) -> None:
+    assert _contradictions([(0, 2)], [(1, 4)], False, covers) == ({(1, 4)} if counts else set())
