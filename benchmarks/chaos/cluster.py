@@ -22,7 +22,7 @@ _NODES = HEAD, SECOND
 _TMP = "/tmp"  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _NO_WORK = ("ray::IDLE", "ray::Agent", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
 _TIMEOUT_S = 600.0  # for a node to start, also on a busy machine
-_AS_NICE = {"RAY_worker_niceness": "0"}  # as this process: nicer ones would starve next to other programs
+_AS_NICE = {"RAY_worker_niceness": "0"}  # as this process: nicer ones starve next to other programs
 _POLL_S = 0.05  # between two checks of a process table or a port
 
 

@@ -109,8 +109,8 @@ def test_no_time_counts_in_which_no_driver_was_at_work(browser: Browser, tmp_pat
         database.store([(7015.0, RunEnded(Outcome.FAILED, "no"))])
     report = write_report(folder, tmp_path / "page.html", running=False)
     with opened(browser, report.as_uri()) as page:
-        expect(page.locator("#facts")).to_contain_text("Elapsed0:25")
-        expect(page.locator("#stages li[data-key='coarse']")).to_contain_text("done · 0:25")
+        expect(page.locator("#facts")).to_contain_text("Elapsed25 s")
+        expect(page.locator("#stages li[data-key='coarse']")).to_contain_text("done · 25 s")
 
 
 def test_all_is_there_without_network(browser: Browser, report: Path) -> None:
