@@ -68,6 +68,8 @@ class Video:
         """
         self.path = path
         self.decoded = 0  # frames so far
+        self.passed = 0  # the same with those that were left out, by the time
+        self._first = 0.0  # seconds
         self.time = 0.0  # seconds: when the last frame is shown
         self.is_plain = True  # so far: nothing is damaged, and each frame has a time after the last one
         self.keys: list[float] = []  # seconds, of the frames so far from which decoding can begin
@@ -101,18 +103,11 @@ class Video:
         )  # frames by the header
 
     @property
-    def passed(self) -> int:
-        """Frames up to the last one, also those that were left out."""
-        left_out = self._stream.codec_context.skip_frame != "DEFAULT"
-        return max(self.decoded, round(self.time * float(self._stream.average_rate or 0)) if left_out else 0)
-
-    @property
     def often(self) -> int:
         """Every how manieth frame is enough of a large video, for `_ENOUGH` a second; 1 of others."""
         if self.width < _LARGE:
             return 1
-        kept = self.decoded / max(self.passed, 1)
-        return max(1, int(float(self._stream.average_rate or 0) * kept / _ENOUGH))
+        return max(1, int(float(self._stream.average_rate or 0) / _ENOUGH))
 
     @property
     def started(self) -> datetime | None:
@@ -130,13 +125,13 @@ class Video:
         `time`, `picture` and `grey` are those of the last one.
         """
         frame: av.VideoFrame | None = self._frame
-        while frame is not None and self.decoded < MAX_FRAMES:
+        while frame is not None and self.passed < MAX_FRAMES:
             # FFmpeg reuses the buffers of frames that are let go, and where a frame is damaged it shows
             # what was in its buffer: so that is done here, at the same moment each time.
             self._frame = frame
             coming = self._ahead.submit(next, self._frames, None)
             self._show(frame)
-            yield self.decoded - 1
+            yield self.passed - 1
             frame = coming.result()
 
     def frames_at(self, times: Sequence[float], keys: Sequence[float]) -> Iterator[float]:
@@ -185,7 +180,7 @@ class Video:
         unusable = self._damaged + self._unlike
         if unusable:
             lines.append(f"{self.path}: {unusable:,} damaged frames, or of another size, were left out")
-        if self.decoded == MAX_FRAMES:
+        if self.passed == MAX_FRAMES:
             lines.append(f"{self.path}: only its first {MAX_FRAMES:,} frames were used; cut it")
         return lines
 
@@ -226,8 +221,11 @@ class Video:
         """`frame` is the last one now."""
         time = round(self._time(frame), 6)
         self.is_plain &= frame.pts is not None and (self.decoded == 0 or time > self.time)
-        self.time = time
-        self.decoded += 1
+        self.time, self._first = time, self._first if self.decoded else time
+        self.decoded, self.passed = self.decoded + 1, self.passed + 1
+        if self._stream.codec_context.skip_frame != "DEFAULT":
+            due = round((time - self._first) * float(self._stream.average_rate or 0)) + 1
+            self.passed = max(self.passed, min(due, MAX_FRAMES))
         if frame.key_frame:
             self.keys.append(time)
 

@@ -174,7 +174,7 @@ def _followed(video: Path, key: str, progress: Progress, effort: Effort) -> Vide
                 motion.add(number, source.time, grey)
             progress(source.passed, 2 * max(source.promised, source.passed))
         keys = source.keys if effort == "draft" else []
-        return VideoMotion(key, source.decoded, keys, motion.finish(), source.notes())
+        return VideoMotion(key, source.passed, keys, motion.finish(), source.notes())
 
 
 def _write(
