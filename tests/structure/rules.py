@@ -102,11 +102,11 @@ def long_functions() -> Iterator[str]:
     )
 
 
-def long_kernels() -> Iterator[str]:
-    """Functions of C++ with more than `MAX_FUNCTION` lines of code."""
+def long_functions_of_others() -> Iterator[str]:
+    """Functions of C++ and JavaScript with more than `MAX_FUNCTION` lines of code, without inner ones."""
     for file in tracked():
-        if file.suffix in (".cpp", ".h", ".cu", ".cuh"):
-            name = str(file.with_suffix(".cpp"))  # of a language that lizard knows
+        if file.suffix in (".cpp", ".h", ".cu", ".cuh", ".js"):
+            name = str(file if file.suffix == ".js" else file.with_suffix(".cpp"))  # of a language it knows
             for function in lizard.analyze_file.analyze_source_code(name, text(file)).function_list:
                 if function.nloc > MAX_FUNCTION:
                     yield f"{file}:{function.name}: {function.nloc} lines"
@@ -212,7 +212,7 @@ RULES: tuple[Callable[[], Iterator[str]], ...] = (
     full_folders,
     long_files,
     long_functions,
-    long_kernels,
+    long_functions_of_others,
     small_modules,
     import_circles,
     tests_of_benchmarks,

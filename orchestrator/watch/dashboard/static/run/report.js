@@ -5,8 +5,9 @@ import { get } from "panolog/shared/api.js";
 import { byId, el, first, setMessage } from "panolog/shared/dom.js";
 import { count, decibel, fixed } from "panolog/shared/format.js";
 
-const MADE = "Stage I trains the whole place at once. Scoring finds which panoramas matter to which block, "
-  + "Stage II trains each block with those, and the merge puts the blocks together.";
+const MADE =
+  "Stage I trains the whole place at once. Scoring finds which panoramas matter to which block, " +
+  "Stage II trains each block with those, and the merge puts the blocks together.";
 const OPEN = ["preparation", "views"]; // cards that are not folded: the first folds itself
 
 /** A button that shows and hides what follows the heading of a card. @param {HTMLElement} card */
@@ -29,9 +30,14 @@ function fold(card) {
 
 /** Facts and stages as a card of their own, after the picture. */
 function made() {
-  const card = el("section", { id: "made", class: "card", "aria-labelledby": "made-title" },
+  const card = el(
+    "section",
+    { id: "made", class: "card", "aria-labelledby": "made-title" },
     el("header", {}, el("h2", { id: "made-title" }, "How it was made")),
-    byId("facts"), byId("stages"), el("p", { class: "muted small note" }, MADE));
+    byId("facts"),
+    byId("stages"),
+    el("p", { class: "muted small note" }, MADE),
+  );
   first(".hero").after(card);
 }
 
@@ -40,10 +46,12 @@ function links({ view, model }) {
   /** @param {string} href @param {string} label @param {string} kind */
   const link = (href, label, kind, download = false) =>
     el("a", { href, class: kind, download: download ? "" : null }, label);
-  byId("actions").replaceChildren(...[
-    view && link("view.html", "Open in 3D", "button primary"),
-    model && link("point_cloud.ply", "Save the model", "button", true),
-  ].filter((part) => part !== false));
+  byId("actions").replaceChildren(
+    ...[
+      view && link("view.html", "Open in 3D", "button primary"),
+      model && link("point_cloud.ply", "Save the model", "button", true),
+    ].filter((part) => part !== false),
+  );
 }
 
 /** @param {string} path of the run below /api @param {RunPage} run */
@@ -61,6 +69,9 @@ export async function report(path, { summary, result }) {
   const { metrics } = await get(`${path}/findings`);
   const seen = Object.keys(metrics?.views ?? {}).length;
   const off = `${fixed(100 * 10 ** (-psnr / 20), 1)} % of full brightness on average`;
-  setMessage(byId("verdict"), `From ${count(seen)} places that the training has not seen, the model differs from the `
-    + `photographs by ${off} (PSNR ${decibel(psnr)}; more is better).`);
+  setMessage(
+    byId("verdict"),
+    `From ${count(seen)} places that the training has not seen, the model differs from the ` +
+      `photographs by ${off} (PSNR ${decibel(psnr)}; more is better).`,
+  );
 }

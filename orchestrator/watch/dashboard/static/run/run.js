@@ -1,9 +1,5 @@
 // The page of one run: passes the server's messages to its parts.
 
-/** @import { EventList, RunChanges, RunPage } from "../shared/messages.js" */
-import { connectionLine, get, messageOf, snapshot, statusOf, stream } from "panolog/shared/api.js";
-import { byId, setMessage } from "panolog/shared/dom.js";
-import { shellWord } from "panolog/shared/format.js";
 import { actions } from "panolog/run/actions.js";
 import { blockTable } from "panolog/run/blocks.js";
 import { curves } from "panolog/run/curves.js";
@@ -17,6 +13,10 @@ import { report } from "panolog/run/report.js";
 import { blockStatuses, trainingRows } from "panolog/run/rows.js";
 import { selection } from "panolog/run/selection.js";
 import { views } from "panolog/run/views.js";
+/** @import { EventList, RunChanges, RunPage } from "../shared/messages.js" */
+import { connectionLine, get, messageOf, snapshot, statusOf, stream } from "panolog/shared/api.js";
+import { byId, setMessage } from "panolog/shared/dom.js";
+import { shellWord } from "panolog/shared/format.js";
 
 const id = snapshot ? "report" : encodeURIComponent(location.pathname.split("/").filter(Boolean).pop() ?? "");
 const path = `runs/${id}`;
@@ -134,7 +134,8 @@ async function explain() {
 function lastState() {
   if (!known) return ", trying again …";
   const { status, label } = known.summary;
-  const then = status === "running" ? "; trying again …" : `. To open it again: panolog dashboard ${shellWord(known.path)}`;
+  const then =
+    status === "running" ? "; trying again …" : `. To open it again: panolog dashboard ${shellWord(known.path)}`;
   return ` — last state: ${label}${then}`;
 }
 
@@ -143,32 +144,37 @@ const line = connectionLine((time) => {
   document.body.classList.toggle("lost", time !== null);
   if (known) show(known);
 }, lastState);
-stream(`?run=${id}&changes=1`, () => {
-  line.good();
-  events.refresh();
-  charts.refresh();
-  pictures.refresh();
-}, (refused) => {
-  line.lost();
-  if (refused) explain();
-}, {
-  /** @param {RunPage} run */
-  run(run) {
+stream(
+  `?run=${id}&changes=1`,
+  () => {
     line.good();
-    show(run);
+    events.refresh();
+    charts.refresh();
+    pictures.refresh();
   },
-  /** @param {RunChanges} changes */
-  changes(changes) {
-    if (known) show(changed(known, changes));
+  (refused) => {
+    line.lost();
+    if (refused) explain();
   },
-  /** @param {{error: string}} message */
-  gone({ error }) {
-    line.lost(`The run cannot be read: ${error}`);
+  {
+    /** @param {RunPage} run */
+    run(run) {
+      line.good();
+      show(run);
+    },
+    /** @param {RunChanges} changes */
+    changes(changes) {
+      if (known) show(changed(known, changes));
+    },
+    /** @param {{error: string}} message */
+    gone({ error }) {
+      line.lost(`The run cannot be read: ${error}`);
+    },
+    /** @param {EventList} message */
+    events({ events: recent }) {
+      events.add(recent);
+      charts.add(recent);
+      pictures.add(recent);
+    },
   },
-  /** @param {EventList} message */
-  events({ events: recent }) {
-    events.add(recent);
-    charts.add(recent);
-    pictures.add(recent);
-  },
-});
+);

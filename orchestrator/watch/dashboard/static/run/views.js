@@ -7,7 +7,8 @@ import { byId, el, replaceIfChanged, setText } from "panolog/shared/dom.js";
 import { count, decibel, fixed, taskLabel } from "panolog/shared/format.js";
 
 /** @param {HeldOutView} view */
-const heldOutText = ({ name, metrics }) => `${name}, held out: PSNR ${decibel(metrics?.psnr)}, SSIM ${fixed(metrics?.ssim, 4)}, WS-PSNR ${decibel(metrics?.ws_psnr)}`;
+const heldOutText = ({ name, metrics }) =>
+  `${name}, held out: PSNR ${decibel(metrics?.psnr)}, SSIM ${fixed(metrics?.ssim, 4)}, WS-PSNR ${decibel(metrics?.ws_psnr)}`;
 
 const HATCHED = ["block/", "round/", "repair/"]; // stages whose tasks train a part of the place
 const STAGES = ["district", "coarse", "block", "round", "repair"];
@@ -58,9 +59,16 @@ export function views(path) {
 
   /** Fills the list of pictures, and keeps what was selected. */
   function options() {
-    const trained = state.tasks.map((task) => el("option", { value: task, selected: task === (state.chosen ?? state.tasks.at(-1)) }, taskLabel(task)));
-    const held = state.heldOut.map(({ number, name }) => el("option", { value: `view/${number}`, selected: `view/${number}` === state.chosen }, name));
-    return [trained.length ? el("optgroup", { label: "Training views" }, trained) : null, held.length ? el("optgroup", { label: "Held-out views" }, held) : null];
+    const trained = state.tasks.map((task) =>
+      el("option", { value: task, selected: task === (state.chosen ?? state.tasks.at(-1)) }, taskLabel(task)),
+    );
+    const held = state.heldOut.map(({ number, name }) =>
+      el("option", { value: `view/${number}`, selected: `view/${number}` === state.chosen }, name),
+    );
+    return [
+      trained.length ? el("optgroup", { label: "Training views" }, trained) : null,
+      held.length ? el("optgroup", { label: "Held-out views" }, held) : null,
+    ];
   }
 
   /** Shows the pictures of an option. @param {string} value */
@@ -73,11 +81,15 @@ export function views(path) {
       const part = HATCHED.some((stage) => value.startsWith(stage));
       const hatched = part ? " · what is hatched is not trained by this block" : "";
       /** @type {PreviewList} */
-      const { previews } = await get(`${path}/previews?task=${encodeURIComponent(value)}`).catch(() => ({ previews: [] }));
-      state.frames = previews.sort((a, b) => a.event - b.event).map((preview) => ({
-        url: urlOf(`${path}/previews/${preview.event}`) ?? "",
-        text: `${preview.view}, iteration ${count(preview.iteration)}${hatched}`,
+      const { previews } = await get(`${path}/previews?task=${encodeURIComponent(value)}`).catch(() => ({
+        previews: [],
       }));
+      state.frames = previews
+        .sort((a, b) => a.event - b.event)
+        .map((preview) => ({
+          url: urlOf(`${path}/previews/${preview.event}`) ?? "",
+          text: `${preview.view}, iteration ${count(preview.iteration)}${hatched}`,
+        }));
     }
     const last = state.frames.length - 1;
     frame.max = String(Math.max(last, 0));
