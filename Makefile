@@ -6,6 +6,7 @@ BIN := .venv/bin
 READY := .venv/ready
 PEERS := build/peers/ready
 TSC := node_modules/typescript/bin/tsc
+BIOME := node_modules/@biomejs/biome/bin/biome
 INPUTS := Makefile pyproject.toml constraints.txt CMakeLists.txt $(shell find renderer/csrc -type f) \
 	$(wildcard */__init__.py */*/__init__.py)
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
@@ -56,13 +57,14 @@ nightly: $(READY) $(if $(findstring tests/deploy,$(or $(FILES),tests/deploy)),$(
 stress: $(READY)  ## run the tests under load, in random order and on one core (FILES=... some of them)
 	$(BIN)/python -m tests.stress $(OPTIONS) $(FILES)
 
-lint: $(READY) $(TSC)  ## check style, types of Python and of the scripts, and the direction of imports
+lint: $(READY) $(TSC)  ## check style and types of Python and of the scripts, and the direction of imports
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/clang-format --dry-run --Werror $$(find renderer/csrc tests/renderer/cuda -name '*.cpp' -o -name '*.h' -o -name '*.cu*')
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/node $(TSC)
+	$(BIN)/node $(BIOME) check --error-on-warnings
 
 types: $(READY)  ## write what the dashboard's scripts know of its API
 	$(BIN)/python -m tests.orchestrator.watch.dashboard.api_types

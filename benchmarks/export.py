@@ -38,6 +38,7 @@ FORMATS = {
     "spz 3": (["--spz"], ".spz", True),
     "spz 4": (["--spz", "--spz-version", "4"], ".spz", True),
     "compressed ply": (["--compressed-ply"], ".compressed.ply", True),
+    "ply": (["--ply"], ".ply", True),
     "glb": (["--glb"], ".glb", False),
     "web": (["--web"], "-web", False),
     "3dtiles": (["--3dtiles"], "-3dtiles", False),

@@ -1,7 +1,8 @@
 """Makes the pictures of docs/dashboard.md: `PYTHONPATH=. python docs/screenshots.py FOLDER [RUN]`.
 
 `python docs/screenshots.py --model RUN CAMERA` makes that of the README instead: the 3D page of a run, which
-begins at the panorama CAMERA (of the demo: street_004.png).
+begins at the panorama CAMERA (of the demo: street_004.png). `python docs/screenshots.py --viewers RUN` makes
+that of docs/export.md: the model of a run in three viewers, two of which npm installs.
 
 Needs the development dependencies and Chromium. FOLDER is one that `panolog dashboard` would serve; RUN is
 the name of a run in it, by default the latest.
@@ -13,12 +14,19 @@ from tempfile import TemporaryDirectory
 from threading import Thread
 from typing import Any, Literal
 
+import cv2
 import httpx
+import numpy as np
 from playwright.sync_api import Browser, Page, expect
 
+from panolog.export.site.write import write_site
+from panolog.orchestrator.cli.commands.export import ExportSpec, export_model
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.watch.dashboard import server
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_file
+from panolog.scene.write import no_progress
+from tests.export.browser import SOFTWARE, serving
+from tests.export.site import test_viewers as viewers
 from tests.orchestrator.watch.dashboard.browser import DESK, PHONE, chromium
 
 HERE = Path(__file__).parent
@@ -54,6 +62,37 @@ def take_model_picture(folder: Path, camera: str) -> None:
         page.screenshot(path=HERE / "view-3d.jpg", type="jpeg", quality=82)
 
 
+def take_viewers_picture(folder: Path) -> None:
+    """Takes the picture of a model in PlayCanvas's engine, in SuperSplat's viewer, and in Spark."""
+    run = RunFolder(folder)
+    shown = site_of_run(run, Wanted())
+    assert shown.page.start is not None
+    pictures = []
+    with TemporaryDirectory() as temporary, chromium(SOFTWARE) as browser:
+        site = Path(temporary) / "site"
+        write_site(site, shown.write_model, shown.page)
+        export_model(folder, site, ExportSpec(("ply", "spz")), no_progress, print)
+        viewers.lay_out(Path(temporary))
+        x, y, z = shown.page.start.position
+        stand = f"camera.position.set({x}, {y}, {z}); camera.rotation.y = {np.radians(shown.page.start.yaw)}"
+        with serving(Path(temporary)) as url:
+            for address, ready, then in (
+                ("site/index.html", "#home:enabled", ""),
+                (viewers.supersplat_address(f"{folder.name}.ply"), "canvas", ""),
+                (f"spark.html?site/{folder.name}.spz", "canvas", stand),
+            ):
+                page = browser.new_page(viewport={"width": 640, "height": 400})
+                page.set_default_timeout(_PATIENCE)
+                page.goto(url + address)
+                page.locator(ready).wait_for(timeout=_PATIENCE)
+                page.evaluate(then)
+                page.wait_for_timeout(20_000)  # drawn in full resolution
+                data = np.frombuffer(page.screenshot(), np.uint8)
+                pictures.append(cv2.imdecode(data, cv2.IMREAD_COLOR))
+                page.close()
+    cv2.imwrite(str(HERE / "viewers.jpg"), np.concatenate(pictures, axis=1), [cv2.IMWRITE_JPEG_QUALITY, 82])
+
+
 def open_page(browser: Browser, url: str, width: int, height: int, theme: Literal["light", "dark"]) -> Page:
     """A page in a viewport of that size; on a phone with two device pixels per pixel."""
     size: Any = {"width": width, "height": height}
@@ -78,6 +117,9 @@ def main() -> None:
     """The program."""
     if sys.argv[1:2] == ["--model"]:
         take_model_picture(Path(sys.argv[2]), sys.argv[3])
+        return
+    if sys.argv[1:2] == ["--viewers"]:
+        take_viewers_picture(Path(sys.argv[2]))
         return
     listener = server.listen("127.0.0.1", 0)
     running = server.make_server(Path(sys.argv[1]), listener, None)

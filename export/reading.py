@@ -1,4 +1,4 @@
-"""Models in the formats of others: SOG, SPZ and compressed PLY, besides the PLY of every trainer."""
+"""Models in the formats of others: SOG, SPZ and compressed PLY, and PLYs that were turned for viewers."""
 
 import zipfile
 from pathlib import Path
@@ -11,7 +11,7 @@ from panolog.export.spz import read_spz
 from panolog.scene.errors import FormatError
 from panolog.scene.files import StrPath
 from panolog.scene.gaussians import concatenate
-from panolog.scene.ply import write_ply
+from panolog.scene.ply import read_ply, write_ply
 
 _HEAD = 4096  # bytes that say what a file is
 _SPZ = (b"\x1f\x8b", b"NGSP")  # gzip, and version 4
@@ -43,9 +43,15 @@ def read_model(path: Path) -> Splats:
 def convert_to_ply(path: Path, output: StrPath, frame: Frame, *, exact: bool = False) -> None:
     """Writes a model of `read_model` as a PLY, with the sky that is in a file next to it (`sky_of`).
 
-    Args: frame, that of the file, which the PLY is turned back from; exact, `Gaussians.exact`.
-    Raises FormatError as `read_model`; OSError if the PLY cannot be written.
+    Args: frame, that of the file, which the PLY is turned back from; exact, `Gaussians.exact` where it is not
+    known from a PLY.
+    Raises FormatError as `read_model`; PlyError if a PLY is damaged; OSError if the PLY cannot be written.
     """
+    if is_ply(path):
+        found = read_ply(path)
+        back = Splats.of(found).turned(frame.inverse).gaussians(exact=found.exact)
+        write_ply(output, back.with_tensors(back.tensors(), sky=found.sky))
+        return
     model = read_model(path).turned(frame.inverse).gaussians(exact=exact)
     sky = sky_of(path)
     if path.suffix == sky.suffix and sky.is_file():

@@ -19,6 +19,7 @@ Part = Literal["scene", "sky", "all"]
 REST = (0, 3, 8, SH_REST)  # coefficients of one channel beyond degree 0, by degree
 ROWS = 65_536  # of a piece
 _INSIDE = 0.999  # of a reach, which a model that was larger has
+_SKY = 20.0  # times as far as the scene reaches: viewers sort by 16 bits of the largest distance
 _LIMIT = (
     30.0  # of logarithms, so that an opacity of 1 and a size of 0, as other trainers have them, are finite
 )
@@ -163,6 +164,23 @@ class Selection:
         return np.asarray(keep & {"scene": scene, "sky": ~scene, "all": True}[self.part])
 
 
+@dataclass(frozen=True)
+class Ball:
+    """What is scaled around a centre, in the coordinates of a model."""
+
+    center: tuple[float, float, float]
+    factor: float
+
+    def of(self, splats: Splats) -> Splats:
+        """Splats, so many times as far from the centre and as large: from there they look the same."""
+        center = np.array(self.center, np.float32)
+        return replace(
+            splats,
+            means=center + (splats.means - center) * np.float32(self.factor),
+            scales=splats.scales + np.float32(np.log(self.factor)),
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class ModelSource:
     """What is selected of a model in a PLY of this program or of other trainers, in an exported frame."""
@@ -171,6 +189,7 @@ class ModelSource:
     selection: Selection = field(default_factory=Selection)
     frame: Frame = field(default_factory=Frame)
     scale: float = 1.0  # exported units, such as metres, of one of the model
+    sky: Ball | None = None  # where the sky is moved, in the coordinates of the model; None = where it is
     count: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -184,7 +203,25 @@ class ModelSource:
 
     def part(self, part: Part) -> "ModelSource":
         """The same model, choice and frame, of another part."""
-        return ModelSource(self.path, replace(self.selection, part=part), self.frame, self.scale)
+        return replace(self, selection=replace(self.selection, part=part))
+
+    def with_near_sky(self) -> "ModelSource":
+        """The same, for viewers: with a sky that is at most `_SKY` times as far as the scene.
+
+        From the middle it looks the same; as one walks, clouds move.
+        """
+        sky, scene = (replace(self.part(part), sky=None)._means() for part in ("sky", "scene"))
+        if not len(sky) or not len(scene):
+            return self
+        center = sky.mean(axis=0)
+        radius, far = (np.linalg.norm(means - center, axis=1) for means in (sky, scene))
+        factor = _SKY * float(far.max()) / float(radius.max())
+        x, y, z = center.tolist()
+        return self if factor >= 1 else replace(self, sky=Ball((x, y, z), factor))
+
+    def _means(self) -> Floats:
+        """(N, 3) positions in the coordinates of the model."""
+        return np.concatenate([np.zeros((0, 3), np.float32), *(it.means for it in self._selected())])
 
     def within(self, reach: float, size: float) -> "ModelSource":
         """The same, made smaller around the origin of its frame until it fits: from there it looks the same.
@@ -207,6 +244,8 @@ class ModelSource:
         """In the coordinates of the model."""
         for gaussians in read_ply_chunks(self.path, ROWS):
             piece, scene = Splats.of(gaussians), np.arange(len(gaussians)) < len(gaussians) - gaussians.sky
+            if self.sky is not None and not scene.all():
+                piece = Splats.joined([piece.select(scene), self.sky.of(piece.select(~scene))])
             chosen = piece.select(self.selection.keeps(piece, scene))
             if len(chosen):
                 yield chosen

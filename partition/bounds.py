@@ -4,11 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from panolog.scene.errors import InputError
 
 _LEAST = 1e-6  # of an axis over the longest one: contraction divides by it
+_FEWEST = 8  # cameras among which spots and strays are looked for
+_SPOT, _AT_SPOT = 5.0, 32  # baselines within which cameras may stand at one spot, and how many are looked at
+_APART = 20.0  # baselines that spots are from each other, or they are none
+_STRAY, _STRAYS = 20.0, 1 / 8  # times how far most cameras are from the middle; the largest share of cameras
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +49,50 @@ class Aabb:
 def baseline(centers: ArrayLike) -> float:
     """Median distance of a camera to its nearest neighbour, b̂ (eq. 8).
 
-    Args: centers (K, 3) camera centres in world units. World units; 0 if most cameras share a position.
+    Where most cameras stand at one spot with a few others, as on a tripod that took several pictures, b̂ is
+    that of the spots: eq. 8 would take the play of the tripod for the baseline.
+
+    Args: centers (K, 3) camera centres in world units. World units; 0 if all cameras share a position.
     Raises InputError with fewer than two cameras, ValueError if a centre is not finite.
     """
     points = _checked(centers)
     if len(points) < 2:
         raise InputError("the scene has fewer than two cameras: distances between cameras need at least two")
+    nearest = _nearest(points)
+    spots = _spots(points, nearest)
+    apart = nearest if spots is None else _nearest(spots)
+    return apart if apart >= _APART * nearest else nearest
+
+
+def strays(centers: ArrayLike) -> NDArray[np.bool_]:
+    """(K,) which cameras are so far away from all others that their positions cannot be meant.
+
+    Args: centers (K, 3). Raises ValueError if one is not finite.
+    """
+    points = _checked(centers)
+    if len(points) < _FEWEST:
+        return np.zeros(len(points), np.bool_)
+    reach = np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.75)
+    alone: NDArray[np.bool_] = cKDTree(points).query(points, k=2)[0][:, 1] > _STRAY * reach
+    return alone if alone.mean() <= _STRAYS else np.zeros_like(alone)
+
+
+def _nearest(points: NDArray[np.float64]) -> float:
     nearest, _ = cKDTree(points).query(points, k=2)
     return float(np.median(nearest[:, 1]))  # the first is the camera itself, or another at its place
+
+
+def _spots(points: NDArray[np.float64], nearest: float) -> NDArray[np.float64] | None:
+    """(S, 3) a camera of each spot; None if cameras (K, 3), `nearest` apart, do not stand at spots."""
+    count = len(points)
+    if count < _FEWEST:
+        return None
+    distances, others = cKDTree(points).query(points, k=min(_AT_SPOT, count))
+    row, column = np.nonzero(distances <= _SPOT * nearest)
+    linked = coo_array((np.ones(len(row)), (row, others[row, column])), (count, count))
+    spots, spot = connected_components(linked, directed=False)
+    _, first, sizes = np.unique(spot, return_index=True, return_counts=True)
+    return points[first] if spots >= 3 and count <= 4 * spots and 2 * sizes.max() <= count else None
 
 
 def margin(centers: ArrayLike, rho_tri: float) -> float:
@@ -70,10 +112,11 @@ def aabb(centers: ArrayLike, rho_tri: float, aspect: float = 0.0) -> Aabb:
     column of cells at least as far as a quarter of the longest axis on both sides of the centroid.
 
     Args: centers (K, 3) training camera centres in world units; aspect, how long each axis of the box is at
-    least, over the longest one. Raises InputError with fewer than two cameras
-    or if all are at one position, ValueError if a centre is not finite.
+    least, over the longest one. `strays` are left out. Raises InputError with fewer than two cameras or if
+    all are at one position, ValueError if a centre is not finite.
     """
     points = _checked(centers)
+    points = points[~strays(points)]
     centroid = points.mean(axis=0)
     half = np.abs(points - centroid).max(axis=0, initial=0.0) + margin(points, rho_tri)
     largest = half.max()

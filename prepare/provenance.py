@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import InputError, SceneError
-from panolog.scene.image_files import ImageInfo, decode, decode_mask, layer_record, not_a_panorama, read_info
+from panolog.scene.image_files import decode, decode_mask, layer_record, not_a_panorama, read_info
+from panolog.scene.pictures.headers import ImageInfo
 
 MAX_BYTES = 2**29  # of pixels, 18,900 x 9,450 in colour: more than any camera has
 

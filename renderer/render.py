@@ -166,6 +166,14 @@ def encode_jpeg(image: NDArray[np.uint8], widest: int) -> bytes:
     return bytes(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
 
 
+def hatched(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W, 3) an image, pale and under diagonal lines: what is not rendered."""
+    height, width = image.shape[:2]
+    period = max(width // 48, 6)
+    lines = np.add.outer(np.arange(height), np.arange(width)) % period < period // 3
+    return np.where(lines[..., None], 232, image // 3 + 96).astype(np.uint8)
+
+
 def render_panorama(
     gaussians: Gaussians,
     rotation: NDArray[np.float64],

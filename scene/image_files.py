@@ -5,7 +5,6 @@ import re
 import struct
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import ImageError, SceneError
+from panolog.scene.pictures.headers import ImageInfo, read_header
 from panolog.scene.pictures.kinds import describe_picture, kind_of
 from panolog.scene.pictures.profiles import jpeg_segments, to_srgb
 from panolog.scene.stores.outline import whole
@@ -42,21 +42,10 @@ _NO_ALPHA = b"BM"  # BMP: its fourth channel is undefined in practice
 _TIFF = (b"II", b"MM")
 
 
-@dataclass(frozen=True)
-class ImageInfo:
-    """The header of an image file."""
-
-    width: int
-    height: int
-    bits: int  # of one channel
-    channels: int
-    alpha: bool = False  # whether some of its pixels may be transparent
-
-
 def read_info(path: Path) -> ImageInfo:
     """The size of an image, and that its file is complete.
 
-    JPEG and PNG are read at their two ends only; any other format is decoded.
+    JPEG, PNG, WebP and usual TIFFs are read at their ends only; any other format is decoded.
 
     Raises:
         SceneError: the file is missing, truncated or no image.
@@ -70,6 +59,8 @@ def read_info(path: Path) -> ImageInfo:
             return _png(path, file)
         if magic.startswith(_JPEG):
             return _jpeg(path, file)
+        if info := read_header(file):
+            return info
     pixels = decode(path, cv2.IMREAD_UNCHANGED)
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     alpha = channels == 4 and not magic.startswith(_NO_ALPHA)
@@ -221,6 +212,9 @@ def resize_used(used: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bo
 def _opacity(path: Path, data: bytes) -> NDArray[np.uint8] | None:
     """The alpha channel (H, W) of what was read from `path`, 255 opaque; None if all of it is opaque."""
     if data.startswith((_JPEG, _NO_ALPHA)) or (data.startswith(_PNG) and not _png_alpha(BytesIO(data))):
+        return None
+    header = read_header(BytesIO(data))
+    if header is not None and not header.alpha:
         return None
     pixels = _decoded(path, data, cv2.IMREAD_UNCHANGED)
     if pixels.ndim != 3 or pixels.shape[2] != 4:

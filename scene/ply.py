@@ -4,7 +4,8 @@ Columns, all float32, little-endian: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0
 coefficients of red, then of green, then of blue), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z).
 Sky Gaussians are last; the header comment `panolog sky N` says how many they are. A comment
 `panolog offset X Y Z` is what to add to positions for those of the scene's COLMAP model. A comment
-`panolog projection exact` says that they were trained along the rays of pixels (`Gaussians.exact`).
+`panolog projection exact` says that they were trained along the rays of pixels (`Gaussians.exact`), and
+`panolog frame export` that they were turned for viewers. Such files may have fewer f_rest columns.
 """
 
 import os
@@ -20,7 +21,7 @@ from panolog.scene.errors import PlyError
 from panolog.scene.files import StrPath, atomic, write_all
 from panolog.scene.gaussians import SH_REST, Gaussians
 from panolog.scene.model import NO_OFFSET, Vector
-from panolog.scene.ply_table import Table, exact_of, offset_of, read_table, sky_of
+from panolog.scene.ply_table import EXPORTED, Table, exact_of, offset_of, read_table, sky_of
 
 CHUNK = 16_384  # rows in memory at a time: 4 MB
 COLUMNS = (
@@ -61,6 +62,7 @@ def write_ply_parts(
     sky: int,
     offset: Vector = NO_OFFSET,
     exact: bool = False,
+    exported: int | None = None,
 ) -> None:
     """Writes the Gaussians of all parts, in order, atomically.
 
@@ -71,20 +73,22 @@ def write_ply_parts(
         sky: how many of them, at the end, are sky.
         offset: as in `write_ply`.
         exact: `Gaussians.exact` of all of them.
+        exported: degree of the spherical harmonics of a file for viewers, to which they were turned.
 
     Raises:
         ValueError: the parts are not `count` rows, or their sky is not the last `sky` rows.
         OSError: the file cannot be written.
     """
+    rest = SH_REST if exported is None else _REST_OF_DEGREE[exported]
     with atomic(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(count, sky, offset, exact))
+        file.write(_header(count, sky, offset, exact, rest, exported=exported is not None))
         written = 0
         for part in parts:
             first_sky = written + len(part) - part.sky
             if first_sky != max(written, min(written + len(part), count - sky)):
                 raise ValueError(f"sky is not the last {sky} of {count} Gaussians")
             for start in range(0, len(part), CHUNK):
-                file.write(_encode(part, slice(start, start + CHUNK)).tobytes())
+                file.write(_encode(part, slice(start, start + CHUNK), rest).tobytes())
             written += len(part)
         if written != count:
             raise ValueError(f"{written} Gaussians were given, {count} were announced")
@@ -195,6 +199,11 @@ def ply_exact(path: Path) -> bool:
     return exact_of(_open(path)[0])
 
 
+def ply_exported(path: Path) -> bool:
+    """Whether it was turned for viewers. Raises PlyError as `ply_header`."""
+    return EXPORTED in _open(path)[0].comments
+
+
 def describe_faults(path: Path) -> list[str]:
     """What is wrong with the Gaussians of a PLY, one line for each kind. Raises PlyError as `ply_header`."""
     table, _, _ = _open(path)
@@ -215,15 +224,19 @@ def describe_faults(path: Path) -> list[str]:
     return lines
 
 
-def _header(count: int, sky: int, offset: Vector, exact: bool) -> bytes:
+def _header(
+    count: int, sky: int, offset: Vector, exact: bool, rest: int = SH_REST, *, exported: bool = False
+) -> bytes:
+    unused = {f"f_rest_{i}" for i in range(3 * rest, 3 * SH_REST)}
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         f"comment panolog sky {sky}",
         *([f"comment panolog offset {' '.join(map(repr, offset))}"] if any(offset) else []),
         *(["comment panolog projection exact"] if exact else []),
+        *([f"comment {EXPORTED}"] if exported else []),
         f"element vertex {count}",
-        *(f"property float {name}" for name in COLUMNS),
+        *(f"property float {name}" for name in COLUMNS if name not in unused),
         "end_header\n",
     ]
     return "\n".join(lines).encode()
@@ -248,8 +261,8 @@ def _copy_some(table: Table, rows: NDArray[np.int64], file: FileIO) -> None:
         write_all(file, memoryview(records[rows[start : start + CHUNK]].tobytes()))
 
 
-def _encode(part: Gaussians, rows: slice) -> NDArray[np.float32]:
-    """(n, 62) rows as they stand in the file."""
+def _encode(part: Gaussians, rows: slice, rest: int) -> NDArray[np.float32]:
+    """(n, 17 + 3 rest) rows as they stand in the file, with `rest` coefficients beyond degree 0."""
     piece = {name: tensor[rows].detach().cpu().to(torch.float32) for name, tensor in part.tensors().items()}
     n = len(piece["means"])
     table = torch.cat(
@@ -257,7 +270,7 @@ def _encode(part: Gaussians, rows: slice) -> NDArray[np.float32]:
             piece["means"],
             torch.zeros(n, 3),
             piece["sh0"].reshape(n, 3),
-            piece["shN"].transpose(1, 2).reshape(n, 3 * SH_REST),
+            piece["shN"][:, :rest].transpose(1, 2).reshape(n, 3 * rest),
             piece["opacities"].reshape(n, 1),
             piece["scales"],
             piece["quats"],

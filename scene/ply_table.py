@@ -20,6 +20,7 @@ _TYPES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 _ORDER = {"binary_little_endian": "<", "binary_big_endian": ">"}
+EXPORTED = "panolog frame export"  # the comment of a model that was turned for viewers
 _LONGEST_LINE = 4096  # bytes of a header's line
 _MOST_LINES = 1000  # of a header
 

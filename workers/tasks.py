@@ -72,10 +72,10 @@ class TaskId:
         return self.stage.value if self.index is None else f"{self.stage.value}/{self.index:03d}"
 
     def __lt__(self, other: "TaskId") -> bool:
-        return self._key < other._key
+        return self.order < other.order
 
     @property
-    def _key(self) -> tuple[int, int]:
+    def order(self) -> tuple[int, int]:
         return _ORDER[self.stage], self.index or 0
 
     @property
@@ -91,6 +91,7 @@ class TaskId:
         return TaskId(Stage.DISTRICT, index)
 
     @staticmethod
+    @lru_cache(maxsize=2**15)
     def block(index: int) -> "TaskId":
         """The training of a block."""
         return TaskId(Stage.BLOCK, index)

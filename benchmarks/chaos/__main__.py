@@ -10,6 +10,7 @@ with the bytes of the undisturbed one, and each fault may cost as much as `fault
 """
 
 import argparse
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -30,6 +31,7 @@ HEAD = (
 )
 _FAULTS = f"all, kill, {', '.join(Kind)}"
 KILLS = (Kind.DRIVER, Kind.WORKER, Kind.RAYLET)
+_HOST = (Kind.NET, Kind.VERSION)  # need a host of its own for the second node
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Outcome:
 
     runs: tuple[Run, ...]  # the undisturbed one first
     interval: float  # seconds between two checkpoints of the undisturbed run, at most
-    cable: bool = True  # whether the network could be disturbed
+    cable: bool = True  # whether the second node had a host of its own
 
     @property
     def undisturbed(self) -> Run:
@@ -74,12 +76,13 @@ class Outcome:
 
 def chaos(root: Path, runs: int, seed: int, kinds: Sequence[Kind]) -> Outcome:
     """All runs, in the folder `root`. Raises RunError if the cluster or the undisturbed run fails."""
+    root.mkdir(parents=True, exist_ok=True)
     with two_nodes(root) as cluster:
         town = ChaosRuns(cluster, root)
         done = [town.run(0, [])]
         if not done[0].digest:
             raise RunError(f"the undisturbed run failed: {done[0].end}")
-        kinds = [kind for kind in kinds if kind != Kind.NET or cluster.cable]
+        kinds = [kind for kind in kinds if kind not in _HOST or cluster.cable]
         for number, plan in enumerate(plans(runs, seed, done[0].seconds, kinds), 1):
             done.append(town.disturbed(number, plan))
             print(_line(done[-1], runs), file=sys.stderr, flush=True)
@@ -111,6 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.quick:
         options.runs = 2
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that all contexts end
 
     def work() -> report.Report:
         with tempfile.TemporaryDirectory(prefix="chaos-runs-") as folder:
@@ -118,8 +122,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         failures = outcome.failures()
         seconds = outcome.undisturbed.seconds
         first = f"undisturbed {seconds:.1f} s, checkpoint interval {outcome.interval:.1f} s"
-        if Kind.NET in options.faults and not outcome.cable:
-            first += "\n\nskipped net: it needs root and /dev/net/tun"
+        if not outcome.cable and (skipped := [kind for kind in _HOST if kind in options.faults]):
+            first += f"\n\nskipped {', '.join(skipped)}: without root and /dev/net/tun"
         parts = [
             first,
             report.markdown(HEAD, list(outcome.rows())),

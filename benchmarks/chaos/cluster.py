@@ -3,13 +3,15 @@
 import socket
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import psutil
 
+import panolog.workers
+from benchmarks.chaos import cards
 from benchmarks.chaos.cable import Cable, laid
 from benchmarks.chaos.shim import Control, build
 from panolog.scene.errors import RunError
@@ -20,6 +22,7 @@ _NODES = HEAD, SECOND
 _TMP = "/tmp"  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _NO_WORK = ("ray::IDLE", "ray::Agent", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
 _TIMEOUT_S = 600.0  # for a node to start, also on a busy machine
+_AS_NICE = {"RAY_worker_niceness": "0"}  # as this process: nicer ones starve next to other programs
 _POLL_S = 0.05  # between two checks of a process table or a port
 
 
@@ -49,7 +52,7 @@ class LocalCluster:
         self._folder = folder
         self.cable = cable
         (self._port,) = free_ports(1)
-        self._environment = cluster_environment()
+        self._environment = cluster_environment() | _AS_NICE
         self._library = build(folder)
         self.controls = {name: Control(folder / f"{name}.control") for name in GROUPS}
         self._nodes: dict[str, subprocess.Popen[bytes]] = {}
@@ -95,6 +98,27 @@ class LocalCluster:
         """The head's record of the cluster; without it, the head ends."""
         return self._process(HEAD, "gcs_server")
 
+    def other_sources(self) -> Callable[[], None]:
+        """Restarts the second node with other sources, which only its host sees. Returns what ends it."""
+        assert self.cable is not None
+        enter, path = self.cable.enter, Path(panolog.workers.__file__).resolve()
+        other = self._folder / "other.py"
+        other.write_text(f"{path.read_text()}# another version\n")
+        subprocess.run([*enter, "mount", "--bind", other, path], check=True)
+        self._restart()
+
+        def undo() -> None:
+            subprocess.run([*enter, "umount", path], check=True)
+            self._restart()
+
+        return undo
+
+    def _restart(self) -> None:
+        """Ends the second node at once; `keep` starts it again."""
+        if raylet := self.raylet():
+            raylet.kill()
+            self._nodes[SECOND].wait()
+
     def busy_worker(self, choice: float) -> psutil.Process | None:
         """A worker with a task or an actor, on any node. Args: choice in [0, 1), which of several."""
         workers = [process for process in psutil.Process().children(recursive=True) if _busy(process)]
@@ -110,7 +134,7 @@ class LocalCluster:
     def _start(self, name: str) -> None:
         host = self._host
         options = ["--head", f"--port={self._port}", f"--temp-dir={self._folder}"]
-        options.append("--include-dashboard=false")
+        options += ["--include-dashboard=false", f"--num-gpus={len(cards.CARDS)}"]
         enter: Sequence[str] = ()
         if name != HEAD:
             options = [f"--address={self.address}"]

@@ -30,8 +30,8 @@ from panolog.workers.tasks import TaskId
 
 Done = ModelSaved | ScoresSaved | PlanSaved | Merged | MeasuresSaved | EvaluationSaved
 Span = tuple[float, float]  # beginning and end, seconds since the epoch
-_OF_DRIVER = (Kind.DRIVER, Kind.GCS)  # end all tasks
-_OF_READS = (Kind.BADNODE, Kind.EIO)  # end a task when it next reads
+_OF_DRIVER = (Kind.DRIVER, Kind.GCS, Kind.EDIT)  # end all tasks
+_OF_READS = (Kind.BADNODE, Kind.EIO, Kind.CARD, Kind.VERSION)  # end a task when it next reads or starts
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,8 @@ def longest_unsaved(history: Sequence[Stored]) -> float:
 def _following(faults: Sequence[Fault], number: int) -> float:
     """When the next fault came that ends tasks in the same way."""
     reads = faults[number].kind in _OF_READS
-    others = (fault.time for fault in faults[number + 1 :] if (fault.kind in _OF_READS) == reads)
+    later = (it for it in faults[number + 1 :] if it.kind == Kind.VERSION or (it.kind in _OF_READS) == reads)
+    others = (fault.time for fault in later)
     return next(others, float("inf"))
 
 
@@ -141,7 +142,8 @@ def _of_reads(history: Sequence[Stored], fault: Fault, meanwhile: Sequence[Store
     redone, spans = 0.0, []
     for number, stored in enumerate(meanwhile):
         record = stored.record
-        if isinstance(record, TaskFailed) and record.kind != Failure.LOST:
+        lost = isinstance(record, TaskFailed) and record.kind == Failure.LOST and fault.kind != Kind.VERSION
+        if isinstance(record, TaskFailed) and not lost:
             tasks.append(record.task)
             redone += stored.time - _saved(_until(history, stored), record.task, stored.time)
             starts = (s.time for s in meanwhile[number:] if not _follows_alone(s.record))

@@ -1,6 +1,7 @@
 """The faults that the benchmark knows: what each does to a run, for how long, and what it may cost."""
 
 import errno
+import json
 import signal
 import subprocess
 import sys
@@ -13,14 +14,17 @@ from random import Random
 import psutil
 from typing_extensions import assert_never
 
+from benchmarks.chaos import cards
 from benchmarks.chaos.cable import Cable
-from benchmarks.chaos.cluster import DRIVER, GROUPS, HEAD, SECOND, LocalCluster
+from benchmarks.chaos.cluster import GROUPS, HEAD, SECOND, LocalCluster
 from benchmarks.chaos.shim import READ, WRITE, Rule
 from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.state import replay
+from panolog.orchestrator.runs.store import read_milestones
 from panolog.workers.tasks import StrEnum
 
-SILENCE_S = 10.0  # deadlines.message; a worker reports every second
-HELLO_S = 30.0  # deadlines.hello, in which a worker starts also on a busy machine
+SILENCE_S = 30.0  # deadlines.message; a worker reports every second
+HELLO_S = 120.0  # deadlines.hello, in which a worker starts also on a busy machine
 RETRY_S = 1.0  # disk.retry
 QUARANTINE = 3  # quarantine.failures
 DAY_S = 86_400  # by which a clock jumps
@@ -62,6 +66,9 @@ class Kind(StrEnum):
     VANISH = "vanish"  # the run folder is elsewhere for a while, as where a disk is unmounted
     MIRROR = "mirror"  # SIGKILL for what copies the run into its store
     STORE = "store"  # each read and write of the store takes longer
+    CARD = "card"  # every task on one of the head's two (simulated) GPUs fails at once until the run ends
+    EDIT = "edit"  # run.json gets another value, and SIGKILL for the driver; the file is restored by hand
+    VERSION = "version"  # the second node restarts with other sources until the run ends
 
 
 @dataclass(frozen=True)
@@ -91,6 +98,9 @@ LIMITS = {
     Kind.VANISH: Limits(RETRY_S + _START_S, (3.0, 6.0)),
     Kind.MIRROR: Limits(_START_S),
     Kind.STORE: Limits(_START_S, (4.0, 8.0)),
+    Kind.CARD: Limits(QUARANTINE * _START_S),
+    Kind.EDIT: Limits(_SUPERVISOR_S + 2 * _START_S),
+    Kind.VERSION: Limits((1 + QUARANTINE) * _START_S),
 }
 
 
@@ -155,24 +165,16 @@ def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
     match planned.kind:
         case Kind.DRIVER | Kind.MIRROR | Kind.WORKER | Kind.RAYLET | Kind.HANG | Kind.PAUSE | Kind.GCS:
             return _signal(planned, victim)
-        case Kind.BADNODE:
-            folder = cluster.copies or victim.scene
-            return "bad node", _fail(cluster, (SECOND,), Rule(folder, READ, errno.EIO))
-        case Kind.EIO:
-            error = errno.EIO if choice < 1 / 2 else errno.ESTALE
-            group = SECOND if int(choice * 4) % 2 else HEAD
-            folder = cluster.copies if group == SECOND and cluster.copies else victim.scene
-            return f"{errno.errorcode[error]} {group}", _fail(cluster, (group,), Rule(folder, READ, error, 1))
+        case Kind.BADNODE | Kind.EIO | Kind.CARD:
+            return _unreadable(planned, victim)
         case Kind.ENOSPC:
             if not RunFolder(victim.root).presence.exists():
                 return None  # on a full disk no run has to begin
             return f"disk full {lasts:g} s", _fail(cluster, GROUPS, Rule(victim.root, WRITE, errno.ENOSPC))
-        case Kind.SLOW:
-            rules = (Rule(folder, READ | WRITE, delay=_DELAY_S) for folder in (victim.scene, victim.root))
-            return f"slow disk {lasts:g} s", _fail(cluster, GROUPS, *rules)
-        case Kind.STORE:
-            rule = Rule(victim.store, READ | WRITE, delay=_DELAY_S)
-            return f"slow store {lasts:g} s", _fail(cluster, (DRIVER,), rule)
+        case Kind.SLOW | Kind.STORE:
+            slow = (victim.store,) if planned.kind == Kind.STORE else (victim.scene, victim.root)
+            rules = (Rule(folder, READ | WRITE, delay=_DELAY_S) for folder in slow)
+            return f"{planned.kind} {lasts:g} s", _fail(cluster, GROUPS, *rules)
         case Kind.LOCKED:
             return _lock(f"lock {lasts:g} s", RunFolder(victim.root).database)
         case Kind.NET:
@@ -180,7 +182,9 @@ def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
         case Kind.CLOCK:
             jump = DAY_S if choice < 1 / 2 else -DAY_S
             return f"clock {jump:+d} s", _move_clocks(cluster, jump)
-        case Kind.TERMINAL | Kind.DAMAGE | Kind.VANISH:
+        case Kind.VERSION:
+            return "other version", cluster.other_sources()
+        case Kind.TERMINAL | Kind.DAMAGE | Kind.VANISH | Kind.EDIT:
             return _of_run(planned, victim)
         case _:
             assert_never(planned.kind)
@@ -212,6 +216,20 @@ def _signal(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
     return f"{what} {planned.lasts:g} s" if planned.lasts else what, undo
 
 
+def _unreadable(planned: Planned, victim: Victim) -> tuple[str, Undo]:
+    """Panoramas, or the file of a GPU, cannot be read on a node: once or for good."""
+    cluster, choice = victim.cluster, planned.choice
+    group = SECOND if planned.kind == Kind.BADNODE or int(choice * 4) % 2 else HEAD
+    folder = cluster.copies if group == SECOND and cluster.copies else victim.scene
+    if planned.kind == Kind.BADNODE:
+        return "bad node", _fail(cluster, (SECOND,), Rule(folder, READ, errno.EIO))
+    if planned.kind == Kind.CARD:
+        card = victim.root.with_name(cards.CARDS[int(choice * 2)])
+        return f"broken {card.name}", _fail(cluster, (HEAD,), Rule(card, READ, errno.EIO))
+    error = errno.EIO if choice < 1 / 2 else errno.ESTALE
+    return f"{errno.errorcode[error]} {group}", _fail(cluster, (group,), Rule(folder, READ, error, 1))
+
+
 def nothing() -> None:
     """What ends a fault that stays, or has ended."""
 
@@ -223,6 +241,8 @@ def _of_run(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
         return "dead terminal", nothing
     if planned.kind == Kind.DAMAGE:
         return _damage(planned, victim)
+    if planned.kind == Kind.EDIT:
+        return _edit(victim)
     return _move_away(f"no folder {planned.lasts:g} s", victim.root)
 
 
@@ -241,6 +261,21 @@ def _damage(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
     with suppress(psutil.NoSuchProcess):
         worker.kill()
     return "damage checkpoints, kill worker", nothing
+
+
+def _edit(victim: Victim) -> tuple[str, Undo] | None:
+    """Changes run.json once its settings are recorded, and kills the driver; its end restores the file."""
+    folder = RunFolder(victim.root)
+    if victim.driver is None or not folder.preflight.exists():
+        return None
+    if not replay(read_milestones(folder.database)).prepared:
+        return None
+    text = folder.info.read_text()
+    info = json.loads(text)
+    info["config"]["iterations"] += 100
+    victim.driver.kill()
+    folder.info.write_text(json.dumps(info))
+    return "edit run.json, kill driver", lambda: folder.info.write_text(text)
 
 
 def _move_away(what: str, root: Path) -> tuple[str, Undo] | None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -11,22 +12,23 @@ from shutil import rmtree
 
 import psutil
 
-from benchmarks.chaos import faults
+from benchmarks.chaos import cards, faults
 from benchmarks.chaos.cluster import DRIVER, LocalCluster
 from benchmarks.chaos.fault_costs import Fault, FaultCost, fault_costs, true_times
-from benchmarks.chaos.faults import HELLO_S, QUARANTINE, RETRY_S, SILENCE_S, Planned, Undo, Victim
-from benchmarks.runs import BIN, history
+from benchmarks.chaos.faults import HELLO_S, QUARANTINE, RETRY_S, SILENCE_S, Kind, Planned, Undo, Victim
+from benchmarks.runs import history
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.synthetic.make import make_town
 
 SETTINGS = (
-    *("--blocks", "2x2x1", "--iterations", "200", "--width", "128", "--device", "cpu"),
+    *("--blocks", "2x2x1", "--iterations", "200", "--width", "128"),
     *("--set", "sky.count=500", "--set", "preview.every=100"),
     *("--set", "checkpoint.every=50", "--set", "checkpoint.share=1"),
     *("--set", f"deadlines.message={SILENCE_S}", "--set", f"deadlines.hello={HELLO_S}"),
     *("--set", f"quarantine.failures={QUARANTINE}", "--set", f"disk.retry={RETRY_S}"),
 )
-_TIMEOUT_S = 300.0  # for a run
+_TIMEOUT_S = 3600.0  # for a run, also on a busy machine
+_REFUSED = "exit code 2:"  # as `resume` does where run.json is not as it was
 _POLL_S = 0.1  # between two looks at the run
 
 
@@ -68,6 +70,15 @@ class _Causing:
                 self.undoes[number]()
                 self.undoes[number] = faults.nothing
 
+    def restored(self) -> bool:
+        """Does by hand what a fault leaves to do, once; whether there was one."""
+        edits = [i for i, fault in enumerate(self.caused) if fault.kind == Kind.EDIT and not fault.until]
+        for number in edits:
+            self.undoes[number]()
+            self.undoes[number] = faults.nothing
+            self.caused[number] = replace(self.caused[number], until=time.time())
+        return bool(edits)
+
     def end(self) -> None:
         """Ends all faults."""
         for undo in self.undoes:
@@ -80,6 +91,7 @@ class ChaosRuns:
     def __init__(self, cluster: LocalCluster, root: Path) -> None:
         self._cluster = cluster
         self._root = root
+        cards.make(root)
         self._scene = make_town(root / "town", panoramas=12, width=128, points=1000)
 
     def run(self, number: int, plan: Sequence[Planned]) -> Run:
@@ -87,13 +99,18 @@ class ChaosRuns:
         folder = self.folder(number)
         self._cluster.wait()
         began = time.time()
-        supervisor, terminal = self._launch(folder)
         causing = _Causing(list(plan), began)
+        simulated = any(planned.kind == Kind.CARD for planned in plan)
+        program = ("benchmarks.chaos.cards", str(self._root)) if simulated else ("panolog.orchestrator.cli",)
+        device = "cuda" if simulated else "cpu"
+        arguments = ["run", str(self._scene), *SETTINGS, "--device", device, "-o"]
         try:
-            end = self._watch(supervisor, terminal, causing, folder)
+            while (end := self._attend([*program, *arguments], causing, folder)).startswith(_REFUSED):
+                if not causing.restored():
+                    break
+                arguments = ["resume"]
         finally:
             causing.end()
-            terminal.wait()
         ended, paths = time.time(), RunFolder(folder)
         digest = "" if end else hashlib.sha256(paths.point_cloud.read_bytes()).hexdigest()
         records = true_times(history(folder), began) if paths.database.exists() else []
@@ -114,23 +131,34 @@ class ChaosRuns:
     def _store(self, folder: Path) -> Path:
         return self._root / "store" / folder.name
 
-    def _launch(self, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+    def _launch(
+        self, command: Sequence[str], folder: Path
+    ) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         """The supervisor of a run, and what writes its output to a log."""
-        command = [str(BIN / "panolog"), "run", str(self._scene), "-o", f"file://{self._store(folder)}"]
-        command += ["--local", str(folder), *SETTINGS]
-        command += ["--supervise", "--address", self._cluster.address]
+        given = [*command, f"file://{self._store(folder)}", "--local", str(folder)]
+        given += ["--supervise", "--address", self._cluster.address]
+        environment = self._cluster.environment(DRIVER)
         with (self._root / f"{folder.name}.log").open("ab") as log:
             terminal = subprocess.Popen("cat", stdin=subprocess.PIPE, stdout=log)
         assert terminal.stdin is not None
         with terminal.stdin as output:
             supervisor = subprocess.Popen(
-                command,
-                env=self._cluster.environment(DRIVER),
+                [sys.executable, "-m", *given],
+                env={**environment, "PATH": f"{self._root}:{environment['PATH']}"},
                 stdout=output,
                 stderr=output,
                 stdin=subprocess.DEVNULL,
             )
         return supervisor, terminal
+
+    def _attend(self, command: Sequence[str], causing: _Causing, folder: Path) -> str:
+        """Runs a command to its end. Returns its error, empty if it ended well."""
+        supervisor, terminal = self._launch(command, folder)
+        try:
+            return self._watch(supervisor, terminal, causing, folder)
+        finally:
+            _end(supervisor)
+            terminal.wait()
 
     def _watch(
         self,
@@ -154,7 +182,6 @@ class ChaosRuns:
                 return ""
             lines = (self._root / f"{folder.name}.log").read_text().strip().splitlines()
             return f"exit code {code}: {lines[-1] if lines else 'no output'}"
-        _end(supervisor)
         return f"no end after {_TIMEOUT_S:.0f} s"
 
 
@@ -169,7 +196,8 @@ def _children(supervisor: subprocess.Popen[bytes]) -> tuple[psutil.Process | Non
 
 def _end(supervisor: subprocess.Popen[bytes]) -> None:
     """Ends a run that would not end."""
-    processes = [psutil.Process(supervisor.pid), *psutil.Process(supervisor.pid).children(recursive=True)]
-    for process in processes:
-        process.kill()
-    supervisor.wait()
+    if supervisor.poll() is None:
+        process = psutil.Process(supervisor.pid)
+        for one in (process, *process.children(recursive=True)):
+            one.kill()
+        supervisor.wait()

@@ -16,7 +16,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks import report
-from benchmarks.driver_scale.__main__ import Load
 from benchmarks.paper.curves import standalone
 from benchmarks.scale import cities, driver, laws, merging, models, plans
 from benchmarks.scale.page import page
@@ -59,7 +58,7 @@ class Parts:
 
     def driver(self) -> Found:
         """The driver."""
-        load = Load(12, 4, 10.0, 0.5) if self._quick else Load(10_000, 2_000, 0.2, 60.0)
+        load = driver.Load(12, 4, 10.0, 0.5) if self._quick else driver.Load(10_000, 2_000, 0.2, 60.0)
         return {"driver": asdict(driver.measure(self._disk, load))}
 
     def plans(self) -> Found:

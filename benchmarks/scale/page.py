@@ -116,6 +116,7 @@ def driver(measured: dict[str, Any]) -> str:
         ("CPU of both drivers, s", cpu),
         ("CPU of a block with its messages, ms", 1e3 * cpu / load["blocks"]),
         ("longest wait of a message, s", max(first["late"], resumed["late"])),
+        ("longest turn of the driver's loop, CPU s", max(first["turn"], resumed["turn"])),
         ("memory of a driver, peak MB", max(first["memory"], resumed["memory"])),
         ("run.db, MB", measured["database"]),
         ("`panolog status --json`, s", measured["status"]),

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import csr_array
 
-from benchmarks.driver_scale.simulated_pool import grid
 from benchmarks.processes import in_fresh_process, peak_memory
+from benchmarks.scale.simulated_pool import grid
 from panolog.orchestrator.engine.stages.partitioning import write_plan
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.partition.plan import PartitionConfig, make_plan, read_plan

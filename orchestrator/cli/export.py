@@ -37,6 +37,7 @@ Sog = Annotated[bool, _format("sog", "SOG of PlayCanvas.")]
 Web = Annotated[bool, _format("web", "Streamed SOG with a page that shows it, for any web server.")]
 Spz = Annotated[bool, _format("spz", "SPZ of Niantic.")]
 CompressedPly = Annotated[bool, _format("compressed-ply", "PLY of SuperSplat.")]
+Ply = Annotated[bool, _format("ply", "PLY of all trainers, turned upright for viewers.")]
 Glb = Annotated[bool, _format("glb", "glTF with KHR_gaussian_splatting.")]
 Tiles = Annotated[bool, _format("3dtiles", "3D Tiles for globes such as Cesium.")]
 SkyImage = Annotated[bool, _format("sky-image", "The sky as a panorama: sky.jpg and sky.exr.")]
@@ -71,6 +72,7 @@ def export(
     web: Web = False,
     spz: Spz = False,
     compressed_ply: CompressedPly = False,
+    ply: Ply = False,
     glb: Glb = False,
     tiles: Tiles = False,
     sky_image: SkyImage = False,
@@ -89,8 +91,8 @@ def export(
     """Write a model as small files for viewers, browsers, engines and globes."""
     if not is_url(source) and not Path(source).exists():
         raise InputError(f"{source}: there is neither a run nor a PLY")
-    wanted = {"sog": sog, "web": web, "spz": spz, "compressed-ply": compressed_ply, "glb": glb}
-    wanted |= {"3dtiles": tiles, "sky-image": sky_image}
+    wanted = {"sog": sog, "web": web, "spz": spz, "compressed-ply": compressed_ply, "ply": ply}
+    wanted |= {"glb": glb, "3dtiles": tiles, "sky-image": sky_image}
     box, direction = crop and _box(crop), up and _direction(up)
     with opened(source, "export") as (root, _), progress_bar("reading the model") as show:
         from panolog.export.splats import Selection

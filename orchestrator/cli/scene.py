@@ -123,6 +123,7 @@ def sfm(
     as_json: JsonOption = False,
 ) -> None:
     """Make a scene from raw panoramas or a 360° video: find poses and points."""
+    from panolog.orchestrator.runs.machines.machine import memory
     from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
     from panolog.prepare.video.frames import PARALLAX
 
@@ -139,7 +140,7 @@ def sfm(
         trajectory=trajectory,
     )
     with progress_bar("reading the panoramas", resumable=True) as show:
-        report = make_scene(source, output, settings, show)
+        report = make_scene(source, output, settings, show, memory=memory() * 3 // 4)
     print_result({"scene": str(output), **report.as_json()}, report.lines(), as_json=as_json)
     _suggest_check(output, as_json=as_json, drawn=output / "sfm.png")
 

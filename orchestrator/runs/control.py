@@ -32,7 +32,8 @@ from panolog.orchestrator.runs.records import (
     RetryRequested,
     UnpauseRequested,
 )
-from panolog.orchestrator.runs.state import RunState, Status, TaskState
+from panolog.orchestrator.runs.state import RunState, Status, TaskState, replay
+from panolog.orchestrator.runs.store import read_milestones
 from panolog.scene.errors import InputError, RunFolderError
 from panolog.scene.files import write_bytes
 from panolog.workers.tasks import StrEnum, TaskId
@@ -257,3 +258,11 @@ def _content(path: Path) -> bytes:
     if len(content) > _MAX_BYTES:
         raise ValueError(f"it has more than {_MAX_BYTES} bytes")
     return content
+
+
+def state_of(root: Path) -> RunState:
+    """That of a run now; that of no run, if it has none or cannot be read."""
+    database = RunFolder(root).database
+    with suppress(OSError, RunFolderError):
+        return replay(read_milestones(database)) if database.exists() else RunState()
+    return RunState()

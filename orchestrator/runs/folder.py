@@ -132,6 +132,11 @@ class RunFolder:
         return self.root / "web"
 
     @property
+    def page(self) -> Path:
+        """The same as one file, which opens without a server."""
+        return self.root / "view.html"
+
+    @property
     def adjusted(self) -> Path:
         """Poses and points after bundle adjustment, and the poses before; absent if they stay."""
         return self.root / "adjusted.npz"

@@ -104,6 +104,7 @@ class RunState:
 
     tasks: dict[TaskId, TaskState] = field(default_factory=dict)
     plan: tuple[BlockPlan, ...] | None = None
+    blocks: tuple[TaskId, ...] = ()  # those to train, longest first
     passes: tuple[tuple[TaskId, ...], ...] = ()  # tasks that train parts of the blocks' union once more
     measures: tuple[TaskId, ...] = ()  # shards of the evaluation; none = it is one task
     notices: dict[Noticed, None] = field(default_factory=dict)  # a set in the order of time
@@ -140,7 +141,7 @@ class RunState:
 
     def status(self, id: TaskId) -> Status:
         """How a task stands."""
-        return self.task(id).status
+        return known.status if (known := self.tasks.get(id)) else Status.WAITING
 
     def failed_blocks(self) -> tuple[int, ...]:
         """Blocks that have used up their attempts, and so keep their Stage I Gaussians."""
@@ -161,8 +162,9 @@ class RunState:
 
     def following(self, id: TaskId) -> tuple[tuple[TaskId, ...], ...]:
         """The stages from the blocks to the merge that make something of a task's model."""
-        begin = next((at for at, stage in enumerate(self.between, 1) if _has(stage, id)), 0)
-        return (*self.between[begin:], (MERGE,))
+        stages = self.between  # of a pass, which has thousands of tasks, one is found by its kind
+        has = [id in stage[:1] or (len(stage) > 1 and stage[0].stage is id.stage) for stage in stages]
+        return (*stages[has.index(True) + 1 if True in has else 0 :], (MERGE,))
 
     def joined(self, id: TaskId) -> bool:
         """Whether a task's model, or what stands for it, is already a part of another."""
@@ -189,7 +191,8 @@ def replay(records: Iterable[Stored]) -> RunState:
 def apply(state: RunState, records: Iterable[Stored]) -> RunState:
     """The state after some more records, in order. Previews and single views change nothing."""
     latest = state.latest
-    state = replace(state, tasks=dict(state.tasks), notices=dict(state.notices))
+    money = replace(state.money, machines=dict(state.money.machines), running=dict(state.money.running))
+    state = replace(state, tasks=dict(state.tasks), notices=dict(state.notices), money=money)
     for stored in records:
         state, latest = _apply(state, stored), stored.time
     return replace(state, latest=latest)
@@ -203,7 +206,7 @@ def at_rest(state: RunState) -> RunState:
 
 
 def _apply(state: RunState, stored: Stored) -> RunState:
-    """The same but for `latest`, in place for tasks and notices: copies would take most of a replay."""
+    """The same but for `latest`, in place for tasks, notices and costs: copies would be most of a replay."""
     match record := stored.record:
         case RunBegan():
             state = _take_over(state, record, stored.time)
@@ -221,7 +224,9 @@ def _apply(state: RunState, stored: Stored) -> RunState:
         case PlanSaved():
             passes = tuple(tuple(map(TaskId.parse, tasks)) for tasks in record.passes)
             measures = tuple(map(TaskId.measure, range(record.measures)))
-            state = replace(state, plan=record.blocks, passes=passes, measures=measures)
+            order = sorted((-b.gaussians, -b.cameras, b.block) for b in record.blocks if b.train)
+            blocks = tuple(TaskId.block(block) for *_, block in order)
+            state = replace(state, plan=record.blocks, blocks=blocks, passes=passes, measures=measures)
         case ModelSaved():
             state = _outdate(state, record.task)
         case Merged():
@@ -232,7 +237,8 @@ def _apply(state: RunState, stored: Stored) -> RunState:
     if isinstance(record, OfTask) and record.task is not None:
         task = state.task(record.task)
         if changes := _changes(task, record, stored.time):
-            state.tasks[task.id] = replace(task, **changes)
+            state.tasks[task.id] = changed = object.__new__(TaskState)
+            vars(changed).update(vars(task) | changes)  # `replace` sets thirty fields: most of a replay
             state = replace(state, step="") if state.step else state
     return state
 
@@ -311,9 +317,8 @@ def _end(task: TaskState, record: TaskFailed | TaskYielded) -> dict[str, Any]:
         changes |= {"shortages": task.shortages + 1, "starved": record.memory}
     else:
         changes["failures"] = (*task.failures, machines.Misfortune(record.kind, (record.node, record.card)))
-    if record.kind == Failure.LOST:
-        return changes | {"losses": task.losses + 1}
-    return changes | {"errors": task.errors + 1}
+    count = "losses" if record.kind == Failure.LOST else "errors"
+    return changes | {count: getattr(task, count) + 1}
 
 
 def _with_nodes(state: RunState, record: Record, time: float) -> RunState:
@@ -321,7 +326,7 @@ def _with_nodes(state: RunState, record: Record, time: float) -> RunState:
     where = state.task(record.task).where if isinstance(record.task, TaskId) else ()
     if isinstance(record, NodeQuarantined):
         _excuse(state, record)
-    if isinstance(record, NodeLeaving):
+    elif isinstance(record, NodeLeaving):
         state.notices[Noticed(None, machines.leave_text(record))] = None
     known = machines.follow(state.nodes, record, where, time)
     return state if known is state.nodes else replace(state, nodes=known)
@@ -380,11 +385,6 @@ def _interrupted(task: TaskState, time: float | None) -> TaskState:
     """The task, if it was running, after the end of its driver at some time, None = unknown."""
     spent = task.spent if time is None else task.spent + _attempt(task, time)
     return replace(task, status=task.at_rest, spent=spent) if task.status == Status.RUNNING else task
-
-
-def _has(stage: Sequence[TaskId], id: TaskId) -> bool:
-    """Whether a task is one of a stage; of a pass, which has thousands, by their kind."""
-    return id in stage[:1] or (len(stage) > 1 and stage[0].stage is id.stage)
 
 
 def _outdate(state: RunState, task: TaskId) -> RunState:

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 MEMORY = 400_000_000  # bytes of decoded panoramas
 MOST_VIEWS, FEWEST_VIEWS = 48, 8
 POINTS = 1500  # of each panorama
-_COLORLESS = 2.0  # of 255: standard deviation below which a cloud is of one colour
+COLORLESS = 2.0  # of 255: standard deviation below which a cloud is of one colour
 _GRID, _BEHIND = 48, 1.2  # columns of a grid of directions; farther than that times the nearest is hidden
 WIDEST = 4096  # pixels; wider panoramas are shrunk
 
@@ -37,7 +37,7 @@ class Evidence:
     @property
     def colorless(self) -> bool:
         """Whether the points have no colours, so that only patches and tracks can be checked."""
-        return float(self.colors.std(axis=0).max()) < _COLORLESS
+        return float(self.colors.std(axis=0).max()) < COLORLESS
 
     @property
     def centers(self) -> Array:

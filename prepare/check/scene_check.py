@@ -7,6 +7,7 @@ import numpy as np
 from panolog.prepare.check.conventions import FIT, GAIN, best_convention, residuals
 from panolog.prepare.check.evidence import Array, Evidence, gather_evidence
 from panolog.prepare.check.exposure import describe, measure_exposures
+from panolog.prepare.check.misplaced import find_misplaced, misplaced_lines
 from panolog.prepare.check.photometry import PixelShift, common_shift, fits_of_poses, patch_agreement
 from panolog.prepare.networks.nadir import black_nadir
 from panolog.scene.model import Scene
@@ -36,6 +37,7 @@ class SceneCheck:
     exposure_spread_stops: float | None  # rms of log gains over panoramas and channels; None if not known
     exposure_stops: dict[str, float]  # of each panorama over the mean, by name
     exposure: str  # the same as text
+    misplaced: dict[str, str]  # panoramas that are not where their poses say, and why
     black_nadir_degrees: float | None  # from straight down, within which the panoramas are black and unmasked
     problems: tuple[str, ...]
 
@@ -44,6 +46,11 @@ class SceneCheck:
         """Whether it can be trained on, as text."""
         if not self.problems:
             return "verdict: poses, points and panoramas fit together"
+        if self.misplaced:
+            return (
+                f"verdict: {len(self.misplaced)} of {self.panoramas} panoramas fit no more than by chance; "
+                "correct their poses or leave them out, or training yields fog around them"
+            )
         count = f"{len(self.problems)} problems" if len(self.problems) > 1 else "a problem"
         return f"verdict: {count}; fix that first, or training yields fog"
 
@@ -97,6 +104,8 @@ def check_scene(scene: Scene) -> SceneCheck:
         fits = fits_of_poses(evidence)
         colors = float(np.median(fits.diagonal()))
         problems = problems or _names(evidence, fits)
+    misplaced = {} if problems else find_misplaced(scene)
+    problems = problems or misplaced_lines(misplaced)
     if not problems:
         problems = (
             _tracks(apart, reprojection)
@@ -116,6 +125,7 @@ def check_scene(scene: Scene) -> SceneCheck:
         exposure_spread_stops=exposures.spread if exposures else None,
         exposure_stops=dict(zip(names, exposures.stops.tolist(), strict=True)) if exposures else {},
         exposure=describe(names, exposures) if exposures else "exposure: too few common points to compare",
+        misplaced=misplaced,
         black_nadir_degrees=_black_nadir(evidence),
         problems=tuple(problems),
     )

@@ -31,7 +31,8 @@ from panolog.prepare.provenance import (
 )
 from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
-from panolog.scene.image_files import ImageInfo, decode_used, read_info, resize
+from panolog.scene.image_files import decode_used, read_info, resize
+from panolog.scene.pictures.headers import ImageInfo
 from panolog.scene.read import MASKS
 from panolog.scene.write import Progress, StageProgress, no_progress
 

@@ -8,6 +8,7 @@ more pixels than the panorama. Features are written in pixels of the panorama: m
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from panolog.scene.projection import project_to_fractions, rays_of_fractions
 
 BAND, UP, DOWN = range(3)
+_ROWS = 128
 _BORDER = np.pi / 4  # radians from the horizon at which the band ends
 _MARGIN = np.deg2rad(6.0)  # beyond, so that what lies at the border of two views is whole in both
 
@@ -40,6 +42,18 @@ class Faces:
             return self.width + 2 * self._beyond, high
         across = 2 * int(np.ceil(2 * self.focal * np.tan((np.pi / 2 - _BORDER + _MARGIN) / 2)))
         return across, across
+
+    def tiles(self, face: int, most: int) -> list[tuple[slice, slice]]:
+        """Columns of a view that are looked at together, about `most` pixels, and which of them count.
+
+        What lies at the border of two tiles is whole in both.
+        """
+        across, high = self.size(face)
+        edges = np.linspace(0, across, 1 + max(1, round(across * high / most))).astype(int).tolist()
+        return [
+            (slice(max(0, left - self._beyond), min(across, right + self._beyond)), slice(left, right))
+            for left, right in pairwise(edges)
+        ]
 
     def view(self, panorama: NDArray[np.uint8], face: int) -> NDArray[np.uint8]:
         """(height, width) the view `face` of a grey panorama (width / 2, width)."""
@@ -84,8 +98,11 @@ def _places(faces: Faces, face: int) -> tuple[NDArray[np.float32], NDArray[np.fl
     Once for the panoramas of one size: it takes a third as long as finding their features.
     """
     across, high = faces.size(face)
-    x, y = np.meshgrid(np.arange(across) + 0.5, np.arange(high) + 0.5)
-    rays = faces._rays(np.column_stack([x.ravel(), y.ravel()]), face)
-    where = project_to_fractions(rays) * (faces.width, faces.width // 2) - 0.5
-    u, v = (np.ascontiguousarray(axis.reshape(high, across), np.float32) for axis in where.T)
+    u, v = np.empty((high, across), np.float32), np.empty((high, across), np.float32)
+    for top in range(0, high, _ROWS):  # all at once take 150 bytes a pixel
+        rows = slice(top, min(top + _ROWS, high))
+        x, y = np.meshgrid(np.arange(across) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
+        rays = faces._rays(np.column_stack([x.ravel(), y.ravel()]), face)
+        where = project_to_fractions(rays) * (faces.width, faces.width // 2) - 0.5
+        u[rows], v[rows] = (axis.reshape(x.shape) for axis in where.T)
     return u, v

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import SUFFIXES, PanoramaFile, look_into, masks_among
+from panolog.prepare.sfm.features import MEMORY
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
 from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
@@ -56,37 +57,22 @@ def make_scene(
     settings: SfmSettings,
     progress: StageProgress,
     with_masks: WithMasks = lambda _, layers: layers,
+    memory: int = MEMORY,
 ) -> SfmReport:
     """Makes a scene of `source`, a folder or a video, in the new folder `output`, with its report.
 
-    Args: with_masks, is given the panoramas and their layers before features are found, and returns the
-    layers with masks that it has made; those of a job that was interrupted must stay as they are.
+    Args: with_masks, gets the panoramas and their layers, and returns the layers with masks that it has made;
+        those of an interrupted job must stay as they are; memory, bytes that may be used.
 
-    Raises:
-        SceneError: the source is wrong, or its panoramas share too little; there is no `output` then, and
-            what was done is kept for the next call.
-        OSError: a file cannot be read or written.
+    Raises SceneError if the source is wrong or its panoramas share too little: there is no `output` then, and
+    what was done is kept for the next call. RunError if a process is killed, OSError if a file fails.
     """
     require_new(output)
     known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
-    layers: LayerFiles
     folder, notes, copies = workspace_folder(output.resolve()), list[str](), list[str]()
     if _image_folder(source).resolve() in output.resolve().parents:
         raise SceneError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
-    if source.is_file():
-        files = extract_frames(
-            source,
-            folder / "frames",
-            parallax=settings.parallax,
-            most=settings.frames,
-            progress=lambda done, total: progress("frames", done, total),
-            note=notes.append,
-        )
-        panoramas = tuple(PanoramaFile(folder / "frames", file.name, file) for file in files)
-        layers = {MASKS: find_layer(folder / "frames", MASKS, [file.name for file in files])}
-    else:
-        given, layers, copies = without_copies(*panoramas_in_folder(source))
-        panoramas = complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n))
+    panoramas, layers = _panoramas_of(source, folder, settings, notes, copies, progress)
     layers = with_masks(panoramas, layers)
     places = None if known is None else _places(known, source, folder, panoramas)
     found = reconstruct(
@@ -97,6 +83,7 @@ def make_scene(
         mapper=settings.mapper,
         partial=settings.partial,
         progress=progress,
+        memory=memory,
         places=places,
     )
     left_out = (*copies, *_left_out(source))
@@ -110,6 +97,31 @@ def make_scene(
         _write(output, report, link, progress)
     shutil.rmtree(folder, ignore_errors=True)
     return reports[0]
+
+
+def _panoramas_of(
+    source: Path,
+    folder: Path,
+    settings: SfmSettings,
+    notes: list[str],
+    copies: list[str],
+    progress: StageProgress,
+) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
+    """The panoramas of a source with their layers; adds to `notes` and `copies` what a user should read."""
+    if not source.is_file():
+        given, layers, found = without_copies(*panoramas_in_folder(source))
+        copies += found
+        return complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n)), layers
+    files = extract_frames(
+        source,
+        folder / "frames",
+        parallax=settings.parallax,
+        most=settings.frames,
+        progress=lambda done, total: progress("frames", done, total),
+        note=notes.append,
+    )
+    panoramas = tuple(PanoramaFile(folder / "frames", file.name, file) for file in files)
+    return panoramas, {MASKS: find_layer(folder / "frames", MASKS, [file.name for file in files])}
 
 
 def _report(

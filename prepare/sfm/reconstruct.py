@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.consistency.solve import Solver
-from panolog.prepare.sfm.features import find_features
+from panolog.prepare.sfm.features import MEMORY, find_features
 from panolog.prepare.sfm.links import Link, find_links
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing, best_matches, choose_pairs, match_pairs
@@ -61,11 +61,12 @@ def reconstruct(
     partial: bool,
     progress: StageProgress,
     places: NDArray[np.float64] | None = None,
+    memory: int = MEMORY,
 ) -> list[Reconstruction]:
     """Features, matches, poses and points of `panoramas`. Results are kept in `folder`, for the next call.
 
-    Args: partial, accept parts of which none has more than half of them; places, (K, 3) where they were
-        taken, by a known trajectory, NaN where it is not.
+    Args: partial, accept parts of which none has more than half of them; memory, bytes that may be used;
+        places, (K, 3) where they were taken, by a known trajectory, NaN where it is not.
     Returns: the parts that are each without a contradiction, the largest first.
     Raises: SceneError, a file is damaged or of another size, or the panoramas share too little.
     """
@@ -79,7 +80,7 @@ def reconstruct(
     allowed = max_error(size[0])
     work.open([_VERSION, allowed, [[(str(path), *file_state(path)) for path in paths] for paths in masks]])
     with silence_colmap():
-        features = find_features(work, masks, progress)
+        features = find_features(work, masks, progress, memory)
         if features == 0:
             where = panoramas[0].path.parent
             raise SceneError(f"{where}: no features in any panorama; are they masked, or empty?")

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.prepare.video.layout import Layout
+
 Picture = NDArray[np.uint8]
 
 # Of FFmpeg's AVColorSpace, which is ITU-T H.273, to the names of its filter `scale`.
@@ -43,15 +45,15 @@ class Converter:
         self._graph.push(frame)
         return np.asarray(self._graph.vpull().to_ndarray(), np.uint8)
 
-    def grey(self, frame: av.VideoFrame) -> Picture:
-        """(H, W) the luma, where possible without a conversion."""
+    def grey(self, frame: av.VideoFrame, layout: Layout) -> Picture:
+        """(H, W) the luma of the panorama, where possible without a conversion."""
         found = _PLANAR.fullmatch(frame.format.name)
         bits = int(found.group(1) or 8) if found else 0
         if not 8 <= bits <= 16:
-            return np.asarray(cv2.cvtColor(self.bgr(frame), cv2.COLOR_BGR2GRAY), np.uint8)
+            return layout.panorama(np.asarray(cv2.cvtColor(self.bgr(frame), cv2.COLOR_BGR2GRAY), np.uint8))
         plane = frame.planes[0]
-        values = np.frombuffer(bytes(plane), np.uint8 if bits == 8 else "<u2")
-        luma = values.reshape(plane.height, -1)[:, : plane.width]
+        values = np.frombuffer(memoryview(plane), np.uint8 if bits == 8 else "<u2")
+        luma = layout.panorama(values.reshape(plane.height, -1)[:, : plane.width])
         levels = _levels(bits, check_colours(frame)[1])
         return np.asarray(cv2.LUT(luma, levels) if bits == 8 else levels[luma & (2**bits - 1)], np.uint8)
 

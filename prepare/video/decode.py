@@ -1,11 +1,13 @@
 """360° videos, frame by frame in order, with their true times; numbers in headers are not trusted."""
 
 import hashlib
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Literal
 
 import av
 import av.container
@@ -27,6 +29,10 @@ _WIDTHS = (256, 12_288)  # pixels: enough to track anything, and more than any c
 _SAMPLED = 2**20  # bytes at the beginning, the middle and the end that identify a video
 _ENDS_EARLY = 0.95  # of the frames in the header, which is an estimate where there is no index
 FORMATS = "mov,matroska,avi,mpegts,mpeg,flv,ogg,asf"  # no playlists: they name other files and addresses
+_THREADS = 8  # of a video at most: each holds a frame
+_LARGE = 3000  # pixels: narrower frames are decoded fast enough
+_FAST, _ENOUGH = 20, 7.5  # frames per second, of which every second one will do; that are looked at, at least
+Effort = Literal["exact", "chosen", "draft"]
 _NO_CLOCK = 2000  # years up to this one are those of a clock that was never set
 _DECODING = {
     "max_pixels": str(_WIDTHS[1] ** 2),  # two eyes above each other
@@ -38,16 +44,23 @@ _OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file", **_DECODI
 class Video:
     """An open video of equirectangular frames.
 
-    There is no seeking: in many files it arrives at another frame than the requested one, while the order
-    of decoding is always the same.
+    In many files seeking arrives at another frame than the requested one, while the order of decoding is
+    always the same. So a frame counts as found only if it is shown at the very time.
     """
 
-    def __init__(self, path: Path, container: av.container.InputContainer, ahead: ThreadPoolExecutor) -> None:
+    def __init__(
+        self,
+        path: Path,
+        container: av.container.InputContainer,
+        ahead: ThreadPoolExecutor,
+        effort: Effort,
+    ) -> None:
         """Decodes the first frame and checks how it lies on the sphere.
 
         Args:
             path, container: the open file.
             ahead: a thread that decodes the next frame while the last one is used.
+            effort: what decoding may leave out.
 
         Raises:
             SceneError: there is no frame, or it is no panorama of a usable size.
@@ -55,12 +68,16 @@ class Video:
         """
         self.path = path
         self.decoded = 0  # frames so far
+        self.passed = 0  # the same with those that were left out, by the time
+        self._first = 0.0  # seconds
         self.time = 0.0  # seconds: when the last frame is shown
+        self.is_plain = True  # so far: nothing is damaged, and each frame has a time after the last one
+        self.keys: list[float] = []  # seconds, of the frames so far from which decoding can begin
         self._damaged = 0  # packets that cannot be decoded; counted by the other thread
         self._unlike = 0  # frames that cannot be converted
         self._ahead = ahead
         self._container = container
-        self._stream = _video_stream(path, container)
+        self._stream = _video_stream(path, container, effort)
         self._converter = Converter()
         self._frames = self._decode()
         first = next(self._frames, None)
@@ -86,6 +103,13 @@ class Video:
         )  # frames by the header
 
     @property
+    def often(self) -> int:
+        """Every how manieth frame is enough of a large video, for `_ENOUGH` a second; 1 of others."""
+        if self.width < _LARGE:
+            return 1
+        return max(1, int(float(self._stream.average_rate or 0) / _ENOUGH))
+
+    @property
     def started(self) -> datetime | None:
         """When recording began by the camera's clock, which should be UTC; None if that is not known."""
         text = self._container.metadata.get("creation_time", "")
@@ -101,29 +125,51 @@ class Video:
         `time`, `picture` and `grey` are those of the last one.
         """
         frame: av.VideoFrame | None = self._frame
-        while frame is not None and self.decoded < MAX_FRAMES:
+        while frame is not None and self.passed < MAX_FRAMES:
             # FFmpeg reuses the buffers of frames that are let go, and where a frame is damaged it shows
             # what was in its buffer: so that is done here, at the same moment each time.
             self._frame = frame
             coming = self._ahead.submit(next, self._frames, None)
-            self.time = self._time(frame)
-            self.decoded += 1
-            yield self.decoded - 1
+            self._show(frame)
+            yield self.passed - 1
             frame = coming.result()
+
+    def frames_at(self, times: Sequence[float], keys: Sequence[float]) -> Iterator[float]:
+        """Those of `times`, ascending, at which frames are shown; ends at the first one that is not found.
+
+        Args: keys, what `keys` was when all of the video had been decoded.
+        """
+        self._show(self._frame)
+        for wanted in times:
+            begin = max((key for key in keys if key <= wanted), default=0.0)
+            if begin > self.time or wanted < self.time:
+                self._container.seek(round(begin / (self._stream.time_base or 1)), stream=self._stream)
+                self._frames, self.time = self._decode(), -1.0
+            while self.time < wanted and (frame := next(self._frames, None)) is not None:
+                self._frame = frame
+                self._show(frame)
+            if self.time != wanted:
+                return
+            yield wanted
 
     def picture(self) -> NDArray[np.uint8] | None:
         """(height, width, 3) BGR; None if it is damaged or unlike the first one."""
-        return self._converted(self._converter.bgr)
+        return self._converted(lambda frame: self.layout.panorama(self._converter.bgr(frame)))
 
-    def grey(self) -> NDArray[np.uint8] | None:
-        """(height, width) luma, full range, for a fraction of the time of `picture`; None as there."""
-        return self._converted(self._converter.grey)
+    def grey(self, width: int = _WIDTHS[1]) -> NDArray[np.uint8] | None:
+        """(H, W) luma, full range, at most `width` wide, for a fraction of the time of `picture`.
+
+        None as there.
+        """
+        layout = self.layout.scaled(width)
+        return self._converted(lambda frame: self._converter.grey(frame, layout))
 
     def notes(self) -> list[str]:
         """Messages about a video that was decoded, one line each."""
         lines = []
         counted, seconds = self._stream.frames > 0, self._duration()
-        if self.decoded < _ENDS_EARLY * self.promised if counted else self.time < _ENDS_EARLY * seconds - 1:
+        there, whole = (self.passed, self.promised) if counted else (self.time + 1, seconds)
+        if there < _ENDS_EARLY * whole:
             part = f"{self.decoded:,} of the {self.promised:,} frames"
             if not counted:
                 part = f"{self.time:.1f} of the {seconds:.1f} seconds"
@@ -134,7 +180,7 @@ class Video:
         unusable = self._damaged + self._unlike
         if unusable:
             lines.append(f"{self.path}: {unusable:,} damaged frames, or of another size, were left out")
-        if self.decoded == MAX_FRAMES:
+        if self.passed == MAX_FRAMES:
             lines.append(f"{self.path}: only its first {MAX_FRAMES:,} frames were used; cut it")
         return lines
 
@@ -146,6 +192,7 @@ class Video:
                     yield from packet.decode()
                 except av.FFmpegError:
                     self._damaged += 1
+                    self.is_plain = False
         except av.FFmpegError:  # the rest of the file cannot be read
             return
 
@@ -154,10 +201,11 @@ class Video:
         frame = self._frame
         if (frame.width, frame.height) == self._size and not frame.is_corrupt:
             try:
-                return self.layout.panorama(convert(frame))
+                return convert(frame)
             except (av.FFmpegError, ColourError):
                 pass
         self._unlike += 1
+        self.is_plain = False
         return None
 
     def _layout(self, first: av.VideoFrame) -> Layout:
@@ -168,6 +216,18 @@ class Video:
         )
         self.spherical = read_spherical(self.path) or spherical_of(mapping, stereo)
         return layout_of(first.width, first.height, matrix, self.spherical, _WIDTHS[1])
+
+    def _show(self, frame: av.VideoFrame) -> None:
+        """`frame` is the last one now."""
+        time = round(self._time(frame), 6)
+        self.is_plain &= frame.pts is not None and (self.decoded == 0 or time > self.time)
+        self.time, self._first = time, self._first if self.decoded else time
+        self.decoded, self.passed = self.decoded + 1, self.passed + 1
+        if self._stream.codec_context.skip_frame != "DEFAULT":
+            due = round((time - self._first) * float(self._stream.average_rate or 0)) + 1
+            self.passed = max(self.passed, min(due, MAX_FRAMES))
+        if frame.key_frame:
+            self.keys.append(time)
 
     def _time(self, frame: av.VideoFrame) -> float:
         """Seconds; of a frame without a time, that of the last one and a little more."""
@@ -185,9 +245,12 @@ class Video:
 
 
 @contextmanager
-def open_video(path: Path) -> Iterator[Video]:
+def open_video(path: Path, effort: Effort = "exact") -> Iterator[Video]:
     """Opens a video in any container of `FORMATS` with any codec of FFmpeg.
 
+    Args: effort, "exact" decodes all frames in one thread, so that damaged ones are the same each time.
+        "chosen" decodes in several threads, and of large videos no frames that no others refer to, most of
+        which are coded worst. "draft" also leaves out what smooths the borders of blocks in large ones.
     Raises:
         SceneError: it is missing, cannot be opened, is no panorama, or its width is out of bounds.
     """
@@ -201,10 +264,10 @@ def open_video(path: Path) -> Iterator[Video]:
         reason = describe_file(path) or "it is damaged, truncated before its index, or no video"
         raise SceneError(f"{path}: cannot be opened as a video; {reason}") from error
     with container, ThreadPoolExecutor(1) as ahead:
-        yield Video(path, container, ahead)
+        yield Video(path, container, ahead, effort)
 
 
-def _video_stream(path: Path, container: av.container.InputContainer) -> av.VideoStream:
+def _video_stream(path: Path, container: av.container.InputContainer, effort: Effort) -> av.VideoStream:
     """The stream of the panoramas, the largest. Raises SceneError."""
     streams = [
         it
@@ -216,8 +279,15 @@ def _video_stream(path: Path, container: av.container.InputContainer) -> av.Vide
     stream = max(streams, key=lambda it: it.width * it.height)
     if sum((it.width, it.height) == (stream.width, stream.height) for it in streams) > 1:
         raise SceneError(f"{path}: it has a video for each lens; {STITCH}")
-    stream.codec_context.options = _DECODING
-    stream.thread_count = 1  # with more, damaged videos decode differently each time
+    options, large = dict(_DECODING), stream.width >= _LARGE
+    if effort != "exact":
+        stream.thread_type = "AUTO"
+    stream.thread_count = 1 if effort == "exact" else min(_THREADS, os.cpu_count() or 1)
+    if effort != "exact" and large and (stream.average_rate or 0) >= _FAST:
+        stream.codec_context.skip_frame = "NONREF"
+    if effort == "draft" and large:
+        options["skip_loop_filter"] = "all"
+    stream.codec_context.options = options
     return stream
 
 

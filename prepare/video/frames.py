@@ -1,6 +1,6 @@
 """Extracts the frames of a 360° video for a reconstruction: sharp ones, an even baseline apart."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
 
@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.video.decode import Video, open_video, video_digest
-from panolog.prepare.video.motion import MotionTracker, VideoMotion, load_motion
+from panolog.prepare.video.decode import Effort, Video, open_video, video_digest
+from panolog.prepare.video.motion import SHARP_WIDTH, MotionTracker, VideoMotion, load_motion
 from panolog.prepare.video.selection import choose_frames
 from panolog.prepare.video.stamp import stamped
 from panolog.prepare.video.telemetry import Telemetry, read_telemetry
@@ -22,6 +22,7 @@ from panolog.scene.write import Progress, no_progress
 
 PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
 _QUALITY = 95
+_DENSE = 0.5  # degrees of parallax between two frames of a large video that are looked at, at most
 _WIDEST = 45.0  # degrees of parallax from which no features match
 
 
@@ -51,7 +52,7 @@ def extract_frames(
         folder: made if missing.
         parallax: degrees, above 0 and up to 45.
         most: maximum number of frames, at least 2; if there would be more, they are further apart.
-        progress: called after each frame of both passes; both numbers count both passes.
+        progress: called after each frame of the first pass and each that is written; counts both passes.
         note: called with a line about each thing that was left out.
 
     Returns:
@@ -72,7 +73,7 @@ def extract_frames(
     for line in (*found.notes, *left_out):
         if note is not None:
             note(line)
-    numbers = choose_frames(found.pieces, parallax, most)
+    numbers = choose_frames(found.pieces, parallax, most, found.keys)
     if len(numbers) < 2:
         raise SceneError(
             f"{video}: the camera moves by less than {parallax:g} degrees of parallax in it, so nothing can "
@@ -83,7 +84,7 @@ def extract_frames(
     if found.chosen != numbers:
         found.chosen = numbers
         found.save(frames.motion)
-    _write(video, frames, numbers, found.decoded, telemetry, progress)
+    _write(video, frames, found, telemetry, progress)
     return [frames.path(number) for number in numbers]
 
 
@@ -92,7 +93,7 @@ def frame_times(video: Path, folder: Path) -> list[float]:
     known = load_motion(_Frames(video, folder).motion)
     if known is None:
         return []
-    times = {n: t for piece in known.pieces for n, t in zip(piece.frames, piece.times, strict=True)}
+    times = known.times()
     return [times[number] for number in known.chosen]
 
 
@@ -111,6 +112,18 @@ class _Frames:
     def mask(self, number: int) -> Path:
         """The file of a frame's mask."""
         return self._folder / MASKS / f"{self.path(number).stem}.png"
+
+    def save(self, number: int, source: Video, telemetry: Telemetry | None) -> bool:
+        """Writes the present frame of `source` as frame `number`; whether it could be decoded."""
+        picture = source.picture()
+        if picture is None:
+            return False
+        if not source.layout.is_whole:
+            self.mask(number).parent.mkdir(exist_ok=True)
+            write_bytes(self.mask(number), _encoded(".png", source.layout.mask()))
+        jpeg = _encoded(".jpg", picture, cv2.IMWRITE_JPEG_QUALITY, _QUALITY)
+        write_bytes(self.path(number), _stamped(jpeg, source, telemetry))
+        return True
 
     def clear(self, numbers: set[int]) -> None:
         """Removes frames with their masks, and partial files of a killed process."""
@@ -137,53 +150,63 @@ def _video_motion(video: Path, file: Path, progress: Progress) -> VideoMotion:
 
 
 def _search(video: Path, key: str, progress: Progress) -> VideoMotion:
-    """The first pass. Raises SceneError."""
-    with open_video(video) as source:
-        motion = MotionTracker(source.width)
-        for number in source.frames():
-            grey = source.grey()
-            if grey is not None:
-                if not motion.pieces and (what := describe_picture(grey)) is not None:
-                    raise SceneError(f"{video}: its frames are {what}")
-                motion.add(number, source.time, grey)
-            progress(number + 1, 2 * max(source.promised, number + 1))
-        found = VideoMotion(key, source.decoded, motion.finish(), source.notes())
-    if not found.pieces:
+    """The first pass, again with care if the video turns out to be damaged. Raises SceneError."""
+    found = _followed(video, key, progress, "draft") or _followed(video, key, progress, "exact")
+    if found is None or not found.pieces:
         raise SceneError(f"{video}: is damaged, or shows nothing that can be tracked; no frame can be used")
     return found
 
 
+def _followed(video: Path, key: str, progress: Progress, effort: Effort) -> VideoMotion | None:
+    """The motion; None of a draft of a video that is not plain. Raises SceneError."""
+    with open_video(video, effort) as source:
+        motion, coming = MotionTracker(source.width), 0
+        for number in source.frames():
+            if effort == "draft" and not source.is_plain:
+                return None
+            if number < coming:
+                continue
+            grey = source.grey(SHARP_WIDTH)
+            coming = number + (motion.frames_within(_DENSE, source.often) if effort == "draft" else 1)
+            if grey is not None:
+                if not motion.pieces and (what := describe_picture(grey)) is not None:
+                    raise SceneError(f"{video}: its frames are {what}")
+                motion.add(number, source.time, grey)
+            progress(source.passed, 2 * max(source.promised, source.passed))
+        keys = source.keys if effort == "draft" else []
+        return VideoMotion(key, source.passed, keys, motion.finish(), source.notes())
+
+
 def _write(
-    video: Path,
-    frames: _Frames,
-    numbers: Sequence[int],
-    before: int,
-    telemetry: Telemetry | None,
-    progress: Progress,
+    video: Path, frames: _Frames, found: VideoMotion, telemetry: Telemetry | None, progress: Progress
 ) -> None:
-    """The second pass, for the missing frames; `before` is the number of frames of the first pass."""
-    missing = {number for number in numbers if not frames.path(number).is_file()}
+    """The second pass, for the missing frames: to each of them, or in order where that does not find one."""
+    times, before = found.times(), found.decoded
+    missing = [number for number in found.chosen if not frames.path(number).is_file()]
+    if missing and found.keys:
+        last = missing[-1]
+        with open_video(video, "chosen") as source:
+            there = source.frames_at([times[number] for number in missing], found.keys)
+            for number, _ in zip(tuple(missing), there, strict=False):
+                if not frames.save(number, source, telemetry):
+                    break
+                missing.remove(number)
+                progress(before + number + 1, before + last + 1)
     if not missing:
         return
-    last = max(missing)
+    last = missing[-1]
+    wanted = {times[number] if found.keys else number: number for number in missing}
     with open_video(video) as source:
-        mask = None if source.layout.is_whole else _encoded(".png", source.layout.mask())
         for number in source.frames():
-            if number in missing:
-                picture = source.picture()
-                if picture is None:
-                    break
-                if mask is not None:
-                    frames.mask(number).parent.mkdir(exist_ok=True)
-                    write_bytes(frames.mask(number), mask)
-                jpeg = _encoded(".jpg", picture, cv2.IMWRITE_JPEG_QUALITY, _QUALITY)
-                write_bytes(frames.path(number), _stamped(jpeg, source, telemetry))
-                missing.remove(number)
-            progress(before + number + 1, before + last + 1)
-            if not missing:
+            at = wanted.pop(source.time if found.keys else number, None)
+            if at is not None and not frames.save(at, source, telemetry):
+                break
+            progress(before + min(number, last) + 1, before + last + 1)
+            if not wanted:
                 return
     raise SceneError(
-        f"{video}: frame {min(missing)} cannot be read any more; the video has changed, or its disk fails"
+        f"{video}: frame {min(wanted.values())} cannot be read any more; the video has changed, or its disk "
+        "fails"
     )
 
 

@@ -1,8 +1,8 @@
 """How the decoded pictures of a video become panoramas: turned, one eye, and placed on the whole sphere."""
 
 import struct
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -12,6 +12,8 @@ from panolog.prepare.video.spherical import Spherical, Stereo
 from panolog.scene.pictures.kinds import EXPORT, STITCH
 
 Turn = tuple[int, int, int, int]  # (a, b, c, d): x' = a x + c y, y' = b x + d y, each -1, 0 or 1
+
+Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 _UPRIGHT = (1, 0, 0, 1)
 _LEFT_EYE: dict[Stereo, tuple[float, float, float, float]] = {  # of the picture: left, top, right, bottom
@@ -59,15 +61,23 @@ class Layout:
         """Whether the picture covers the whole sphere."""
         return self.place.shape == (self.width // 2, self.width)
 
-    def panorama(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def scaled(self, width: int) -> "Layout":
+        """That of panoramas that are at most `width` pixels wide."""
+        if width >= self.width:
+            return self
+        place = Span(*(round(edge * width / self.width) for edge in self.place))
+        return replace(self, place=place, width=width)
+
+    def panorama(self, picture: NDArray[Pixel]) -> NDArray[Pixel]:
         """(width / 2, width, ...) of a decoded picture (H, W, ...); 0 where there is none."""
         eye = _displayed(picture, self.turn)[self.eye.slices]
         rows, columns = self.place.shape
         if eye.shape[:2] != (rows, columns):
-            eye = np.asarray(cv2.resize(eye, (columns, rows), interpolation=cv2.INTER_LINEAR), np.uint8)
+            way = cv2.INTER_AREA if columns < eye.shape[1] else cv2.INTER_LINEAR
+            eye = np.asarray(cv2.resize(eye, (columns, rows), interpolation=way), picture.dtype)
         if self.is_whole:
             return np.ascontiguousarray(eye)
-        whole = np.zeros((self.width // 2, self.width, *picture.shape[2:]), np.uint8)
+        whole = np.zeros((self.width // 2, self.width, *picture.shape[2:]), picture.dtype)
         whole[self.place.slices] = eye
         return whole
 
@@ -135,7 +145,7 @@ def _turn(matrix: bytes | None, width: int, height: int) -> Turn:
     return (a, b, c, d) if straight or quarter else _UPRIGHT
 
 
-def _displayed(picture: NDArray[np.uint8], turn: Turn) -> NDArray[np.uint8]:
+def _displayed(picture: NDArray[Pixel], turn: Turn) -> NDArray[Pixel]:
     """The picture (H, W, ...) turned."""
     a, b, c, d = turn
     if a == 0:

@@ -25,7 +25,7 @@ _LEFT = 0.5  # of an anchor's corners, or it is replaced as well
 _NOISE = 0.5  # degrees; below, an anchor that is replaced for lack of corners has not moved
 _CLEAR = 0.5  # of the recent sharpness; a frame below is no anchor, and no sign of a cut
 _RECENT = 31  # frames whose median sharpness is compared with
-_VERSION = 2  # of the search; results of another version are not used
+_VERSION = 3  # of the search; results of another version are not used
 _LARGEST = 64 * MAX_FRAMES  # bytes of a file of motion
 
 FrameNumber = Annotated[int, Field(strict=True, ge=0, le=MAX_FRAMES)]
@@ -53,9 +53,14 @@ class VideoMotion:
 
     digest: str  # of the video
     decoded: FrameNumber = 0  # frames
+    keys: list[FiniteFloat] = field(default_factory=list)  # seconds, where a search can begin; none: in order
     pieces: list[Piece] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     chosen: list[FrameNumber] = field(default_factory=list)  # frames that are, or will be, files
+
+    def times(self) -> dict[FrameNumber, float]:
+        """Seconds when the frames are shown."""
+        return {n: t for piece in self.pieces for n, t in zip(piece.frames, piece.times, strict=True)}
 
     def save(self, path: Path) -> None:
         """Writes it atomically. Raises OSError."""
@@ -109,6 +114,14 @@ class MotionTracker:
             if self._stray is not None:
                 self._begin(self._stray)
             self._stray = None if self._stray is not None and self._measure(frame) else frame
+
+    def frames_within(self, parallax: float, most: int) -> int:
+        """How many frames the camera takes for so many degrees at its present pace, from 1 to `most`."""
+        last = self.pieces[-1] if self.pieces and self._stray is None else Piece()
+        if len(last.frames) < 2:
+            return 1
+        moved, frames = (it[-1] - it[-2] for it in (last.positions, last.frames))
+        return int(np.clip(parallax * frames / max(abs(moved), 1e-6), 1, most))
 
     def finish(self) -> list[Piece]:
         """All pieces, after the last frame."""

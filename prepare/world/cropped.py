@@ -20,7 +20,8 @@ from panolog.prepare.provenance import MAX_BYTES
 from panolog.prepare.world.exif import Crop, Exif, essential_exif, read_exif
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, stem_of
-from panolog.scene.image_files import ImageInfo, decode_colors, decode_used, read_info
+from panolog.scene.image_files import decode_colors, decode_used, read_info
+from panolog.scene.pictures.headers import ImageInfo
 from panolog.scene.write import Progress, no_progress
 
 _THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama

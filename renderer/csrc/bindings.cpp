@@ -107,10 +107,7 @@ std::optional<panolog::Exterior> view_of(const std::optional<ExteriorArrays>& ar
                            .back = back.data()};
 }
 
-}  // namespace
-
-NB_MODULE(_core, m) {
-  m.doc() = "PanoLOG's CPU kernels";
+void bind_process(nb::module_& m) {
   m.def("instruction_set", [] { return panolog::kernels().name; });
   m.def(
       "choose_instruction_set", [](const char* name) { return panolog::choose_kernels(name); }, "name"_a,
@@ -136,6 +133,18 @@ NB_MODULE(_core, m) {
       },
       "Returns memory to the system that is free now, though it is kept: what follows needs other sizes.");
 
+  // For benchmarks.
+  m.def(
+      "stages",
+      [] {
+        const panolog::Stages& s = panolog::latest;
+        return std::make_tuple(s.project, s.order, s.composite, s.composite_backward, s.project_backward);
+      },
+      "Seconds of the latest projection, ordering, compositing, and the backward passes of compositing and "
+      "projection.");
+}
+
+void bind_rasterize(nb::module_& m) {
   m.def(
       "rasterize",
       [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
@@ -164,7 +173,9 @@ NB_MODULE(_core, m) {
       "width"_a, "height"_a, "sh_degree"_a, "near"_a, "exact"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a,
       "state"_a, "exterior"_a.none(),
       "Eq. 1. Writes the images and states; returns splats, rays, slots, entries and tiles for the backward pass.");
+}
 
+void bind_backward(nb::module_& m) {
   m.def(
       "rasterize_backward",
       [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
@@ -216,7 +227,9 @@ NB_MODULE(_core, m) {
       "exterior"_a.none(), "out_motion"_a = nb::none(), "out_absolute"_a = nb::none(),
       "Writes the gradients of the parameters and, with out_motion, the sums of camera motion and, with out_absolute, "
       "absolute gradients of affine splats (csrc/gradients.h), from those of the three images.");
+}
 
+void bind_bake(nb::module_& m) {
   m.def(
       "bake",
       [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
@@ -248,7 +261,9 @@ NB_MODULE(_core, m) {
       "front_color"_a, "front_alpha"_a, "front_inverse_depth"_a, "back_color"_a, "back_alpha"_a, "back_inverse_depth"_a,
       "All but the first `own` Gaussians as a camera sees them, before and behind those; see csrc/bake.h. Returns "
       "spans, which Gaussians composite among the own ones, splats and rays of all.");
+}
 
+void bind_losses(nb::module_& m) {
   m.def(
       "photometric",
       [](In<float> color, In<uint8_t> target, std::optional<In<uint8_t>> mask, int width, int height, float lambda_ssim,
@@ -288,7 +303,9 @@ NB_MODULE(_core, m) {
       },
       "rendered"_a, "target"_a, "valid"_a, "threads"_a, "gradient"_a,
       "Returns the mean over valid pixels (eq. 5); writes its gradient.");
+}
 
+void bind_adam(nb::module_& m) {
   m.def(
       "adam",
       [](InOut<float> parameter, In<float> gradient, InOut<float> exp_avg, InOut<float> exp_avg_sq, int64_t count,
@@ -315,14 +332,16 @@ NB_MODULE(_core, m) {
       "parameter"_a, "gradient"_a, "exp_avg"_a, "exp_avg_sq"_a, "count"_a, "lr"_a, "beta1"_a, "beta2"_a, "eps"_a,
       "step"_a, "threads"_a, "units"_a = nb::none(),
       "One step on the first `count` values, in place. Returns whether a value of their gradient is not finite.");
+}
 
-  // For benchmarks.
-  m.def(
-      "stages",
-      [] {
-        const panolog::Stages& s = panolog::latest;
-        return std::make_tuple(s.project, s.order, s.composite, s.composite_backward, s.project_backward);
-      },
-      "Seconds of the latest projection, ordering, compositing, and the backward passes of compositing and "
-      "projection.");
+}  // namespace
+
+NB_MODULE(_core, m) {
+  m.doc() = "PanoLOG's CPU kernels";
+  bind_process(m);
+  bind_rasterize(m);
+  bind_backward(m);
+  bind_bake(m);
+  bind_losses(m);
+  bind_adam(m);
 }

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.driver_scale.__main__ import lost
 from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.runs import clock, stage_seconds
+from benchmarks.scale.driver import lost
 from benchmarks.scale.merging import SKY, _check, fill, measure
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Progressed, Stored

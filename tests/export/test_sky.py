@@ -9,8 +9,11 @@ import torch
 
 from panolog.export.frame import Frame
 from panolog.export.sky import render_sky, write_sky_image
+from panolog.export.splats import ModelSource, Selection, Splats
 from panolog.scene.errors import InputError
-from panolog.scene.gaussians import Gaussians
+from panolog.scene.gaussians import Gaussians, concatenate
+from panolog.scene.ply import write_ply
+from tests.export.gaussians import scattered
 
 UP = (0.0, 0.0, 1.0)
 
@@ -54,6 +57,25 @@ def test_below_the_horizon_colours_are_continued() -> None:
     assert np.isfinite(image).all()
     assert image[40:].min() > 0.2  # not black
     np.testing.assert_allclose(image[20, 30], render_sky(whole, frame, 128)[20, 30], atol=0.02)
+
+
+@pytest.mark.parametrize("far", [20_000.0, 500.0])
+def test_viewers_get_a_sky_that_looks_the_same_and_is_near(tmp_path: Path, far: float) -> None:
+    """Only where it is much farther than the scene."""
+    scene, path = scattered(300, extent=20), tmp_path / "model.ply"
+    center, around = np.array([3.0, -2.0, 1.0]), sky(Frame.upright(UP))
+    means = torch.from_numpy(center + far * (around.means / 100).numpy()).float()
+    around = around.with_tensors(around.tensors() | {"means": means}, sky=len(around))
+    write_ply(path, concatenate(scene.gaussians(), around))
+    source = ModelSource(path, Selection(part="all"))
+    before, after = (Splats.joined(list(it.pieces())) for it in (source, source.with_near_sky()))
+    factor = (after.means[300:] - means.numpy().mean(0)) / (before.means[300:] - means.numpy().mean(0))
+    reach = np.linalg.norm(scene.means - means.numpy().mean(0), axis=1).max()
+    expected = min(1.0, 20 * reach / far)
+    np.testing.assert_allclose(factor, expected, rtol=0.02)
+    np.testing.assert_allclose(after.scales[300:] - before.scales[300:], np.log(expected), atol=0.02)
+    for name, column in before.columns().items():
+        np.testing.assert_array_equal(column[:300], after.columns()[name][:300])
 
 
 def test_files(tmp_path: Path) -> None:

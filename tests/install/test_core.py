@@ -1,5 +1,6 @@
 """The core, without the packages of the extras: it imports, and commands say in one line what they need."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -32,39 +33,41 @@ def core(script: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, check=False, capture_output=True, text=True, cwd=cwd)
 
 
-def panolog_without_extras(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Runs a command where nothing but the core is installed."""
-    program = f"from panolog.orchestrator.cli.app import app; app({[*map(str, arguments)]!r})"
-    return core(program, cwd)
+COMMANDS = {
+    "scene sfm raw -o scene": "this needs pycolmap: pip install 'panolog[prepare]'",
+    "run raw -o run": "this needs pycolmap: pip install 'panolog[prepare]'",
+    "dashboard .": "this needs Starlette: pip install 'panolog[dashboard]'",
+    "run scene -o run --address auto": "this needs Ray: pip install 'panolog[cluster]'",
+    "export model.ply -o out --3dtiles --epsg 25832": "this needs pyproj: pip install 'panolog[export]'",
+}
+EACH = f"""
+import json
+from typer.testing import CliRunner
+from panolog.orchestrator.cli.app import app
+for command in {list(COMMANDS)!r}:
+    ended = CliRunner().invoke(app, command.split())
+    print(json.dumps([ended.exit_code, ended.stdout, ended.stderr]))
+"""
 
 
-@pytest.mark.parametrize(
-    ("command", "said"),
-    [
-        ("scene sfm raw -o scene", "this needs pycolmap: pip install 'panolog[prepare]'"),
-        ("run raw -o run", "this needs pycolmap: pip install 'panolog[prepare]'"),
-        ("dashboard .", "this needs Starlette: pip install 'panolog[dashboard]'"),
-        ("run scene -o run --address auto", "this needs Ray: pip install 'panolog[cluster]'"),
-        (
-            "export model.ply -o out --3dtiles --epsg 25832",
-            "this needs pyproj: pip install 'panolog[export]'",
-        ),
-    ],
-)
-def test_a_command_says_which_extra_it_needs(command: str, said: str, tmp_path: Path) -> None:
+def test_a_command_says_which_extra_it_needs(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene")
     shutil.copytree(scene / "images", tmp_path / "raw")
     write_ply(tmp_path / "model.ply", scene_gaussians(read_scene(scene)))
-    ended = panolog_without_extras(*command.split(), cwd=tmp_path)
-    assert (ended.returncode, ended.stdout, ended.stderr.splitlines()[-1]) == (2, "", f"panolog: {said}")
+    ended = core(EACH, tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    for said, line in zip(COMMANDS.values(), ended.stdout.splitlines(), strict=True):
+        code, stdout, stderr = json.loads(line)
+        assert (code, stdout, stderr.splitlines()[-1]) == (2, "", f"panolog: {said}")
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.system
 def test_a_run_goes_without_ray_and_reports_what_it_leaves_out(tmp_path: Path) -> None:
     write_scene(tmp_path / "scene")
-    settings = ["--iterations", 10, "--set", "sky.count=20", "--device", "cpu"]
-    ended = panolog_without_extras("run", "scene", "-o", "run", *settings, cwd=tmp_path)
+    command = ["run", "scene", "-o", "run", "--iterations", 10, "--set", "sky.count=20", "--device", "cpu"]
+    program = f"from panolog.orchestrator.cli.app import app; app({[*map(str, command)]!r})"
+    ended = core(program, tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert "report: not written: this needs plotly: pip install 'panolog[dashboard]'" in ended.stderr
     assert "plan.png is not drawn: this needs matplotlib" in ended.stderr

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from panolog.partition.bounds import Aabb, aabb, baseline
+from panolog.partition.bounds import Aabb, aabb, baseline, strays
 from panolog.partition.cells import Grid
 from panolog.partition.contraction import contract
 from panolog.scene.errors import InputError
@@ -16,7 +16,38 @@ def test_baseline_is_that_of_all_pairs() -> None:
     centers = np.random.default_rng(0).normal(size=(600, 3))
     distances = np.linalg.norm(centers[:, None] - centers[None], axis=2) + np.diag(np.full(600, np.inf))
     assert baseline(centers) == pytest.approx(np.median(distances.min(axis=1)), rel=1e-12)
-    assert baseline(np.repeat(centers, 3, axis=0)) == 0
+
+
+@pytest.mark.parametrize("play", [0.0, 0.004])
+def test_spots_of_a_tripod_count_once(play: float) -> None:
+    """Three pictures at each of forty spots, and a few spots with one."""
+    random = np.random.default_rng(2)
+    spots = np.arange(46.0)[:, None] * (1.5, 0.2, 0.0) + random.normal(0, 0.1, (46, 3))
+    centers = np.concatenate([np.repeat(spots[:40], 3, axis=0), spots[40:]])
+    centers += random.normal(0, play, centers.shape)
+    assert baseline(centers) == pytest.approx(baseline(spots), rel=0.02)
+    assert baseline(np.full((40, 3), 2.0)) == 0
+
+
+def test_groups_of_a_walk_are_no_spots() -> None:
+    """Eq. 8 to the letter, however far the groups of cameras that lie in line are apart."""
+    line = np.arange(12.0)[:, None] * (1.0, 0, 0)
+    groups = np.concatenate([line + np.array([0, 1000.0 * group, 0]) for group in range(5)])
+    assert baseline(groups) == 1
+    assert baseline(np.concatenate([line, line + np.array([0, 0.1, 0])])) == pytest.approx(
+        0.1
+    )  # two ways side by side
+
+
+def test_a_stray_camera_widens_nothing() -> None:
+    walk = np.random.default_rng(1).normal(0, (20, 10, 0.1), (16, 3))
+    box = aabb(walk, 5.0)
+    lost = np.insert(walk, 3, (8000.0, 50.0, -3000.0), axis=0)
+    assert np.flatnonzero(strays(lost)).tolist() == [3]
+    np.testing.assert_allclose(aabb(lost, 5.0).half, box.half, rtol=0.1)
+    assert not strays(walk).any()
+    assert not strays(np.concatenate([walk, walk + np.array([1e5, 0, 0])])).any()  # two sites
+    assert not strays(np.array([[0.0, 0, 0], [1, 0, 0], [1e4, 0, 0]])).any()  # which of three?
 
 
 def test_aabb_is_the_trajectory_about_its_centroid_plus_the_margin() -> None:

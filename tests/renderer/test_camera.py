@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.renderer.camera import Camera, Lens, facing, perspective
-from panolog.renderer.render import encode_png, render_panorama, to_bytes
+from panolog.renderer.render import encode_png, hatched, render_panorama, to_bytes
 from panolog.scene.gaussians import Gaussians
 from tests.renderer.reference_rays import pixel_rays
 
@@ -73,3 +73,16 @@ def test_a_gaussian_ahead_is_in_the_middle_of_the_panorama() -> None:
     decoded = cv2.imdecode(np.frombuffer(encode_png(panorama), np.uint8), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(np.asarray(decoded)[..., ::-1], panorama)
     assert not render_panorama(one, np.eye(3), np.zeros(3), 128, near=10.0).any()
+
+
+def test_what_is_not_rendered_is_pale_under_diagonal_lines() -> None:
+    image = np.zeros((96, 192, 3), np.uint8)
+    image[:, 96:] = 255
+    found = hatched(image)
+    lines = (found == 232).all(axis=2)
+    assert 0.2 < lines.mean() < 0.4
+    assert (lines[:-1, 1:] == lines[1:, :-1]).all() and not (lines[:-1] == lines[1:]).all()
+    assert found.min() >= 96  # no part of it is black
+    assert (
+        found[:, 96:][~lines[:, 96:]].mean() > found[:, :96][~lines[:, :96]].mean() + 50
+    )  # it can be recognised

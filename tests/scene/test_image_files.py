@@ -1,11 +1,16 @@
+from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
+from panolog.scene import image_files
 from panolog.scene.errors import ImageError, InputError
-from panolog.scene.image_files import ImageInfo, check_images, decode_panorama, read_info
+from panolog.scene.image_files import check_images, decode_panorama, read_info
+from panolog.scene.pictures.headers import ImageInfo, read_header
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
 
@@ -18,6 +23,46 @@ def test_size_and_depth_come_from_the_header(tmp_path: Path, suffix: str) -> Non
     if suffix == "png":
         cv2.imwrite(str(path), np.zeros((16, 32), np.uint16))
         assert read_info(path) == ImageInfo(32, 16, 16, 1)
+
+
+HEADERS: dict[str, Callable[[Path], object]] = {
+    "grey.tif": lambda it: cv2.imwrite(str(it), PIXELS[..., 0]),
+    "rgb16.tif": lambda it: cv2.imwrite(str(it), PIXELS.astype(np.uint16) * 257),
+    "rgba.tif": lambda it: Image.fromarray(np.dstack([PIXELS, PIXELS[..., 0]])).save(it),
+    "raw.tif": lambda it: Image.fromarray(PIXELS).save(it, compression=None),
+    "jpeg.tif": lambda it: Image.fromarray(PIXELS).save(it, compression="jpeg"),
+    "strips.tif": lambda it: Image.fromarray(PIXELS).save(it, compression="tiff_lzw", tiffinfo={278: 8}),
+    "lossy.webp": lambda it: Image.fromarray(PIXELS).save(it, quality=80),
+    "lossless.webp": lambda it: Image.fromarray(PIXELS).save(it, lossless=True),
+    "exif.webp": lambda it: Image.fromarray(PIXELS).save(it, exif=b"Exif\0\0II*\0\b\0\0\0\0\0"),
+    "rgba.webp": lambda it: Image.fromarray(np.dstack([PIXELS, PIXELS[..., 0]])).save(it, lossless=True),
+    "rgba_lossy.webp": lambda it: Image.fromarray(np.dstack([PIXELS, PIXELS[..., 0]])).save(it),
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_headers_of_tiff_and_webp_say_what_decoding_does(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / name
+    HEADERS[name](path)
+    with monkeypatch.context() as patched:
+        patched.setattr(image_files, "read_header", lambda _: None)
+        decoded = read_info(path)
+    monkeypatch.setattr(image_files, "decode", None)
+    assert read_info(path) == decoded
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, of truncated directories
+@pytest.mark.parametrize("name", HEADERS)
+def test_no_header_is_believed_of_a_truncated_file(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    HEADERS[name](path)
+    data = path.read_bytes()
+    whole = read_header(BytesIO(data))
+    for length in range(0, len(data) - 1, 61):
+        found = read_header(BytesIO(data[:length]))
+        assert found is None or (found == whole and length > 0.9 * len(data))  # all but a tag at the end
 
 
 @pytest.mark.parametrize("suffix, progressive", [("jpg", 0), ("jpg", 1), ("png", 0)])

@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import grimp
+import lizard
 
 ROOT = Path(__file__).parents[2]
 ROOMS = ("orchestrator", "prepare", "export", "workers", "renderer", "partition", "synthetic", "scene")
@@ -99,6 +100,16 @@ def long_functions() -> Iterator[str]:
     yield from (
         f"{name}: is no longer long, drop its exception" for name in LONG_FUNCTIONS if name not in found
     )
+
+
+def long_functions_of_others() -> Iterator[str]:
+    """Functions of C++ and JavaScript with more than `MAX_FUNCTION` lines of code, without inner ones."""
+    for file in tracked():
+        if file.suffix in (".cpp", ".h", ".cu", ".cuh", ".js"):
+            name = str(file if file.suffix == ".js" else file.with_suffix(".cpp"))  # of a language it knows
+            for function in lizard.analyze_file.analyze_source_code(name, text(file)).function_list:
+                if function.nloc > MAX_FUNCTION:
+                    yield f"{file}:{function.name}: {function.nloc} lines"
 
 
 def small_modules() -> Iterator[str]:
@@ -201,6 +212,7 @@ RULES: tuple[Callable[[], Iterator[str]], ...] = (
     full_folders,
     long_files,
     long_functions,
+    long_functions_of_others,
     small_modules,
     import_circles,
     tests_of_benchmarks,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from playwright.sync_api import Browser, Page
 
-from tests.orchestrator.watch.dashboard.browser import chromium
+from tests.orchestrator.watch.dashboard.browser import PATIENCE_MS, chromium
 from tests.visual.compare import Picture
 from tests.visual.fixed import NOW, fixed_fonts
 
@@ -61,6 +61,7 @@ def fixed_page(browser: Browser, folder: Path) -> Iterator[Page]:
     """A page where time stands still and nothing moves; it shows `folder` as /data."""
     context = browser.new_context(reduced_motion="reduce", locale="en-GB", timezone_id="UTC")
     page = context.new_page()
+    page.set_default_timeout(PATIENCE_MS)
     page.clock.set_fixed_time(NOW)
     page.add_init_script(_RENAME % {"old": json.dumps(str(folder)), "new": json.dumps("/data")})
     try:

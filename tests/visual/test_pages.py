@@ -53,7 +53,7 @@ _HARD_TO_READ = {  # rules, and a text that is then hard to read
     "#stages { position: relative; } #stages::after { content: ''; position: absolute; inset: 0;"
     " background: rgb(128 128 128 / 85%); }": "Stage I",  # under a slab
     "#log-text::placeholder { color: #aaa; }": "Search",
-    "#view-source { color: #bbb; }": "block 1",  # in a field
+    "#view-source { color: #bbb; }": "held_out_000.jpg",  # in a field
     "#facts { opacity: 0.35; }": "Progress",
     ".tag { background: none !important; color: #999; }": "render",  # on a picture
 }

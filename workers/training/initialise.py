@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from panolog.partition.bounds import baseline
+from panolog.partition.bounds import baseline, strays
 from panolog.partition.cells import Volume
 from panolog.scene.gaussians import SH_C0, SH_REST, Gaussians, concatenate, logit
 from panolog.scene.images import View, pixels, unexposed
@@ -37,7 +37,7 @@ def scene_length(scene: Scene) -> float:
 def camera_extent(scene: Scene, views: Sequence[int]) -> float:
     """Extent of 3DGS: 1.1 × the largest distance of a camera from the mean of them, world units.
 
-    At least that of two neighbours, for views at one position.
+    Without `strays`, and at least that of two neighbours, for views at one position.
 
     Args: views, the rows of `scene.panoramas` that are trained on. So a block takes steps, and splits at
     sizes, that fit its part of the scene.
@@ -47,6 +47,7 @@ def camera_extent(scene: Scene, views: Sequence[int]) -> float:
 
 def extent_of(centers: NDArray[np.float64], apart: float) -> float:
     """`camera_extent` of cameras at centers (K, 3). Args: apart, the distance of neighbours, world units."""
+    centers = centers[~strays(centers)]
     radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     return 1.1 * max(radius, apart / 2)
 

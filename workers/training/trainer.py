@@ -19,7 +19,7 @@ from panolog.renderer import ops
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda.iteration import Problem
-from panolog.renderer.render import encode_jpeg, render, to_bytes
+from panolog.renderer.render import encode_jpeg, hatched, render, to_bytes
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache, View
@@ -378,7 +378,7 @@ class Trainer:
         self.average.clear()
 
     def _preview(self) -> Preview:
-        """The first training view as rendered now; a darkened photograph where a block draws nothing."""
+        """The first training view as rendered now; hatched where a block draws nothing."""
         self.settle()
         view, degree = self.views.first(self.spec.views), self.schedule.sh_degree(self.iteration)
         model, camera, around = self.state.gaussians, self._camera(view.row), self._around(view.row)
@@ -387,6 +387,6 @@ class Trainer:
             photograph, picture = view.image.cpu().numpy(), to_bytes(rendered.color)
             if around is not None:
                 left_out = ~around.active(self.spec.width, self.spec.width // 2).cpu().numpy()
-                picture[left_out] = photograph[left_out] // 4
+                picture[left_out] = hatched(photograph)[left_out]
             jpeg = encode_jpeg(np.concatenate([picture, photograph]), PREVIEW_WIDTH)
         return Preview(self.spec.task, self.iteration, self.scene.panoramas[view.row].name, jpeg)

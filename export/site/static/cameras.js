@@ -40,7 +40,9 @@ function show(walk) {
   mark(walk.current);
   const many = found.length > LISTED;
   at("found").textContent = found.length
-    ? many ? `the first ${LISTED} of ${number.format(found.length)}` : ""
+    ? many
+      ? `the first ${LISTED} of ${number.format(found.length)}`
+      : ""
     : "no camera has such a name";
 }
 

@@ -27,7 +27,10 @@ export function say(text, failed = false) {
   at("state").classList.toggle("failed", failed);
 }
 
-const SECTIONS = [["list", "cameras"], ["how", "help"]];
+const SECTIONS = [
+  ["list", "cameras"],
+  ["how", "help"],
+];
 
 /** @param {string} section  Opens or closes a section, and closes the other one. Returns whether it is open. */
 export function toggle(section) {

@@ -31,7 +31,11 @@ export const between = (a, b, t = 1) => [a[0] + t * (b[0] - a[0]), a[1] + t * (b
 export const distance = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
 
 /** @param {Point} point @param {Point} direction @param {number} by @returns {Point} */
-export const shifted = (point, direction, by) => [point[0] + by * direction[0], point[1] + by * direction[1], point[2] + by * direction[2]];
+export const shifted = (point, direction, by) => [
+  point[0] + by * direction[0],
+  point[1] + by * direction[1],
+  point[2] + by * direction[2],
+];
 
 export class Flight {
   /** @param {Pose} pose @param {number} step  World units that are a step here: the sense of scale. */
@@ -147,7 +151,8 @@ export class Flight {
     const journey = this._journey;
     if (journey) {
       journey.time += seconds;
-      const t = Math.min(1, journey.time / journey.seconds), share = smooth(t);
+      const t = Math.min(1, journey.time / journey.seconds),
+        share = smooth(t);
       this._place({
         position: between(journey.from.position, journey.to.position, share),
         yaw: journey.from.yaw + share * wrap(journey.to.yaw - journey.from.yaw),

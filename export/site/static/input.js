@@ -11,7 +11,16 @@ const SPIN = 70; // degrees per second by the arrows
 const PACE = 2.2; // steps per second by the keys
 const FASTER = 4;
 /** @type {Record<string, Point>} right, up, ahead */
-const KEYS = { KeyW: [0, 0, 1], KeyS: [0, 0, -1], KeyA: [-1, 0, 0], KeyD: [1, 0, 0], KeyE: [0, 1, 0], KeyQ: [0, -1, 0], PageUp: [0, 1, 0], PageDown: [0, -1, 0] };
+const KEYS = {
+  KeyW: [0, 0, 1],
+  KeyS: [0, 0, -1],
+  KeyA: [-1, 0, 0],
+  KeyD: [1, 0, 0],
+  KeyE: [0, 1, 0],
+  KeyQ: [0, -1, 0],
+  PageUp: [0, 1, 0],
+  PageDown: [0, -1, 0],
+};
 /** @type {Record<string, [number, number]>} left, up */
 const ARROWS = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
@@ -41,14 +50,16 @@ export function listenToPointers(canvas, flight, calls) {
   canvas.addEventListener("pointermove", (event) => {
     const from = held.get(event.pointerId);
     if (!from) return;
-    const dx = event.clientX - from.x, dy = event.clientY - from.y;
+    const dx = event.clientX - from.x,
+      dy = event.clientY - from.y;
     if (!far && Math.hypot(dx, dy) < STILL) return;
     if (!far) calls.grab();
     far = true;
     const others = [...held].filter(([id]) => id !== event.pointerId).map(([, place]) => place);
     if (others.length) {
       const [other] = others;
-      const apart = Math.hypot(event.clientX - other.x, event.clientY - other.y) - Math.hypot(from.x - other.x, from.y - other.y);
+      const apart =
+        Math.hypot(event.clientX - other.x, event.clientY - other.y) - Math.hypot(from.x - other.x, from.y - other.y);
       const scale = flight.step * PINCH;
       flight.move([-dx * scale * 0.25, dy * scale * 0.25, apart * scale * 0.5]);
     } else if (from.button === 2 || from.button === 1) {
@@ -66,7 +77,8 @@ export function listenToPointers(canvas, flight, calls) {
     held.delete(event.pointerId);
     if (!from || far || event.type === "pointercancel" || from.button !== 0) return;
     const { left, top } = canvas.getBoundingClientRect();
-    const x = event.clientX - left, y = event.clientY - top;
+    const x = event.clientX - left,
+      y = event.clientY - top;
     const again = event.timeStamp - last.time < TWICE && Math.hypot(x - last.x, y - last.y) < 4 * STILL;
     last = { time: again ? 0 : event.timeStamp, x, y };
     if (again) calls.twice(x, y);
@@ -75,13 +87,17 @@ export function listenToPointers(canvas, flight, calls) {
   canvas.addEventListener("pointerup", release);
   canvas.addEventListener("pointercancel", release);
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    calls.grab();
-    const pixels = event.deltaY * (event.deltaMode === 1 ? 30 : event.deltaMode === 2 ? 300 : 1);
-    const scale = flight.pivot ? flight.pivot * 0.0012 : flight.step * WHEEL;
-    flight.move([0, 0, -Math.max(-400, Math.min(400, pixels)) * scale]);
-  }, { passive: false });
+  canvas.addEventListener(
+    "wheel",
+    (event) => {
+      event.preventDefault();
+      calls.grab();
+      const pixels = event.deltaY * (event.deltaMode === 1 ? 30 : event.deltaMode === 2 ? 300 : 1);
+      const scale = flight.pivot ? flight.pivot * 0.0012 : flight.step * WHEEL;
+      flight.move([0, 0, -Math.max(-400, Math.min(400, pixels)) * scale]);
+    },
+    { passive: false },
+  );
 }
 
 /**
@@ -97,10 +113,12 @@ export function listenToKeys(flight, commands, grab) {
   const apply = () => {
     /** @type {Point} */
     const speed = [0, 0, 0];
-    let left = 0, up = 0;
+    let left = 0,
+      up = 0;
     const pace = PACE * (shift ? FASTER : 1);
     for (const code of down) {
-      const by = KEYS[code], turn = ARROWS[code];
+      const by = KEYS[code],
+        turn = ARROWS[code];
       if (by) for (const axis of /** @type {const} */ ([0, 1, 2])) speed[axis] += by[axis] * pace;
       if (turn) [left, up] = [left + turn[0], up + turn[1]];
     }
@@ -111,7 +129,8 @@ export function listenToKeys(flight, commands, grab) {
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return;
     const element = /** @type {HTMLElement} */ (event.target);
-    const writes = element.matches("input[type=search]"), slides = element.matches("input[type=range]");
+    const writes = element.matches("input[type=search]"),
+      slides = element.matches("input[type=range]");
     if (event.key === "Escape" || !(writes || slides)) {
       const command = commands[event.key.toLowerCase()];
       if (command && !event.repeat && !(event.key === "Enter" && element.matches("button, a"))) command(event);

@@ -75,7 +75,8 @@ export class Measure {
     const [a, b] = this.points;
     const strong = document.createElement("strong");
     strong.textContent = written(distance(a, b), this._metres);
-    const height = written(Math.abs(a[1] - b[1]), this._metres), level = written(Math.hypot(a[0] - b[0], a[2] - b[2]), this._metres);
+    const height = written(Math.abs(a[1] - b[1]), this._metres),
+      level = written(Math.hypot(a[0] - b[0], a[2] - b[2]), this._metres);
     at("measured").replaceChildren(strong, ` apart; ${level} along the ground, ${height} in height`);
   }
 
@@ -86,14 +87,17 @@ export class Measure {
 
   /** Draws points and line over the picture. */
   _draw() {
-    const lines = at("lines"), labels = at("labels");
+    const lines = at("lines"),
+      labels = at("labels");
     if (!this.points.length) {
       if (lines.childElementCount) lines.replaceChildren();
       if (labels.childElementCount) labels.replaceChildren();
       return;
     }
     const places = this.points.map((point) => this._stage.project(point));
-    const shapes = places.filter(({ ahead }) => ahead > this._near).map(({ x, y }) => shape("circle", { cx: x, cy: y, r: 5 }));
+    const shapes = places
+      .filter(({ ahead }) => ahead > this._near)
+      .map(({ x, y }) => shape("circle", { cx: x, cy: y, r: 5 }));
     const line = this._visible();
     labels.replaceChildren();
     if (line) {

@@ -46,12 +46,18 @@ export class Panorama {
     material.depthWrite = false;
     if (before) material.blendType = pc.BLEND_NORMAL;
     this._material = material;
-    const mesh = pc.Mesh.fromGeometry(app.graphicsDevice, new pc.SphereGeometry({ radius: 1, latitudeBands: 32, longitudeBands: 32 }));
+    const mesh = pc.Mesh.fromGeometry(
+      app.graphicsDevice,
+      new pc.SphereGeometry({ radius: 1, latitudeBands: 32, longitudeBands: 32 }),
+    );
     const shape = new pc.MeshInstance(mesh, material);
     shape.cull = false;
     shape.pick = false;
     this.entity = new pc.Entity(`panorama-${where}`);
-    this.entity.addComponent("render", { meshInstances: [shape], layers: [before ? pc.LAYERID_IMMEDIATE : pc.LAYERID_WORLD] });
+    this.entity.addComponent("render", {
+      meshInstances: [shape],
+      layers: [before ? pc.LAYERID_IMMEDIATE : pc.LAYERID_WORLD],
+    });
     this.entity.enabled = false;
     app.root.addChild(this.entity);
     this.opacity = before ? 0 : 1;
@@ -75,8 +81,16 @@ export class Panorama {
     const picture = fitted(image, device.maxTextureSize);
     this._texture?.destroy();
     this._texture = new pc.Texture(device, {
-      name: "panorama", width: picture.width, height: picture.height, format: pc.PIXELFORMAT_RGBA8, mipmaps: false, flipY: false,
-      minFilter: pc.FILTER_LINEAR, magFilter: pc.FILTER_LINEAR, addressU: pc.ADDRESS_REPEAT, addressV: pc.ADDRESS_CLAMP_TO_EDGE,
+      name: "panorama",
+      width: picture.width,
+      height: picture.height,
+      format: pc.PIXELFORMAT_RGBA8,
+      mipmaps: false,
+      flipY: false,
+      minFilter: pc.FILTER_LINEAR,
+      magFilter: pc.FILTER_LINEAR,
+      addressU: pc.ADDRESS_REPEAT,
+      addressV: pc.ADDRESS_CLAMP_TO_EDGE,
     });
     this._texture.setSource(picture);
     const [x, y, z, w] = rotation;

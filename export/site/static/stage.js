@@ -7,7 +7,8 @@ const FOV = 85; // degrees along the longer side of the window
 const BUDGET = matchMedia("(pointer: coarse)").matches ? 800_000 : 2_000_000; // Gaussians that are drawn of a streamed model
 const FIRST = 500_000; // of them until it is known how fast the machine is
 const LEAST = 150_000; // of them, however slow the machine is
-const SLOW = 90, QUICK = 35; // ms of a frame while the view moves: above, less is drawn; below, more again
+const SLOW = 90,
+  QUICK = 35; // ms of a frame while the view moves: above, less is drawn; below, more again
 const FRAMES = 5; // that are averaged
 const REST = 220; // ms without movement after which a picture is drawn in full resolution
 const SOLID = 100; // of 255: opacity from which on there is something that can be pointed at
@@ -49,8 +50,10 @@ export class Stage {
     this.canvas = canvas;
     this.camera = new pc.Entity("camera");
     this.camera.addComponent("camera", {
-      clearColor: new pc.Color(0.05, 0.063, 0.082), fov: FOV,
-      toneMapping: pc.TONEMAP_NONE, gammaCorrection: pc.GAMMA_SRGB,
+      clearColor: new pc.Color(0.05, 0.063, 0.082),
+      fov: FOV,
+      toneMapping: pc.TONEMAP_NONE,
+      gammaCorrection: pc.GAMMA_SRGB,
     });
     app.root.addChild(this.camera);
     const splats = app.scene.gsplat;
@@ -102,7 +105,8 @@ export class Stage {
     const full = Math.min(window.devicePixelRatio || 1, 2);
     const ratio = this._detail === 1 ? full : Math.max(COARSEST, this._detail);
     app.graphicsDevice.maxPixelRatio = Math.min(full, ratio);
-    const width = Math.max(1, Math.round(canvas.clientWidth * Math.min(full, ratio))), height = Math.max(1, Math.round(canvas.clientHeight * Math.min(full, ratio)));
+    const width = Math.max(1, Math.round(canvas.clientWidth * Math.min(full, ratio))),
+      height = Math.max(1, Math.round(canvas.clientHeight * Math.min(full, ratio)));
     if (canvas.width !== width || canvas.height !== height) app.graphicsDevice.setResolution(width, height);
     const camera = /** @type {pc.CameraComponent} */ (this.camera.camera);
     camera.horizontalFov = canvas.clientWidth > canvas.clientHeight;
@@ -136,13 +140,21 @@ export class Stage {
     app.autoRender = false;
     this.loading = levels > 1 ? 1 : 0;
     app.on("update", () => this._adapt());
-    app.systems.gsplat.on("frame:ready", (/** @type {unknown} */ _, /** @type {unknown} */ __, /** @type {boolean} */ ready, /** @type {number} */ loading) => {
-      this.loading = ready ? loading : Math.max(1, loading);
-      if (this.loading || !this.model?.lodRangeMin) return;
-      this.model.lodRangeMin -= 1; // one level after the other: what is near is soon better, and the best comes last
-      this.loading = 1;
-      this.draw();
-    });
+    app.systems.gsplat.on(
+      "frame:ready",
+      (
+        /** @type {unknown} */ _,
+        /** @type {unknown} */ __,
+        /** @type {boolean} */ ready,
+        /** @type {number} */ loading,
+      ) => {
+        this.loading = ready ? loading : Math.max(1, loading);
+        if (this.loading || !this.model?.lodRangeMin) return;
+        this.model.lodRangeMin -= 1; // one level after the other: what is near is soon better, and the best comes last
+        this.loading = 1;
+        this.draw();
+      },
+    );
     this.draw();
   }
 
@@ -162,11 +174,16 @@ export class Stage {
   async _add(url, contents, progress) {
     const { app } = this;
     const asset = new pc.Asset("model", "gsplat", contents ? { url, filename: url, contents } : { url });
-    asset.on("progress", (/** @type {number} */ loaded, /** @type {number} */ total) => total && progress(Math.min(1, loaded / total)));
+    asset.on(
+      "progress",
+      (/** @type {number} */ loaded, /** @type {number} */ total) => total && progress(Math.min(1, loaded / total)),
+    );
     app.assets.add(asset);
     await new Promise((resolve, reject) => {
       asset.once("load", resolve);
-      asset.once("error", (/** @type {unknown} */ error) => reject(new StageError(`The model cannot be read: ${error}`)));
+      asset.once("error", (/** @type {unknown} */ error) =>
+        reject(new StageError(`The model cannot be read: ${error}`)),
+      );
       app.assets.load(asset);
     });
     const entity = new pc.Entity("model");
@@ -180,7 +197,8 @@ export class Stage {
 
   /** @param {boolean} streamed  Resolves when the first picture has been drawn. */
   _first(streamed) {
-    const { app } = this, { gsplat } = app.systems;
+    const { app } = this,
+      { gsplat } = app.systems;
     let begun = !streamed;
     return new Promise((resolve) => {
       /** @param {unknown} _ @param {unknown} __ @param {boolean} ready @param {number} loading */
@@ -196,7 +214,8 @@ export class Stage {
 
   /** Once a tick: draws less on a slow machine while the view moves or gets finer, and in full once it rests. */
   _adapt() {
-    const now = performance.now(), { drawn } = this;
+    const now = performance.now(),
+      { drawn } = this;
     this.drawn = false;
     if (drawn) this._times.push(now - this._ticked);
     this._ticked = now;
@@ -234,7 +253,10 @@ export class Stage {
     const box = this.model?.resource?.aabb;
     if (!box) return { middle: [0, 0, 0], radius: 1 };
     const { center, halfExtents } = box;
-    return { middle: [-center.x, -center.y, center.z], radius: Math.hypot(halfExtents.x, halfExtents.y, halfExtents.z) || 1 };
+    return {
+      middle: [-center.x, -center.y, center.z],
+      radius: Math.hypot(halfExtents.x, halfExtents.y, halfExtents.z) || 1,
+    };
   }
 
   /** @param {number} step  World units of a step: what the camera's range and the levels of detail depend on. */
@@ -255,8 +277,15 @@ export class Stage {
    */
   async pick(x, y, rounds = 2) {
     const { clientWidth: width, clientHeight: height } = this.canvas;
-    const column = Math.max(0, Math.min(width - 1, Math.floor(x))), row = Math.max(0, Math.min(height - 1, Math.floor(y)));
-    const texture = new pc.Texture(this.app.graphicsDevice, { name: "depth", width, height, format: pc.PIXELFORMAT_RGBA8, mipmaps: false });
+    const column = Math.max(0, Math.min(width - 1, Math.floor(x))),
+      row = Math.max(0, Math.min(height - 1, Math.floor(y)));
+    const texture = new pc.Texture(this.app.graphicsDevice, {
+      name: "depth",
+      width,
+      height,
+      format: pc.PIXELFORMAT_RGBA8,
+      mipmaps: false,
+    });
     const target = new pc.RenderTarget({ colorBuffer: texture, depth: true });
     const pixel = new pc.Vec4((column - 1) / width, (height - 2 - row) / height, 3 / width, 3 / height);
     /** @param {number[]} depths @param {number} mode */
@@ -275,7 +304,11 @@ export class Stage {
       }
       const [near, far] = [Math.exp(from), Math.exp(to)];
       const [weighed, weight] = await seen([near, far, 0], 2);
-      return this._along(((2 * column + 1) / width) - 1, 1 - (2 * row + 1) / height, near + (weighed / Math.max(1, weight)) * (far - near));
+      return this._along(
+        (2 * column + 1) / width - 1,
+        1 - (2 * row + 1) / height,
+        near + (weighed / Math.max(1, weight)) * (far - near),
+      );
     } finally {
       target.destroy();
       texture.destroy();
@@ -286,7 +319,8 @@ export class Stage {
   /** @param {number} across @param {number} up  in [-1, 1] of the picture @param {number} depth  along the view. @returns {Point} */
   _along(across, up, depth) {
     const { data } = /** @type {pc.CameraComponent} */ (this.camera.camera).projectionMatrix;
-    const from = this.camera.getPosition(), axes = [this.camera.right, this.camera.up, this.camera.forward];
+    const from = this.camera.getPosition(),
+      axes = [this.camera.right, this.camera.up, this.camera.forward];
     const by = [(across * depth) / data[0], (up * depth) / data[5], depth];
     /** @param {"x" | "y" | "z"} axis */
     const sum = (axis) => axes.reduce((place, direction, i) => place + by[i] * direction[axis], from[axis]);
@@ -296,7 +330,9 @@ export class Stage {
   /** @param {pc.RenderTarget} target @param {number[]} depths @param {pc.Vec4} part  of it. Draws the model as `DEPTH` says. */
   _drawDepth(target, depths, part) {
     const camera = /** @type {pc.CameraComponent} */ (this.camera.camera);
-    const { clearColor } = camera, { x, y, z, w } = camera.scissorRect, hidden = this.backdrops.filter((entity) => entity.enabled);
+    const { clearColor } = camera,
+      { x, y, z, w } = camera.scissorRect,
+      hidden = this.backdrops.filter((entity) => entity.enabled);
     camera.renderTarget = target;
     camera.scissorRect = part;
     camera.clearColor = new pc.Color(0, 0, 0, 0);
@@ -317,7 +353,11 @@ export class Stage {
     const matrix = new pc.Mat4().mul2(camera.projectionMatrix, camera.viewMatrix);
     matrix.transformVec4(place, place);
     const { clientWidth, clientHeight } = this.canvas;
-    return { x: (place.x / place.w / 2 + 0.5) * clientWidth, y: (0.5 - place.y / place.w / 2) * clientHeight, ahead: place.w };
+    return {
+      x: (place.x / place.w / 2 + 0.5) * clientWidth,
+      y: (0.5 - place.y / place.w / 2) * clientHeight,
+      ahead: place.w,
+    };
   }
 }
 
@@ -325,10 +365,18 @@ export class Stage {
 export async function makeStage(canvas) {
   let device;
   try {
-    device = await pc.createGraphicsDevice(canvas, { deviceTypes: [pc.DEVICETYPE_WEBGL2], antialias: false, alpha: false, powerPreference: "high-performance" });
+    device = await pc.createGraphicsDevice(canvas, {
+      deviceTypes: [pc.DEVICETYPE_WEBGL2],
+      antialias: false,
+      alpha: false,
+      powerPreference: "high-performance",
+    });
   } catch {
     device = null;
   }
-  if (!device) throw new StageError("This browser cannot draw in 3D: WebGL 2 is missing or switched off. Try another browser, or switch on hardware acceleration.");
+  if (!device)
+    throw new StageError(
+      "This browser cannot draw in 3D: WebGL 2 is missing or switched off. Try another browser, or switch on hardware acceleration.",
+    );
   return new Stage(canvas, device);
 }

@@ -2,12 +2,12 @@
 
 import { offerCameras } from "./cameras.js";
 import { at, button, close, number, press, say, still, toggle } from "./dom.js";
-import { Flight, ahead, angles, between, distance, shifted } from "./flight.js";
+import { ahead, angles, between, distance, Flight, shifted } from "./flight.js";
 import { listenToKeys, listenToPointers } from "./input.js";
 import { Measure } from "./measure.js";
 import { Panorama } from "./panorama.js";
-import { StageError, makeStage } from "./stage.js";
-import { Walk, spacing } from "./walk.js";
+import { makeStage, StageError } from "./stage.js";
+import { spacing, Walk } from "./walk.js";
 
 /** @typedef {import("./page.js").Page} Page @typedef {import("./page.js").Pose} Pose */
 
@@ -29,7 +29,10 @@ async function read() {
 
 /** @param {Page} page  Says how large the model is, and how far its training. */
 function tell(page) {
-  const part = page.shown < page.total ? `${number.format(page.shown)} of ${number.format(page.total)}` : number.format(page.total);
+  const part =
+    page.shown < page.total
+      ? `${number.format(page.shown)} of ${number.format(page.total)}`
+      : number.format(page.total);
   const iteration = page.iteration ? ` · iteration ${number.format(page.iteration)}` : ""; // not of older pages
   at("count").textContent = page.total ? `${part} Gaussians${iteration}` : "";
 }
@@ -48,7 +51,8 @@ async function approach(stage, flight, x, y) {
   const point = await stage.pick(x, y);
   if (!point) return;
   const position = between(flight.position, point, NEARER);
-  const [x0, y0, z0] = flight.position, [x1, y1, z1] = point;
+  const [x0, y0, z0] = flight.position,
+    [x1, y1, z1] = point;
   const look = angles([x1 - x0, y1 - y0, z1 - z0]);
   for (const call of flight.onLeave) call();
   flight.travel({ position, ...look }, still.matches ? 0 : 0.8);
@@ -157,19 +161,30 @@ async function show() {
   offerCameras(walk);
   listenToPointers(canvas, flight, {
     click: (x, y) => measure.take(x, y),
-    twice: (x, y) => measure.active ? measure.take(x, y) : approach(stage, flight, x, y),
+    twice: (x, y) => (measure.active ? measure.take(x, y) : approach(stage, flight, x, y)),
     grab,
   });
-  listenToKeys(flight, {
-    escape: () => close() || (measure.active && measure.toggle()) || flight.halt(),
-    h: () => button("how").click(), "?": () => button("how").click(),
-    p: () => walk.toggle(), ",": () => walk.step(-1), ".": () => walk.step(1),
-    m: () => measure.toggle(), o: orbit, 0: home, enter: middle,
-  }, grab);
+  listenToKeys(
+    flight,
+    {
+      escape: () => close() || (measure.active && measure.toggle()) || flight.halt(),
+      h: () => button("how").click(),
+      "?": () => button("how").click(),
+      p: () => walk.toggle(),
+      ",": () => walk.step(-1),
+      ".": () => walk.step(1),
+      m: () => measure.toggle(),
+      o: orbit,
+      0: home,
+      enter: middle,
+    },
+    grab,
+  );
 
   let last = performance.now();
   stage.app.on("update", () => {
-    const now = performance.now(), seconds = (now - last) / 1000;
+    const now = performance.now(),
+      seconds = (now - last) / 1000;
     last = now;
     walk.update(seconds);
     if (flight.update(seconds)) stage.follow(flight);
@@ -185,17 +200,22 @@ async function show() {
   let ready = false;
   const progress = /** @type {HTMLProgressElement} */ (at("progress"));
   const sky = showSky(stage, page);
-  await stage.load(page.model, contents, (share) => {
-    progress.hidden = false;
-    progress.value = share;
-  }, () => {
-    if (page.step === null && !page.cameras.length) flight.step = stage.bounds.radius / 20;
-    stage.setStep(flight.step);
-    if (page.start || page.cameras.length) return;
-    page.start = outside(stage.bounds);
-    flight.set(page.start);
-    stage.follow(flight);
-  });
+  await stage.load(
+    page.model,
+    contents,
+    (share) => {
+      progress.hidden = false;
+      progress.value = share;
+    },
+    () => {
+      if (page.step === null && !page.cameras.length) flight.step = stage.bounds.radius / 20;
+      stage.setStep(flight.step);
+      if (page.start || page.cameras.length) return;
+      page.start = outside(stage.bounds);
+      flight.set(page.start);
+      stage.follow(flight);
+    },
+  );
   progress.hidden = true;
   ready = true;
   say("");

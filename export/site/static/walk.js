@@ -13,13 +13,17 @@ const PAUSE = 1.6; // s at each camera for who wants no movement
 
 /** @param {Camera[]} cameras  The usual distance between one and the next, 0 if there is none. */
 export function spacing(cameras) {
-  const steps = cameras.slice(1).map((camera, i) => distance(camera.position, cameras[i].position)).filter((step) => step > 0);
+  const steps = cameras
+    .slice(1)
+    .map((camera, i) => distance(camera.position, cameras[i].position))
+    .filter((step) => step > 0);
   return steps.sort((a, b) => a - b)[steps.length >> 1] ?? 0;
 }
 
 /** @param {Camera[]} cameras @param {Point} position  The number of the nearest one. */
 function nearest(cameras, position) {
-  let best = 0, least = Infinity;
+  let best = 0,
+    least = Infinity;
   cameras.forEach((camera, i) => {
     const away = distance(camera.position, position);
     if (away < least) [best, least] = [i, away];
@@ -31,7 +35,9 @@ function nearest(cameras, position) {
 function spline(a, b, c, d, t) {
   /** @param {0 | 1 | 2} i */
   const axis = (i) =>
-    0.5 * (2 * b[i] + t * (c[i] - a[i] + t * (2 * a[i] - 5 * b[i] + 4 * c[i] - d[i] + t * (3 * (b[i] - c[i]) + d[i] - a[i]))));
+    0.5 *
+    (2 * b[i] +
+      t * (c[i] - a[i] + t * (2 * a[i] - 5 * b[i] + 4 * c[i] - d[i] + t * (3 * (b[i] - c[i]) + d[i] - a[i]))));
   return [axis(0), axis(1), axis(2)];
 }
 
@@ -73,8 +79,7 @@ export class Walk {
     button("back").addEventListener("click", () => this.step(-1));
     button("on").addEventListener("click", () => this.step(1));
     input("along").addEventListener("input", () => {
-      this.pause();
-      this._leave();
+      this.leave();
       this.place = Number(input("along").value);
       this._flight.set(this._pose());
       this._say();
@@ -84,9 +89,9 @@ export class Walk {
       if (Math.abs(near - this.place) < 0.02) this.go(this.cameras[near]);
     });
     button("photograph").addEventListener("click", () => {
-      const shown = pressed("photograph") && (this._arrived !== null || !this.current);
-      press("photograph", !shown);
-      if (!shown) this._show();
+      press("photograph", !pressed("photograph"));
+      if (pressed("photograph") && this.current) this._show();
+      else if (pressed("photograph")) this.go(this.cameras[nearest(this.cameras, this._flight.position)]);
     });
     input("strength").addEventListener("input", () => {
       if (!pressed("photograph")) button("photograph").click();
@@ -105,6 +110,7 @@ export class Walk {
     this._waited = 0;
     this._turned = [0, 0];
     this._leave();
+    press("photograph", false);
     if (this.place >= this.cameras.length - 1) this.place = 0;
     this._mark();
     this._flight.travel(this._pose(), still.matches ? 0 : 0.6);
@@ -128,7 +134,10 @@ export class Walk {
     if (camera) this.go(camera);
   }
 
-  /** @param {Camera} camera @param {boolean} [atOnce]  Goes there and shows its photograph; at once, the model. */
+  /**
+   * Goes there, and shows its photograph if that is on; at once, the model.
+   * @param {Camera} camera @param {boolean} [atOnce]
+   */
   go(camera, atOnce = false) {
     this.pause();
     this._leave();
@@ -141,10 +150,11 @@ export class Walk {
     this._flight.travel(camera, atOnce || still.matches ? 0 : TRAVEL, () => atOnce || this._show());
   }
 
-  /** The user moves the view away. */
+  /** The user moves the view away: what is shown there is the model. */
   leave() {
     this.pause();
     this._leave();
+    press("photograph", false);
   }
 
   _leave() {
@@ -172,14 +182,17 @@ export class Walk {
 
   /** @returns {Pose} the pose on the path at `place`, looking along it */
   _pose() {
-    const { cameras, place } = this, i = Math.min(cameras.length - 1, Math.floor(place)), t = place - i;
+    const { cameras, place } = this,
+      i = Math.min(cameras.length - 1, Math.floor(place)),
+      t = place - i;
     if (t < 1e-6) return cameras[i];
     /** @param {number} k */
     const point = (k) => cameras[Math.max(0, Math.min(cameras.length - 1, k))].position;
     const far = distance(point(i), point(i + 1)) > GAP * this._usual;
     const curve = (/** @type {number} */ s) =>
       far ? between(point(i), point(i + 1), s) : spline(point(i - 1), point(i), point(i + 1), point(i + 2), s);
-    const from = cameras[i], to = cameras[Math.min(i + 1, cameras.length - 1)];
+    const from = cameras[i],
+      to = cameras[Math.min(i + 1, cameras.length - 1)];
     const turn = ((((to.yaw - from.yaw + 180) % 360) + 360) % 360) - 180;
     return { position: curve(t), yaw: from.yaw + t * turn, pitch: from.pitch + t * (to.pitch - from.pitch) };
   }
@@ -213,14 +226,17 @@ export class Walk {
   /** @param {number} seconds */
   _fade(seconds) {
     const there = this._arrived !== null && this._arrived === this.current && pressed("photograph");
-    const wanted = there ? Number(input("strength").value) / 100 : 0, { opacity } = this._picture;
+    const wanted = there ? Number(input("strength").value) / 100 : 0,
+      { opacity } = this._picture;
+    at("tag").hidden = opacity === 0;
     if (opacity === wanted) return;
     const by = still.matches ? 1 : seconds / FADE;
     this._picture.setOpacity(opacity < wanted ? Math.min(wanted, opacity + by) : Math.max(wanted, opacity - by));
   }
 
   _say() {
-    const { cameras } = this, near = Math.round(this.place);
+    const { cameras } = this,
+      near = Math.round(this.place);
     input("along").value = String(this.place);
     input("along").setAttribute("aria-valuetext", cameras[near].name);
     at("where").textContent = `${near + 1} / ${cameras.length} · ${cameras[near].name}`;

@@ -77,7 +77,15 @@ def diagnose(
     Raises InputError if the scene, the settings or the address are wrong; StoreLostError.
     """
     packages = (_package(module) for module in PACKAGES)
-    findings = [_cpu(), _memory(), _disk(Path.cwd()), _torch(), _gpu(), _kernels(), *packages]
+    findings = [
+        _cpu(),
+        Finding("memory", f"{gib(psutil.virtual_memory().total)}, {gib(memory())} available"),
+        Finding("disk", f"{gib(shutil.disk_usage(Path.cwd()).free)} free at {Path.cwd()}"),
+        Finding("torch", f"{torch.__version__}, Python {platform.python_version()}"),
+        _gpu(),
+        _kernels(),
+        *packages,
+    ]
     machine = Diagnosis(findings)
     if source is None or not machine.ready:
         return machine
@@ -97,18 +105,6 @@ def _cpu() -> Finding:
     flags = set(_CPUINFO.read_text().split()) if _CPUINFO.is_file() else set()
     simd = next((name for name in _SIMD if name in flags), "none known")
     return Finding("CPU", f"{cores()} cores, {platform.machine()}, best SIMD {simd}")
-
-
-def _memory() -> Finding:
-    return Finding("memory", f"{gib(psutil.virtual_memory().total)}, {gib(memory())} available")
-
-
-def _disk(folder: Path) -> Finding:
-    return Finding("disk", f"{gib(shutil.disk_usage(folder).free)} free at {folder}")
-
-
-def _torch() -> Finding:
-    return Finding("torch", f"{torch.__version__}, Python {platform.python_version()}")
 
 
 def _gpu() -> Finding:

@@ -8,24 +8,20 @@ from typing import Any
 
 import torch
 
-from panolog.export.compressed_ply import write_compressed_ply
+from panolog.export.formats import ChosenModel, write_format
 from panolog.export.frame import Frame
 from panolog.export.georeference import Georeference, georeference_from, georeference_of
-from panolog.export.gltf.glb import write_glb
-from panolog.export.gltf.tiles import TILESET, write_tiles
-from panolog.export.reading import sky_of
+from panolog.export.gltf.tiles import TILESET
 from panolog.export.site.write import DESCRIPTION
-from panolog.export.sky import render_sky, write_sky_image
-from panolog.export.sog.write import write_sog
-from panolog.export.splats import ModelSource, Part, Selection
-from panolog.export.spz import LARGEST, REACH, Version, write_spz
+from panolog.export.splats import Selection
+from panolog.export.spz import Version
 from panolog.orchestrator.cli.session.delivery import provenance
 from panolog.orchestrator.engine.stages.scenes import scene_of
 from panolog.orchestrator.runs.folder import RunFolder, model_of, write_json
 from panolog.orchestrator.runs.info import read_info
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_file, site_of_run, write_folder
 from panolog.scene.errors import ConfigError, InputError
-from panolog.scene.ply import describe_faults, read_sky
+from panolog.scene.ply import describe_faults
 from panolog.scene.write import StageProgress
 
 # By option, the ending of what it writes.
@@ -34,6 +30,7 @@ FORMATS = {
     "web": "-web",
     "spz": ".spz",
     "compressed-ply": ".compressed.ply",
+    "ply": ".ply",
     "glb": ".glb",
     "3dtiles": "-3dtiles",
     "sky-image": ".jpg",
@@ -86,10 +83,11 @@ def export_model(
     ]
     for _, path in jobs:
         path.parent.mkdir(parents=True, exist_ok=True)
+    chosen = ChosenModel(model.ply, model.place, spec.selection, spec.sky, spec.levels, spec.spz)
     written: list[Path] = []
     for done, (kind, path) in enumerate(jobs):
         progress(f"writing {path.name}", done, len(jobs))
-        written += _WRITERS[kind](model, path, spec)
+        written += _web(model, path, spec) if kind == "web" else write_format(kind, chosen, path)
     if output.is_dir() and written != [output]:
         write_json(output / _GEOREFERENCE, model.place.as_json(model.made_of))
         written.append(output / _GEOREFERENCE)
@@ -175,80 +173,9 @@ def _place(output: Path, name: str, kind: str, count: int) -> Path:
     return output / (ending[1:] if folder else f"{stem}{ending}")
 
 
-def _source(
-    model: _Model, spec: ExportSpec, part: Part, frame: Frame | None = None, scale: float = 1.0
-) -> ModelSource:
-    """Raises InputError if nothing is left of the model."""
-    selection = replace(spec.selection, part=part)
-    found = ModelSource(model.ply, selection, frame or model.place.frame, scale)
-    if not found.count:
-        raise InputError(f"{model.ply}: nothing is left of it; select more")
-    return found
-
-
-def _whole(spec: ExportSpec) -> Part:
-    return "all" if spec.sky else "scene"
-
-
-def _sog(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
-    write_sog(path, _source(model, spec, _whole(spec), model.place.upside_down))
-    return [path]
-
-
-def _spz(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
-    """The sky, whose size SPZ may not hold, is a file of its own: pulled in, so that it looks the same."""
-    write_spz(path, _source(model, spec, "scene"), spec.spz)
-    if not spec.sky or not len(read_sky(model.ply)):
-        return [path]
-    sky = sky_of(path)
-    write_spz(sky, _source(model, spec, "sky").within(REACH, LARGEST), spec.spz)
-    return [path, sky]
-
-
-def _compressed_ply(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
-    write_compressed_ply(path, _source(model, spec, _whole(spec), model.place.upside_down))
-    return [path]
-
-
-def _glb(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
-    write_glb(path, _in_metres(model, spec))
-    return [path]
-
-
-def _tiles(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
-    write_tiles(path, _in_metres(model, spec), to_ecef=model.place.tiles_to_ecef(), levels=spec.levels)
-    return [path]
-
-
-def _in_metres(model: _Model, spec: ExportSpec) -> ModelSource:
-    """The scene in the unit of glTF and 3D Tiles, where it is known how large one of the model's is."""
-    return _source(model, spec, "scene", scale=model.place.unit or 1.0)
-
-
 def _web(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
     place, levels = model.place, spec.levels
     wanted = Wanted(selection=spec.selection, sky=spec.sky, streams=True, levels=levels, place=place)
     shown = site_of_run(model.run, wanted) if model.run else site_of_file(model.ply, wanted)
     write_folder(shown, path)
     return [path]
-
-
-def _sky_image(model: _Model, path: Path, _: ExportSpec) -> list[Path]:
-    sky = read_sky(model.ply)
-    if not len(sky):
-        raise InputError(f"{model.ply}: has no sky; leave out --sky-image")
-    image, paths = render_sky(sky, model.place.frame), [path, path.with_suffix(".exr")]
-    for file in paths:
-        write_sky_image(file, image)
-    return paths
-
-
-_WRITERS: dict[str, Callable[[_Model, Path, ExportSpec], list[Path]]] = {
-    "sog": _sog,
-    "web": _web,
-    "spz": _spz,
-    "compressed-ply": _compressed_ply,
-    "glb": _glb,
-    "3dtiles": _tiles,
-    "sky-image": _sky_image,
-}

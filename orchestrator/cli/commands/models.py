@@ -11,7 +11,7 @@ from panolog.export.georeference import georeference_of
 from panolog.export.reading import convert_to_ply, is_ply
 from panolog.orchestrator.cli.console import say
 from panolog.scene.model import Scene
-from panolog.scene.ply import describe_faults
+from panolog.scene.ply import describe_faults, ply_exported
 
 Axes = Literal["export", "model"]
 
@@ -34,10 +34,10 @@ def size_of(path: Path) -> int:
 def as_ply(path: Path, frame: Callable[[], Frame], *, exact: bool) -> Iterator[Path]:
     """Yields a model as a PLY: its own path, or that of a temporary file.
 
-    Args: frame, returns that which it is turned back from, if it is no PLY already; exact, `Gaussians.exact`.
+    Args: frame, returns that which an exported one is turned back from; exact, `Gaussians.exact`.
     Raises FormatError if it is no model.
     """
-    if path.is_file() and is_ply(path):
+    if path.is_file() and is_ply(path) and not ply_exported(path):
         for line in describe_faults(path):
             say(line)
         yield path

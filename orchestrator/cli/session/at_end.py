@@ -6,17 +6,15 @@ store and those who are notified have everything.
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from subprocess import DEVNULL, Popen, TimeoutExpired
 
 from panolog.orchestrator.runs import control
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Outcome
-from panolog.orchestrator.runs.state import RunState, replay
 from panolog.orchestrator.runs.storage.state import read_state
-from panolog.orchestrator.runs.store import read_milestones
-from panolog.scene.errors import InputError, RunFolderError, in_one_line
+from panolog.scene.errors import InputError, in_one_line
 
 _LONGEST_S = 600.0  # for the command; then it goes on by itself
 _REFUSED, _INTERRUPTED = 2, 130  # exit codes of panolog
@@ -57,7 +55,7 @@ def _end(wanted: str, folder: RunFolder, code: int, why: str, say: Say) -> None:
     if mirror is not None and not mirror.complete:
         say(f"--at-end is not carried out, for nothing to be lost: {mirror.line}")
         return
-    outcome, reason = _outcome(folder.database, code)
+    outcome, reason = _outcome(folder.root, code)
     run = str(folder.root.absolute())
     said = {"PANOLOG_OUTCOME": outcome, "PANOLOG_REASON": why or reason, "PANOLOG_RUN": run}
     say(f"carrying out --at-end: {wanted}")
@@ -78,11 +76,9 @@ def _end(wanted: str, folder: RunFolder, code: int, why: str, say: Say) -> None:
             say(f"--at-end has failed (code {failed}): what it was to end may still be there, and paid")
 
 
-def _outcome(database: Path, code: int) -> tuple[str, str]:
+def _outcome(root: Path, code: int) -> tuple[str, str]:
     """How the run has ended, and why: done, limited, failed or refused. Args: code, panolog's exit code."""
-    state = RunState()
-    with suppress(OSError, RunFolderError):
-        state = replay(read_milestones(database))
+    state = control.state_of(root)
     if code == 0:
         reached = state.money.reached
         return str(state.outcome or Outcome.DONE), reached.reason if reached else state.reason

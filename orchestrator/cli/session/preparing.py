@@ -26,6 +26,7 @@ from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.control import Action, ControlRequest
 from panolog.orchestrator.runs.folder import RunFolder, command_line
 from panolog.orchestrator.runs.info import SceneRef
+from panolog.orchestrator.runs.machines.machine import memory
 from panolog.orchestrator.runs.preparation import notes
 from panolog.orchestrator.runs.preparation.notes import Counts, StepProgress, StepResult
 from panolog.orchestrator.runs.preparation.settings import (
@@ -242,7 +243,7 @@ class Preparation:
         """Does the steps that are not done, and returns the scene.
 
         Raises InputError if a step cannot be done or the check finds that the scene is wrong; RunError if a
-        network fails; KeyboardInterrupt at a request to stop.
+        network fails or a process is killed; KeyboardInterrupt at a request to stop.
         """
         write_settings(self.folder, self.settings)
         with stoppable(self.folder):
@@ -285,7 +286,9 @@ class Preparation:
         if not scene.exists():
             options = TypeAdapter(SfmSettings).validate_python(settings.sfm)
             show = self.progress(Step.SFM)
-            made = make_scene(Path(settings.source), scene, options, show, self._with_masks)
+            made = make_scene(
+                Path(settings.source), scene, options, show, self._with_masks, memory() * 3 // 4
+            )
             self._lines += made.lines()
         shutil.rmtree(workspace_folder(scene.resolve()), ignore_errors=True)
         for masks in (MASKS, GIVEN):  # the scene has copies

@@ -254,7 +254,11 @@ class _Beginning:
     def preflight(self, workers: Pool, info: RunInfo) -> RunConfig:
         """The resolved settings of a run, once they are in run.json. Raises InputError if it does not fit."""
         folder, root = self.folder, self.folder.root
-        self._measure(info.config)
+        measuring = Measuring(
+            self.scene, info.config, lambda what: self.journal.record([Preparing(what)]), self.warn
+        )
+        measured = measuring.found()  # how panoramas were captured, if Stage I is to learn that
+        self.journal.until_done(lambda: save_measured(folder, measured, self.scene))
         self.journal.record([Preparing("calibrating")])
         prices, local = prices_of(self.journal.state), self.address is None
         found = _examine(workers, self.scene, info.config, root, self.warn, prices, self._waits, local=local)
@@ -270,14 +274,6 @@ class _Beginning:
         layers = [Noticed(None, line) for line in describe_layers(self.scene)]
         self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), *layers, done])
         return found.config
-
-    def _measure(self, config: RunConfig) -> None:
-        """Keeps what Stage I begins with, if it is to learn how panoramas were captured."""
-        found = Measuring(self.scene, config, self._doing, self.warn).found()
-        self.journal.until_done(lambda: save_measured(self.folder, found, self.scene))
-
-    def _doing(self, what: str) -> None:
-        self.journal.record([Preparing(what)])
 
     def _waits(self, why: str) -> None:
         """For a machine, or "" once there is one."""

@@ -24,10 +24,8 @@ from panolog.orchestrator.runs.machines.children import bound_to_parent, signals
 from panolog.orchestrator.runs.preparation.notes import result_path
 from panolog.orchestrator.runs.preparation.settings import Step
 from panolog.orchestrator.runs.records import Outcome
-from panolog.orchestrator.runs.state import RunState, Status, replay
-from panolog.orchestrator.runs.store import read_milestones
+from panolog.orchestrator.runs.state import RunState, Status
 from panolog.orchestrator.runs.units import duration
-from panolog.scene.errors import RunFolderError
 from panolog.workers.tasks import TaskId
 
 _PROGRAM = (sys.executable, "-m", "panolog.orchestrator.cli")
@@ -62,14 +60,15 @@ def supervise(run: Supervised) -> int:
         return _Supervisor(run, signals, before).supervise()
 
 
-def cause(code: int, state: RunState, pid: int) -> str | None:
+def cause(code: int, state: RunState, *, own: bool) -> str | None:
     """Why another driver may succeed after one has ended; None if it would not, or is not wanted.
 
-    Args: code, its exit code, or minus the signal that has killed it; state, of the run afterwards; pid, its.
+    Args: code, its exit code, or minus the signal that has killed it; state, of the run afterwards; own,
+    whether that is this driver's, which has taken the run over.
     """
     if code < 0:
         return f"killed by signal {-code} ({signal.Signals(-code).name})"
-    if code in (0, 130) or state.driver is None or state.driver.pid != pid:
+    if code in (0, 130) or not own:
         return None  # as wanted, or before it has taken the run over
     if state.outcome is None:
         return f"exit code {code} without a record, as when Ray has lost the head of its cluster"
@@ -122,12 +121,12 @@ class _Supervisor:
         while (code := driver.poll()) is None:
             if (number := self._taken(_POLL_S)) is not None:
                 driver.send_signal(number)
-        state = _state(self.run.root)
+        state = control.state_of(self.run.root)
         own = state.driver is not None and state.driver.pid == driver.pid
         self.taken = self.taken or own
         if own and state.outcome == Outcome.DONE:
             return 0, None  # what has ended it came afterwards, such as the end of the cluster's head
-        return code, cause(code, state, driver.pid)
+        return code, cause(code, state, own=own)
 
     def _taken(self, seconds: float) -> int | None:
         """The next request to stop, if one comes in that time; also returns when a driver has ended."""
@@ -168,15 +167,8 @@ def _answers(host: str, port: int) -> bool:
     return False
 
 
-def _state(root: Path) -> RunState:
-    """That of the run now; that of no run, if it has none or cannot be read."""
-    with suppress(OSError, RunFolderError):
-        return replay(read_milestones(RunFolder(root).database))
-    return RunState()
-
-
 def progress_made(root: Path) -> Saved:
     """What a next driver of a run need not do again: if that grows, resuming it is worth it."""
-    folder, state = RunFolder(root), _state(root)
+    folder, state = RunFolder(root), control.state_of(root)
     steps = frozenset(step for step in Step if result_path(folder, step).exists())
     return steps, {task.id: (task.status == Status.DONE, task.checkpoint) for task in state.tasks.values()}

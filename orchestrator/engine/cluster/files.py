@@ -151,7 +151,9 @@ class NodeFiles:
 
     def _copy(self, path: Path) -> Path:
         folder = Path(ray.get_runtime_context().get_temp_dir()) / _FOLDER / self.cache
-        return folder / _digest(path, self.stamps[path]) / path.name
+        version = (str(path), self.stamps[path])
+        digest = "-".join(hashlib.sha256(repr(it).encode()).hexdigest()[:16] for it in version)
+        return folder / digest / path.name
 
     def _fetch(self, path: Path, stamp: Stamp, copy: Path) -> None:
         with atomic(copy) as temporary, temporary.open("wb") as file:
@@ -285,11 +287,6 @@ def _here() -> str:
     """Ray's id of this machine."""
     node: str = ray.get_runtime_context().get_node_id()
     return node
-
-
-def _digest(path: Path, stamp: Stamp) -> str:
-    """The folder of a copy: 16 digits for its path, then 16 for its version."""
-    return "-".join(hashlib.sha256(repr(it).encode()).hexdigest()[:16] for it in (str(path), stamp))
 
 
 def _make_room(copy: Path, size: int) -> None:

@@ -107,9 +107,4 @@ class RunMetrics:
 
     def _tags(self, sample: MetricSample) -> dict[str, str]:
         values = (self._run, sample.task, sample.node)
-        return {tag: _ascii(value) for tag, value in zip(TAGS, values, strict=True)}
-
-
-def _ascii(text: str) -> str:
-    """Ray refuses a tag with other letters."""
-    return text.encode("ascii", "backslashreplace").decode()
+        return {t: v.encode("ascii", "backslashreplace").decode() for t, v in zip(TAGS, values, strict=True)}

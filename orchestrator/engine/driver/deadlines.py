@@ -52,12 +52,12 @@ class Deadlines:
             if not attempt.ready and silent > self._config.hello:
                 reason = f"no message for {silent:.0f} s since its start: the worker does not begin"
                 found.append((attempt, reason))
-            elif attempt.ready and silent > self._limit(attempt.spec.task):
+            elif silent > self._config.message and attempt.ready and silent > self._limit(attempt.spec.task):
                 found.append((attempt, f"no message for {silent:.0f} s: the worker hangs"))
         return found
 
     def _limit(self, task: TaskId) -> float:
-        """Seconds between two messages of a task, at most."""
+        """Seconds between two messages of a task that works, at most."""
         intervals = sorted(self._intervals.get(task, ()))
         usual = intervals[len(intervals) * 3 // 4] if intervals else 0.0
-        return max(self._config.message, _TIMES * max(usual, self._expected))
+        return _TIMES * max(usual, self._expected)

@@ -28,6 +28,7 @@ from panolog.workers.training.task_config import CacheConfig
 _SMALLER = 1 / 4  # of the image cache, after a shortage of memory
 _FREE = 1 / 2  # of a machine's free memory that its tasks on GPUs fill with decoded panoramas
 _SOME = ""  # a kind of place of which nothing is known: the average one
+_DIGITS = 6  # of the binary number of a block's Gaussians: its memory is known within 3 %
 _OF_LOST = 0.2  # of an error: whatever ends a process says little about its node
 
 
@@ -39,8 +40,6 @@ class Demands:
         self._state = state
         self._samples = block_times(state)
         self._model = fit(self._samples)
-        kinds, plan = (TaskId.block, TaskId.round), state.plan or ()
-        self._blocks = {kind(block.block): block for kind in kinds for block in plan}
 
     def of(self, tasks: Iterable[TaskId]) -> list[Demand]:
         """Those of tasks that wait."""
@@ -68,19 +67,22 @@ class Demands:
         return [Running(where, self._left(task, where, now)) for task, where in placements.items()]
 
     def _demand(self, task: TaskId) -> Demand:
-        state = self._state.task(task)
+        memory, seconds = self._sizes.of(task, self._state), self._seconds(task)
+        if (state := self._state.tasks.get(task)) is None:
+            return Demand(task, memory, seconds)
         more_than = state.starved if state.shortages > 1 else 0
-        memory = self._sizes.of(task, self._state)
         avoid = defaultdict[str, float](float)
         for failure in state.failures:
             for where in filter(None, failure.where):
                 avoid[where] += _OF_LOST if failure.kind == Failure.LOST else 1
         alone = state.shortages > 0
-        return Demand(task, memory, self._seconds(task), alone=alone, more_than=more_than, avoid=avoid)
+        return Demand(task, memory, seconds, alone=alone, more_than=more_than, avoid=avoid)
 
     def _seconds(self, task: TaskId) -> Callable[[str], float]:
-        block = self._blocks.get(task)
-        return _one if block is None else predictor(self._model, block.cameras, block.gaussians)
+        if task.stage not in (Stage.BLOCK, Stage.ROUND):
+            return lambda _: 1.0
+        block = self._sizes.plan(self._state)[task.number]
+        return predictor(self._model, block.cameras, block.gaussians)
 
     def _left(self, task: TaskId, where: Placement, now: float) -> float:
         state = self._state.task(task)
@@ -94,6 +96,7 @@ class Sizes:
 
     def __init__(self, job: Job) -> None:
         self._job = job
+        self._plan: dict[int, BlockPlan] = {}
         self._blocks: dict[int, int] = {}
         self._shards: dict[int, int] = {}
 
@@ -101,7 +104,8 @@ class Sizes:
         """Those of one task. Args: state of the run, which has the plan when blocks are trained."""
         match task.stage:
             case Stage.DISTRICT | Stage.COARSE:
-                return self._coarse
+                stage = self._estimate.stages[0]
+                return stage.device or stage.host
             case Stage.BLOCK | Stage.ROUND:
                 return self._of_blocks(state)[task.number]
             case Stage.REPAIR:  # part of two blocks, on panoramas of both
@@ -118,11 +122,6 @@ class Sizes:
         job = self._job
         return Estimator(job.scene, job.config, basis_of(job.folder, job.scene, job.config), ())
 
-    @cached_property
-    def _coarse(self) -> int:
-        stage = self._estimate.stages[0]
-        return stage.device or stage.host
-
     def expected(self, stage: Stage, state: RunState) -> tuple[float, int] | None:
         """Seconds of all tasks of a stage, one after another, and how many these are; None if not known."""
         for found in self._estimate.stages:
@@ -134,6 +133,11 @@ class Sizes:
     def _estimate(self) -> Estimate:
         return self._estimator.estimate()
 
+    def plan(self, state: RunState) -> Mapping[int, BlockPlan]:
+        """The blocks by number; a run has one plan."""
+        self._plan = self._plan or {block.block: block for block in state.plan or ()}
+        return self._plan
+
     def _of_blocks(self, state: RunState) -> Mapping[int, int]:
         """By block; they are counted once, with the plan."""
         if not self._blocks:
@@ -141,7 +145,8 @@ class Sizes:
         return self._blocks
 
     def _block(self, plan: BlockPlan) -> int:
-        stage = self._estimator.block(self._gaussians, plan.gaussians, plan.cameras)
+        step = 1 << max(0, plan.gaussians.bit_length() - _DIGITS)  # rounded up: of thousands, few differ
+        stage = self._estimator.block(self._gaussians, -(-plan.gaussians // step) * step, plan.cameras)
         return stage.device or stage.host
 
     @cached_property
@@ -160,7 +165,7 @@ class Sizes:
     @cached_property
     def _rendering(self) -> int:
         """Scoring and evaluation with the whole model, whichever is larger."""
-        estimator, work = self._estimator, (self._gaussians, self._cameras)
+        estimator, work = self._estimator, (self._gaussians, len(self._job.scene.train))
         needs = [estimator.rendering(*work), estimator.scoring(*work)]
         return max(device or host for host, device in needs)
 
@@ -169,10 +174,6 @@ class Sizes:
         """What Stage I came to; where a limit has ended it, what was made of it."""
         model = self._job.folder.model(COARSE)
         return ply_header(model if model.exists() else self._job.folder.point_cloud)[0]
-
-    @property
-    def _cameras(self) -> int:
-        return len(self._job.scene.train)
 
 
 def image_cache(cache: CacheConfig, where: Placement, node: Node, need: int, shortages: int) -> CacheConfig:
@@ -189,7 +190,3 @@ def image_cache(cache: CacheConfig, where: Placement, node: Node, need: int, sho
         if device is None:
             device = max(0.0, USABLE * where.memory - need) / 2**30
     return cache.model_copy(update={"memory": memory, "device": device})
-
-
-def _one(_: str) -> float:
-    return 1.0

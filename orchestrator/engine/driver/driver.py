@@ -18,6 +18,7 @@ from panolog.orchestrator.engine.driver.ending import end_recorded
 from panolog.orchestrator.engine.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.engine.driver.journal import Journal, Patience
 from panolog.orchestrator.engine.driver.machines import Machines
+from panolog.orchestrator.engine.driver.policy import outcome
 from panolog.orchestrator.engine.driver.purse import Purse
 from panolog.orchestrator.engine.driver.requests import Requests, Stop
 from panolog.orchestrator.engine.driver.results import Deliver, OnPlan, Results
@@ -66,7 +67,7 @@ from panolog.workers.training.trainer import TrainSpec
 
 _WAIT_S = 0.5  # after which the display is refreshed without a message
 _TURN_S = 0.05  # the same while something large is written
-_STARTS_S = 1.0  # of a turn in which tasks are started: what blocks begin with may take minutes to cut
+_STARTS_S = 0.5  # of a turn in which tasks are started: what blocks begin with may take minutes to cut
 _REVIEW_S = 60.0  # after which it is decided anew whether a task waits for another node than where it failed
 _LOOK_S = 10.0  # the same while machines are on their way
 _ENDS = (Trained, Scored, Ended, Failed)  # after these messages another task may start
@@ -128,9 +129,6 @@ class Driver:
     @cached_property
     def _later(self) -> Specs:  # of the stages after Stage I
         return Specs(self._job.learnt, self._pool)
-
-    def _specs_at(self, stage: Stage) -> Specs:
-        return self._specs if stage in (Stage.DISTRICT, Stage.COARSE) else self._later
 
     def run(self) -> RunState:
         """Runs until the run has ended, which the caller has begun.
@@ -221,9 +219,9 @@ class Driver:
         self._news = self._news or changed
         if self._news or nodes != self._nodes or self._clock.monotonic() >= self._again:
             self._nodes, self._news, self._again = nodes, False, math.inf
-            if (end := job.outcome(self._state)) is not None:
-                return end
             ready = job.ready(self._state)
+            if (end := outcome(self._state, ready)) is not None:
+                return end
             if not self._attempts and (why := quarantine.hopeless(self._state, ready, nodes)):
                 return Outcome.FAILED, why
             self._start_ready(ready)
@@ -257,7 +255,8 @@ class Driver:
             self._again = self._clock.monotonic() + _LOOK_S
 
     def _start(self, task: TaskId, where: Placement) -> None:
-        spec = self._journal.until_done(lambda: self._specs_at(task.stage).of(task))
+        specs = self._specs if task.stage in (Stage.DISTRICT, Stage.COARSE) else self._later
+        spec = self._journal.until_done(lambda: specs.of(task))
         state, iteration = self._state.task(task), 0
         if isinstance(spec, TrainSpec) and spec.checkpoint is not None:
             iteration = checkpoint.iteration_of(self._job.folder.checkpoint(task))

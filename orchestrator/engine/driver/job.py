@@ -19,7 +19,6 @@ from panolog.orchestrator.engine.stages.scenes import learnt_scene
 from panolog.orchestrator.engine.stages.surroundings import Surroundings
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.records import Outcome
 from panolog.orchestrator.runs.state import RunState
 from panolog.partition.cells import Volume
 from panolog.partition.districts import Districts
@@ -83,22 +82,13 @@ class Job:
 
     def ready(self, state: RunState) -> tuple[TaskId, ...]:
         """The tasks that may start now: `policy.ready`."""
-        return policy.ready(state, **self._stages)
-
-    def outcome(self, state: RunState) -> tuple[Outcome, str] | None:
-        """How the run has ended: `policy.outcome`."""
-        return policy.outcome(state, **self._stages)
-
-    @property
-    def _stages(self) -> policy.Stages:
-        districts = 1 if self.districts is None else self.districts.count
-        config = self.config
-        return {
-            "shards": len(self.shards),
-            "refine": config.refine,
-            "districts": districts,
-            "deliver": config.deliver,
-        }
+        return policy.ready(
+            state,
+            shards=len(self.shards),
+            refine=self.config.refine,
+            districts=1 if self.districts is None else self.districts.count,
+            deliver=self.config.deliver,
+        )
 
     def views(self, task: TaskId) -> tuple[int, ...]:
         """The rows of the scene's panoramas that train a district, or Stage I as one."""
@@ -258,12 +248,10 @@ class Specs:
 
     def passes(self) -> tuple[tuple[str, ...], ...]:
         """The tasks of each pass over the blocks' union."""
-        tasks = {Stage.ROUND: self._rounds, Stage.REPAIR: self._repairs}
+        blocks = np.flatnonzero(self.plan.trained).tolist()
+        tasks = {Stage.ROUND: lambda: map(TaskId.round, blocks), Stage.REPAIR: self._repairs}
         found = (tuple(map(str, tasks[stage]())) for stage in self._job.config.passes.stages)
         return tuple(filter(None, found))
-
-    def _rounds(self) -> Iterator[TaskId]:
-        return map(TaskId.round, np.flatnonzero(self.plan.trained).tolist())
 
     def _repairs(self) -> Iterator[TaskId]:
         near = self.repaired

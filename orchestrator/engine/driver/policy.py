@@ -1,22 +1,11 @@
 """What a run does next, and what follows a failure: pure functions of a `RunState`."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypedDict
 
 from panolog.orchestrator.runs.records import Failure, Outcome
 from panolog.orchestrator.runs.state import RunState, Status, TaskState
 from panolog.workers.tasks import COARSE, DELIVER, EVAL, MERGE, PLAN, Stage, TaskId
-
-
-class Stages(TypedDict):
-    """What the settings say of the stages of a run."""
-
-    shards: int  # of scoring
-    refine: bool  # whether there is a Stage II
-    districts: int  # of which Stage I is trained apart; 1 = as one
-    deliver: bool  # whether files for viewers are made
-
 
 _NAMED = 10  # blocks in a message, at most
 LOSSES = 5  # attempts in a row, without a checkpoint, that may be lost with their process or machine
@@ -56,7 +45,7 @@ def _training(state: RunState, *, shards: int, refine: bool, districts: int) -> 
         yield tuple(map(TaskId.district, range(districts)))
     yield (COARSE,)
     if refine:
-        yield from (tuple(map(TaskId.shard, range(shards))), (PLAN,), block_order(state))
+        yield from (tuple(map(TaskId.shard, range(shards))), (PLAN,), state.blocks)
         yield from state.between
 
 
@@ -66,20 +55,7 @@ def _trained(state: RunState) -> bool:
     return any(task.status == Status.DONE or task.checkpoint is not None for task in first)
 
 
-def block_order(state: RunState) -> tuple[TaskId, ...]:
-    """The blocks to train, longest first; none before the plan.
-
-    All train for as many iterations: what counts is how many Gaussians they refine, then how many panoramas
-    they decode.
-    """
-    blocks = [block for block in state.plan or () if block.train]
-    blocks.sort(key=lambda block: (-block.gaussians, -block.cameras, block.block))
-    return tuple(TaskId.block(block.block) for block in blocks)
-
-
-def outcome(
-    state: RunState, *, shards: int, refine: bool, districts: int = 1, deliver: bool = False
-) -> tuple[Outcome, str] | None:
+def outcome(state: RunState, ready: Sequence[TaskId]) -> tuple[Outcome, str] | None:
     """How the run has ended, with the reason of a failure; None while there is something to do."""
     for task in state.tasks.values():
         if task.status == Status.FAILED and not task.id.stage.refines:
@@ -87,7 +63,7 @@ def outcome(
     reached = state.money.reached
     held = (Status.RUNNING,) if reached else (Status.RUNNING, Status.PAUSED)
     unfinished = any(task.status in held for task in state.tasks.values())
-    if unfinished or ready(state, shards=shards, refine=refine, districts=districts, deliver=deliver):
+    if unfinished or ready:
         return None
     if reached is not None:
         return Outcome.LIMITED, reached.reason

@@ -15,7 +15,7 @@ as there are cores for each of them. Checkpoints and previews are left out: they
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 from panolog.orchestrator.engine.estimates import calibration
 from panolog.orchestrator.engine.estimates.calibration import AVERAGE, CHECKPOINT, PIXEL, TRAINED, Basis
@@ -242,9 +242,11 @@ class Estimator:
         """Sky Gaussians in the training of a block."""
         return 0 if self.bakes else self._sky
 
-    def _periods(self, start: int) -> list[Period]:
+    @cached_property
+    def _periods(self) -> Callable[[int], list[Period]]:
         """How a block grows from so many scene Gaussians."""
-        return population(start, self._added, self._pixels, replace(self._schedule, refine=True))
+        schedule = replace(self._schedule, refine=True)
+        return cache(lambda start: population(start, self._added, self._pixels, schedule))
 
     def host(self, gaussians: int, cameras: int, initial: int = 0) -> int:
         """Peak bytes of the process of a task that trains so many Gaussians on so many panoramas.
@@ -375,21 +377,18 @@ class Estimator:
         """Peak bytes of one Gaussian in training."""
         return TRAINED + (2 * self._saved if self._saves else 0)
 
-    def _more(self, gaussians: int) -> int:
-        """Bytes beyond the calibration's of a step with so many Gaussians at the job's width."""
-        measured = self.basis.measured
-        pixels = self._pixels - measured.width * (measured.width // 2)
-        return gaussians * self._each - measured.grown.gaussians * TRAINED + pixels * PIXEL
-
     def _fixed(self, cameras: int, baked: int = 0) -> int:
         """Bytes of a worker's process with the decoded panoramas, but without Gaussians that it trains.
 
         Args: baked, bytes that are kept for each panorama besides.
         """
         measured = self.basis.measured
-        cache = min(int(self.config.cache.memory * 2**30), cameras * (self._view_bytes + baked))
-        own = measured.grown.host - measured.images
-        return own + cache + (0 if self._cuda else self._more(0))
+        kept = min(int(self.config.cache.memory * 2**30), cameras * (self._view_bytes + baked))
+        own = measured.grown.host - measured.images + kept
+        if self._cuda:
+            return own
+        pixels = self._pixels - measured.width * (measured.width // 2)
+        return own - measured.grown.gaussians * TRAINED + pixels * PIXEL
 
     def _stage(
         self, name: Stage, tasks: int, gaussians: int, need: tuple[int, int], seconds: Callable[[int], float]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias, TypeVar
 
-from panolog.orchestrator.engine.estimates.costs import Estimate, StageEstimate
+from panolog.orchestrator.engine.estimates.costs import Estimate
 from panolog.orchestrator.engine.estimates.estimate import Estimator
 from panolog.orchestrator.engine.scheduling.placement import USABLE
 from panolog.orchestrator.runs.config import RunConfig, change
@@ -155,8 +155,9 @@ def _shortage(estimator: Estimator, estimate: Estimate, free: int) -> _Short | N
     for stage in estimate.stages:
         for what, need, have in (("GPU memory", stage.device, device), ("memory", stage.host, host)):
             if need > have > 0:
-                words = f"{_of(stage)} needs about {gib(need)} of {what}, and {gib(have)} are free"
-                return _Short(memory=True, what=words)
+                name = _NAMES.get(stage.name, str(stage.name))
+                words = f"{name}, with {stage.gaussians:,} Gaussians, needs about {gib(need)} of {what}"
+                return _Short(memory=True, what=f"{words}, and {gib(have)} are free")
     if estimate.disk > free:
         disk = f"the run folder needs about {gib(estimate.disk)}, and {gib(free)} of its disk are free"
         return _Short(memory=False, what=disk)
@@ -184,10 +185,6 @@ def _baked(estimator: Estimator, estimate: Estimate) -> int:
         cache = cache.model_copy(update={"device": left})
     room = Rooms.of(cache, device, scene.panoramas[scene.train[0]], estimator.width, bakes=True).baked
     return stage.together * max(0, estimator.parts.block_cameras * estimator.baked_view - room)
-
-
-def _of(stage: StageEstimate) -> str:
-    return f"{_NAMES.get(stage.name, str(stage.name))}, with {stage.gaussians:,} Gaussians,"
 
 
 def _ways(estimator: Estimator, estimate: Estimate, fits: Callable[[Settings], bool]) -> Iterator[str]:

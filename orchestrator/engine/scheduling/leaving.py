@@ -48,7 +48,9 @@ def staying(state: RunState, nodes: Iterable[Node]) -> list[Node]:
     """The nodes that tasks can still be placed on."""
     nodes = list(nodes)
     without = [node for node in nodes if _leave(state, node.id) is None]
-    return without or [node for node in nodes if _likely(_leave(state, node.id))]
+    return without or [
+        node for node in nodes if (leave := _leave(state, node.id)) and leave.kind == Leaving.REBALANCE
+    ]
 
 
 def announced(state: RunState, node: str) -> bool:
@@ -71,7 +73,3 @@ def notice(state: RunState, nodes: Sequence[Node]) -> list[Noticed]:
 def _leave(state: RunState, id: str) -> Leave | None:
     known = state.nodes.get(id)
     return known.leave if known else None
-
-
-def _likely(leave: Leave | None) -> bool:
-    return leave is not None and leave.kind == Leaving.REBALANCE

@@ -13,8 +13,10 @@ A task avoids the nodes and GPUs on which it has failed, as if it took `_PATIENC
 failure: it waits so long at most for others, and where it has failed on all it starts where it did so least.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from heapq import heapify, heappop, heappush
 
 import numpy as np
 
@@ -30,17 +32,13 @@ USABLE = 0.9  # of a node's free memory: the rest is for Ray and what the estima
 Placed = tuple[TaskId, Placement]
 
 
-def _equal(_: str) -> float:
-    return 1.0
-
-
 @dataclass(frozen=True)
 class Demand:
     """A task that could start."""
 
     task: TaskId
     memory: int  # bytes that it needs, roughly: of a GPU, or of a node if it runs on the CPU
-    seconds: Callable[[str], float] = _equal  # by kind of place
+    seconds: Callable[[str], float] = lambda _: 1.0  # by kind of place
     alone: bool = False  # it has run out of memory: nothing else may run on its device
     more_than: int = 0  # bytes of memory that were not enough
     avoid: Mapping[str, float] = field(default_factory=dict)  # how often it has failed, by Node.id and card
@@ -262,27 +260,48 @@ def _assign_cpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[
     cores = [int(d.node.cpus - sum(task.placement.cpus for task in d.tasks)) for d in devices]
     memory = [d.memory - sum(task.placement.memory for task in d.tasks) for d in devices]
     assigned: list[list[Demand]] = [[] for _ in devices]
-    open_ = {i for i in range(len(devices)) if cores[i] > 0}
+    room = [(-float(count), i) for i, count in enumerate(cores) if count > 0]  # a heap: most cores first
+    heapify(room)
+    refused = math.inf  # bytes that no device has any more
     for demand in sorted(demands, key=lambda demand: -demand.seconds("cpu")):
-        if not open_:
-            break
-        fitting = [i for i in open_ if demand.memory <= memory[i]]
-        if not fitting:
+        if demand.memory >= refused:
             continue
-        least = min(demand.avoids(devices[i]) for i in fitting)
-        if least and _is_worth_waiting(demand, least, devices, assigned):
+        if (place := _take(demand, room, memory, devices)) is None:
+            refused = demand.memory
             continue
-        liked = [i for i in fitting if demand.avoids(devices[i]) == least]
-        i = max(liked, key=lambda i: (cores[i] / (len(assigned[i]) + 1), -i))
+        i = place[1]
+        if (least := demand.avoids(devices[i])) and _is_worth_waiting(demand, least, devices, assigned):
+            heappush(room, place)
+            continue
         assigned[i].append(demand)
         memory[i] -= demand.memory
-        if len(assigned[i]) == cores[i]:
-            open_.discard(i)
+        if len(assigned[i]) < cores[i]:
+            heappush(room, (-cores[i] / (len(assigned[i]) + 1), i))
     return [
         placed
         for i, tasks in enumerate(assigned)
         for placed in _share_cores(devices[i].node, cores[i], tasks)
     ]
+
+
+def _take(
+    demand: Demand, room: list[tuple[float, int]], memory: Sequence[int], devices: Sequence[_Device]
+) -> tuple[float, int] | None:
+    """Takes from a heap the first device with memory for a task, of those that it avoids least."""
+    if demand.avoid:
+        fitting = (place for place in room if demand.memory <= memory[place[1]])
+        place = min(fitting, key=lambda it: (demand.avoids(devices[it[1]]), it), default=None)
+        if place is not None:
+            room.remove(place)
+            heapify(room)
+        return place
+    passed: list[tuple[float, int]] = []
+    while room and demand.memory > memory[room[0][1]]:
+        passed.append(heappop(room))
+    place = heappop(room) if room else None
+    for one in passed:
+        heappush(room, one)
+    return place
 
 
 def _is_worth_waiting(

@@ -86,10 +86,6 @@ NO_GROWTH = Growth()
 Price = Callable[[Node], float | None]  # per hour
 
 
-def _no_price(_: Node) -> float | None:
-    return None
-
-
 @dataclass(frozen=True)
 class Work:
     """The tasks of a stage that wait for a place."""
@@ -112,7 +108,7 @@ class Scaling:
     overhead: float  # of the work of a stage that machines may cost besides, see `ScalingConfig`
     startup: float = STARTUP_S  # seconds in which a machine joins
     known: Mapping[str, Node] = field(default_factory=dict)  # a machine of each group that was seen
-    price: Price = _no_price
+    price: Price = lambda _: None
 
     def node(self, group: Group, number: int = 0) -> Node:
         """A machine of a group that is not there."""
@@ -131,7 +127,7 @@ class Scaling:
             fitting = [g for g in able if sizes[g.name] == most]
         prices = {g.name: self.price(self.node(g)) for g in fitting}
         size = {g.name: (sizes[g.name] or _ABUNDANT, g.gpus, g.cpus) for g in fitting}
-        return sorted(fitting, key=lambda g: (_or_last(prices[g.name]), size[g.name]))
+        return sorted(fitting, key=lambda g: (prices[g.name] is None, prices[g.name] or 0.0, size[g.name]))
 
     def wanted(
         self, work: Work, running: Sequence[Running], nodes: Sequence[Node], without: Set[str] = frozenset()
@@ -223,7 +219,3 @@ def _makespan(longest_first: Sequence[float], places: list[float]) -> float:
         heapq.heapreplace(free, end)
         last = max(last, end)
     return last
-
-
-def _or_last(price: float | None) -> float:
-    return float("inf") if price is None else price

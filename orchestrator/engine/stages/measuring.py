@@ -7,11 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.folder import command_line
 from panolog.prepare.check.bundle import MENDS, adjust
 from panolog.prepare.check.exposure import DIFFERS, describe, measure_exposures
+from panolog.prepare.check.misplaced import find_misplaced
 from panolog.prepare.check.residuals import describe as describe_residuals
 from panolog.prepare.check.residuals import read_tracks
+from panolog.scene.files import some_of
 from panolog.scene.model import Scene
+from panolog.scene.stores.outline import url_of
 from panolog.workers.capture.captured import Captured
 
 
@@ -37,6 +41,12 @@ class Measuring:
         adjusted, residuals = self._poses()
         if adjusted is not None:
             self._scene = adjusted.applied(self._scene)
+        self._doing("checking panoramas")
+        if names := list(find_misplaced(self._scene)):
+            self._warn(
+                f"{some_of(names, 'panorama')} not where the poses say; training on that blurs the model: "
+                f"`{command_line('scene', 'check', url_of(self._scene.root) or self._scene.root)}` names each"
+            )
         exposure = self._exposures()
         rows = np.array(self._scene.train, np.int64)
         known = exposure is not None or residuals is not None

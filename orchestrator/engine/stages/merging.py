@@ -119,7 +119,7 @@ def join_districts(folder: RunFolder, scene: Scene, districts: Districts, iterat
 
     def parts() -> Iterator[Gaussians]:
         for path, cell in files:
-            yield from _kept(path, cell)
+            yield from (retained(piece, cell, 0.0) for piece in read_ply_chunks(path))
         yield sky
 
     count = _write(folder.model(COARSE), parts, len(sky), files[0][0])
@@ -240,12 +240,6 @@ def _labels(piece: Gaussians, plan: Plan) -> NDArray[np.int64]:
         raise RunError(f"the Stage I model cannot be cut: {error}") from error
     labels[piece.scene] = np.where(seen, blocks, -1)
     return labels
-
-
-def _kept(coarse: Path, cell: Volume) -> Iterator[Gaussians]:
-    """What the Stage I model has in a cell, in pieces."""
-    for piece in read_ply_chunks(coarse):
-        yield retained(piece, cell, 0.0)
 
 
 def _write(path: Path, parts: Callable[[], Iterator[Gaussians]], sky: int, like: Path) -> int:

@@ -67,7 +67,7 @@ def save_captured(folder: RunFolder, captured: Captured, scene: Scene) -> None:
     learnt = captured.applied(scene)
     adjusted = Captured.load(folder.adjusted) if folder.adjusted.exists() else None
     if captured.exposure is not None:
-        write_json(folder.exposure, {"panoramas": _exposures(learnt)})
+        write_json(folder.exposure, {"panoramas": [_exposure(learnt.panoramas[row]) for row in learnt.train]})
     if captured.movers is not None:
         write_movers(folder, learnt)
     if captured.poses is not None:
@@ -84,10 +84,6 @@ def save_measured(folder: RunFolder, found: Measured, scene: Scene) -> None:
     if found.adjusted is not None:
         found.adjusted.save(folder.adjusted)
         save_poses(folder, None, found.adjusted, found.adjusted.applied(scene))
-
-
-def _exposures(scene: Scene) -> list[dict[str, Any]]:
-    return [_exposure(scene.panoramas[row]) for row in scene.train]
 
 
 def _exposure(panorama: Panorama) -> dict[str, Any]:

@@ -78,7 +78,8 @@ class Surroundings:
         scenery = sum(map(len, parts))
         for other, levels in enumerate(self._levels):
             if other not in blocks:
-                parts.append(_frozen(levels.rows(levels.cut(centers, self._angle))))
+                found = levels.rows(levels.cut(centers, self._angle))
+                parts.append(found.with_tensors(found.tensors(), sky=len(found)))  # it does not train
         parts.append(self._sky)
         count = sum(map(len, parts))
         write_ply_parts(path, parts, count=count, sky=count - scenery, exact=self._sky.exact)
@@ -94,8 +95,3 @@ def _blocks(model: Path, labels: NDArray[np.int64], count: int) -> Iterator[Gaus
     for block in sorted_runs(model.parent, pieces, labels, count):  # what follows the labels is sky
         tensors = {name: torch.from_numpy(column) for name, column in block.items()}
         yield Gaussians(**tensors, sky=0, exact=exact)
-
-
-def _frozen(gaussians: Gaussians) -> Gaussians:
-    """The same, called sky: they neither train nor densify."""
-    return gaussians.with_tensors(gaussians.tensors(), sky=len(gaussians))

@@ -24,9 +24,6 @@ def settled(state: RunState, end: float, *, running: bool) -> Spending:
 
     Args: end, seconds since the epoch; running, whether a driver works on the run.
     """
-    money = state.money
     if running:
-        return money.until(end)
-    for lost in lost_with_driver(state):
-        money = money.with_lost(lost)
-    return money.until(state.ended or state.latest or end)
+        return state.money.until(end)
+    return state.money.with_lost(lost_with_driver(state)).until(state.ended or state.latest or end)

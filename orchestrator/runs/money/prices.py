@@ -86,7 +86,8 @@ class PriceList(BaseModel):
             dearest = max(self.machine, key=lambda entry: entry.price)
             kind = f"{kind_of(node)}, not in the price list: priced as {dearest.name}"
             return NodeReserved(node.id, node.host, kind, dearest.price)
-        if entry.spot is not None and _is_spot(node):
+        spot = any(key == _MARKET and value.casefold() in _SPOT for key, value in node.labels)
+        if entry.spot is not None and spot:
             return NodeReserved(node.id, node.host, f"{entry.name} spot", entry.spot)
         return NodeReserved(node.id, node.host, entry.name, entry.price)
 
@@ -196,7 +197,3 @@ def _line_of(text: str, place: tuple[int | str, ...]) -> int:
 
 def _like(pattern: str, values: list[str]) -> bool:
     return any(fnmatchcase(value.casefold(), pattern.casefold()) for value in values if value)
-
-
-def _is_spot(node: Node) -> bool:
-    return any(key == _MARKET and value.casefold() in _SPOT for key, value in node.labels)

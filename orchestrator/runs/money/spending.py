@@ -6,7 +6,7 @@ its last checkpoint is lost when it ends without another. Nothing else is counte
 and no machine while no driver is at work.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 from panolog.orchestrator.runs.money.records import (
@@ -95,8 +95,8 @@ class _Share:
 class Spending:
     """All machines of a run by Node.id, and the limits of what it may cost."""
 
-    machines: Mapping[str, PaidMachine] = field(default_factory=dict)
-    running: Mapping[TaskId, _Share] = field(default_factory=dict)
+    machines: dict[str, PaidMachine] = field(default_factory=dict)
+    running: dict[TaskId, _Share] = field(default_factory=dict)
     budget: BudgetSet | None = None  # the latest
     since: float | None = None  # seconds since the epoch at which that was set
     near: BudgetNear | None = None
@@ -140,80 +140,60 @@ class Spending:
         """Of all costs; "" if there are no prices."""
         return str(self.budget.prices.get("currency", "")) if self.budget else ""
 
-    def with_lost(self, record: WorkLost) -> "Spending":
+    def with_lost(self, records: Iterable[WorkLost]) -> "Spending":
         """The same with work that was lost: of its machine, what the task bore on average while it ran."""
-        share = self.running.get(record.task)
-        if share is None or share.node not in self.machines:
-            return self
-        machine = self.machines[share.node].until(record.until)
-        span = max(record.until - share.since, 1e-9)
-        part = min(1.0, (machine.shared - share.shared) / span)
-        lost = machine.lost + machine.priced(record.seconds * part)
-        return replace(self, machines={**self.machines, share.node: replace(machine, lost=lost)})
+        machines = dict(self.machines)
+        for record in records:
+            share = self.running.get(record.task)
+            if share is not None and share.node in machines:
+                machine = machines[share.node].until(record.until)
+                part = min(1.0, (machine.shared - share.shared) / max(record.until - share.since, 1e-9))
+                lost = machine.lost + machine.priced(record.seconds * part)
+                machines[share.node] = replace(machine, lost=lost)
+        return replace(self, machines=machines)
 
 
 def spend(spending: Spending, stored: Stored) -> Spending:
-    """What a run has cost after one more record."""
+    """What a run has cost after one more record; in place for machines and for what runs."""
     record, time = stored.record, stored.time
     if not isinstance(record, _COUNTED):
         return spending
+    machines, running = spending.machines, spending.running
     match record:
         case NodeReserved():
-            known = spending.machines.get(record.node)
-            new = PaidMachine(record, time)
-            if known is not None:
-                new = replace(known.until(time), reserved_as=record, at=max(time, known.at), open=True)
-            return _with(spending, record.node, new)
-        case NodeReturned():
-            machine = spending.machines.get(record.node)
-            return spending if machine is None else _with(spending, record.node, _closed(machine, time))
+            known = machines.get(record.node) or PaidMachine(record, time)
+            at = max(time, known.at)
+            machines[record.node] = replace(known.until(time), reserved_as=record, at=at, open=True)
+        case NodeReturned() if record.node in machines:
+            machines[record.node] = _closed(machines[record.node], time)
         case WorkLost():
-            return spending.with_lost(record)
+            return spending.with_lost([record])
         case BudgetSet():
             return replace(spending, budget=record, since=time, near=None, reached=None)
-        case BudgetNear():
-            return replace(spending, near=record)
-        case BudgetReached():
+        case BudgetNear() | BudgetReached():
+            if isinstance(record, BudgetNear):
+                return replace(spending, near=record)
             return replace(spending, reached=record)
         case RunEnded():
-            machines = {id: _closed(machine, time) for id, machine in spending.machines.items()}
-            return replace(spending, machines=machines)
-        case RunBegan():  # one that was killed has recorded no end
-            end = time if record.previous is None else record.previous
-            machines = {id: replace(_closed(m, end), tasks=0) for id, m in spending.machines.items()}
-            return replace(spending, machines=machines, running={})
-        case TaskStarted():
-            return _started(_ended(spending, record.task, time), record, time)
+            machines |= {id: _closed(machine, time) for id, machine in machines.items()}
+        case RunBegan(previous=before):  # one that was killed has recorded no end
+            end = time if before is None else before
+            machines |= {id: replace(_closed(machine, end), tasks=0) for id, machine in machines.items()}
+            running.clear()
         case _:
-            return _ended(spending, record.task, time)
+            if record.task is not None and (share := running.pop(record.task, None)):
+                machine = machines[share.node].until(time)
+                machines[share.node] = replace(machine, tasks=machine.tasks - 1)
+    if isinstance(record, TaskStarted) and record.node_id in machines:
+        machine = machines[record.node_id].until(time)
+        machines[record.node_id] = replace(machine, tasks=machine.tasks + 1)
+        running[record.task] = _Share(record.node_id, time, machine.shared)
+    return spending
 
 
 def _sum(parts: Iterable[Used]) -> Used:
     return sum(parts, Used())
 
 
-def _with(spending: Spending, node: str, machine: PaidMachine) -> Spending:
-    return replace(spending, machines={**spending.machines, node: machine})
-
-
 def _closed(machine: PaidMachine, time: float) -> PaidMachine:
     return replace(machine.until(time), open=False)
-
-
-def _started(spending: Spending, record: TaskStarted, time: float) -> Spending:
-    machine = spending.machines.get(record.node_id)
-    if machine is None:
-        return spending
-    machine = machine.until(time)
-    share = _Share(record.node_id, time, machine.shared)
-    spending = _with(spending, record.node_id, replace(machine, tasks=machine.tasks + 1))
-    return replace(spending, running={**spending.running, record.task: share})
-
-
-def _ended(spending: Spending, task: TaskId, time: float) -> Spending:
-    if (share := spending.running.get(task)) is None:
-        return spending
-    running = {id: other for id, other in spending.running.items() if id != task}
-    machine = spending.machines[share.node].until(time)
-    machine = replace(machine, tasks=machine.tasks - 1)
-    return replace(_with(spending, share.node, machine), running=running)

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.control import state_of
 from panolog.orchestrator.runs.folder import RunFolder, command_line
 from panolog.orchestrator.runs.machines.children import bound_to_parent, signals_blocked
 from panolog.orchestrator.runs.queue.entries import Entry, Share, State
@@ -32,9 +33,7 @@ from panolog.orchestrator.runs.queue.processes import Processes
 from panolog.orchestrator.runs.queue.shares import Capacity, NeverFitsError, environment
 from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.runs.records import Outcome
-from panolog.orchestrator.runs.state import RunState, replay
-from panolog.orchestrator.runs.store import read_milestones
-from panolog.scene.errors import QueueError, RunFolderError, RunLockedError
+from panolog.scene.errors import QueueError, RunLockedError
 
 PROGRAM = (sys.executable, "-m", "panolog.orchestrator.cli")
 # The shell waits for a line, then becomes the program: with the same number and moment of start.
@@ -310,11 +309,3 @@ class _Runner:
 
 def _resume(entry: Entry) -> str:
     return f"`{command_line('queue', 'retry', entry.id)}`"
-
-
-def state_of(root: Path) -> RunState:
-    """That of a run now; that of no run, if it has none or cannot be read."""
-    database = RunFolder(root).database
-    with suppress(OSError, RunFolderError):
-        return replay(read_milestones(database)) if database.exists() else RunState()
-    return RunState()

@@ -22,11 +22,14 @@ GET /api/runs/{id}/previews[?task=]   PreviewList: the latest of each task, or a
 GET /api/runs/{id}/previews/{event}   JPEG, the render above the photograph
 GET /api/runs/{id}/views              HeldOutViews
 GET /api/runs/{id}/views/{number}     JPEG, the render above the photograph
+GET /api/runs/{id}/cover/{event}      JPEG, the render of such a picture, small: `RunRow.cover` names one
 GET /api/runs/{id}/preparation/{name} PNG or JPEG, what a step of the preparation has made: `PictureView.name`
 GET /api/runs/{id}/exposure           ExposureCurve
 GET /api/runs/{id}/findings           Findings: metrics of held-out panoramas, seams, refined poses, movers
 GET /api/runs/{id}/findings/{name}    PNG or JPEG, one of `Findings.pictures`
 GET /api/runs/{id}/point_cloud.ply    the model, to save
+GET /api/runs/{id}/downloads/{kind}   a file of it that was made, to save
+GET /api/runs/{id}/view.html          the model in 3D as one file, in a sandbox of its own
 GET /api/runs/{id}/report.html[?save=1]the report, to read in a sandbox of its own, or to save
 GET /api/compare?run=ID&run=ID…       Comparison of two to eight runs; of one that cannot be read the error
 GET /api/compare/curves?run=ID&run=ID…
@@ -44,6 +47,8 @@ POST /api/queue                       {"action": "move"|"remove"|"retry", "entry
 POST /api/runs/{id}/viewer            {"task": null|"coarse"|"block/003", "camera": null|name} → {"url"} of a
                                       page with the model in 3D, which takes seconds to make. It begins at the
                                       panorama of that name in the plan: `PlanCamera.name`
+POST /api/runs/{id}/downloads         {"kind": "sog"|"spz"|"ply"|"html"} → {"url"} of a file of the model,
+                                      which takes seconds to make
 GET /models/{key}/…                   its files, and photographs; the key grants them
 
 A POST needs `X-PanoLOG: 1` and the content type application/json.
@@ -52,13 +57,11 @@ A POST needs `X-PanoLOG: 1` and the content type application/json.
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
-from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from panolog.export.site.write import DESCRIPTION
 from panolog.orchestrator.watch.dashboard import maps, pictures, stream
 from panolog.orchestrator.watch.dashboard.dependencies import (
     ComparedRuns,
@@ -73,9 +76,13 @@ from panolog.orchestrator.watch.dashboard.dependencies import (
 )
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry, read_below
 from panolog.orchestrator.watch.dashboard.messages import CameraView
-from panolog.orchestrator.watch.dashboard.model_pages import ModelPages, page_policy
 from panolog.orchestrator.watch.dashboard.queues.panel import QueueAction
-from panolog.orchestrator.watch.dashboard.responses import json_response, model_download, report_download
+from panolog.orchestrator.watch.dashboard.responses import (
+    json_response,
+    model_download,
+    page_download,
+    report_download,
+)
 from panolog.orchestrator.watch.dashboard.watch import Watch, error_line
 from panolog.orchestrator.watch.views import queries
 from panolog.orchestrator.watch.views.comparison.compare import compare
@@ -110,15 +117,6 @@ class QueueRequest(BaseModel):
     action: QueueAction
     entry: Annotated[int, Field(ge=1, lt=2**63)]
     before: Annotated[int, Field(ge=1, lt=2**63)] | None = None
-
-
-class ViewerRequest(BaseModel):
-    """The body of a POST to /viewer."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    task: str | None = None
-    camera: str | None = None
 
 
 @router.get("/api/runs")
@@ -169,7 +167,7 @@ def _camera_view(run: Watch, row: int) -> CameraView | None:
         return None
     camera, scores = found
     try:
-        pictures.open_panorama(_scene_of(run), camera.name).close()
+        pictures.open_panorama(scene_of(run), camera.name).close()
         why = None
     except InputError as error:
         why = str(error)
@@ -180,10 +178,10 @@ def _panorama(cache: pictures.PanoramaCache, run: Watch, row: int) -> Response:
     camera = maps.camera_of(run.entry, row)
     if camera is None:
         raise InputError("the plan of this run has no such panorama")
-    return cache.small(_scene_of(run), camera.name)
+    return cache.small(scene_of(run), camera.name)
 
 
-def _scene_of(run: Watch) -> Path:
+def scene_of(run: Watch) -> Path:
     """The folder that the run has recorded, or the outline of the URL.
 
     Raises InputError if it has recorded none, or this machine has not read what is at the URL.
@@ -249,6 +247,12 @@ async def get_view(request: Request, run: Run, number: _EventId) -> Response:
     return await respond(request, 404, pictures.view, run.entry, number)
 
 
+@router.get("/api/runs/{id}/cover/{event}")
+async def get_cover(request: Request, run: Run, event: _EventId) -> Response:
+    """A small picture of it."""
+    return await respond(request, 404, pictures.cover, run.entry, event)
+
+
 @router.get("/api/runs/{id}/preparation/{name}")
 async def get_preparation_picture(request: Request, run: Run, name: str) -> Response:
     """What a step of the preparation has made."""
@@ -277,6 +281,12 @@ async def get_finding_picture(request: Request, run: Run, name: str) -> Response
 async def get_model(request: Request, run: Run) -> Response:
     """The merged model."""
     return await respond(request, 404, model_download, run.entry)
+
+
+@router.get("/api/runs/{id}/view.html")
+async def get_view_page(request: Request, run: Run) -> Response:
+    """The model in 3D."""
+    return await respond(request, 404, page_download, run.entry)
 
 
 @router.get("/api/runs/{id}/report.html")
@@ -345,38 +355,3 @@ async def post_queue(request: Request, registry: Registry) -> Response:
         raise HTTPException(409, error_line(error, registry.root)) from error
     await registry.list.refresh()
     return json_response(request, encode({"accepted": True}), 202)
-
-
-@router.post("/api/runs/{id}/viewer")
-async def post_viewer(request: Request, registry: Registry, id: str) -> Response:
-    """Makes a page with the run's model, or a task's, in 3D."""
-    body = await body_of(request, ViewerRequest)
-    watch = await fresh_watch(registry, id)
-    pages: ModelPages = request.app.state.pages
-    try:
-        if body.camera is not None:
-            await registry.call(maps.require_camera, watch.entry, body.camera)
-        key = await pages.make(watch.entry, body.task, _scene_folder(watch))
-    except (InputError, OSError) as error:
-        raise HTTPException(409, error_line(error, registry.root)) from error
-    start = "" if body.camera is None else f"#camera={quote(body.camera, safe='')}"
-    return json_response(request, encode({"url": f"/models/{key}/{start}"}))
-
-
-@router.get("/models/{key}/{path:path}")
-async def get_model_page(request: Request, key: str, path: str) -> Response:
-    """A file of one of these pages."""
-    pages: ModelPages = request.app.state.pages
-    if path == DESCRIPTION:
-        await pages.renew(key)
-    policy = page_policy(request.headers.get("host", ""), key)
-    return await respond(request, 404, pages.file, key, path, policy, request.app.state.panoramas)
-
-
-def _scene_folder(run: Watch) -> Path | None:
-    """Where the photographs of a run are, if that is on this machine."""
-    try:
-        scene = _scene_of(run)
-    except InputError:
-        return None
-    return scene if scene.is_absolute() and scene.is_dir() else None

@@ -32,6 +32,7 @@ class Results(ViewModel):
 
     model: bool
     report: bool
+    view: bool = False  # a page in 3D of the model as one file
     map: bool = False  # whether cameras and points can be shown from above, also before there is a plan
     exposure: str | None = None
     findings: str = ""
@@ -58,7 +59,10 @@ class RunChanges(LiveView):
 
 
 class RunRow(ViewModel):
-    """A run in the list: `status` also "unread" or "unreadable"; `created` and `latest` in epoch seconds."""
+    """A run in the list: `status` also "unread" or "unreadable"; `created` and `latest` in epoch seconds.
+
+    `cover` is the number of its picture, see GET …/cover/{event}; the panoramas are `width` pixels wide.
+    """
 
     id: str
     name: Text
@@ -75,14 +79,19 @@ class RunRow(ViewModel):
     created: float | None = None
     latest: float | None = None
     seconds: float | None = None
+    width: int | None = None
+    iterations: int | None = None
+    blocks: int | None = None
+    cover: int | None = None
     error: Text | None = None
 
     @staticmethod
-    def of_page(page: RunPage) -> "RunRow":
-        """The row of a run that could be read."""
+    def of_page(page: RunPage, cover: int | None = None) -> "RunRow":
+        """The row of a run that could be read. Args: cover, the event of its picture."""
         summary, scene, made = page.summary, page.info.get("scene"), page.preparation
         source = made.source if made else str(scene.get("path", "")) if isinstance(scene, dict) else ""
-        model = summary.model
+        model, config = summary.model, page.info.get("config")
+        settings = config if isinstance(config, dict) else {}
         return RunRow(
             id=page.id,
             name=page.name,
@@ -99,12 +108,21 @@ class RunRow(ViewModel):
             created=_epoch(page.info.get("created")) or page.began,
             latest=page.latest,
             seconds=summary.seconds,
+            width=_whole(settings.get("width")),
+            iterations=_whole(settings.get("iterations")),
+            blocks=len(summary.blocks) or None,
+            cover=cover,
         )
 
     @staticmethod
     def unread(entry: RunEntry) -> "RunRow":
         """The row of a run of which only its place is known."""
         return RunRow(id=entry.id, name=entry.name)
+
+
+def _whole(value: Any) -> int | None:
+    """A number in run.json."""
+    return value if isinstance(value, int) else None
 
 
 def _epoch(moment: Any) -> float | None:

@@ -17,7 +17,7 @@ from fastapi import HTTPException
 from fastapi.responses import Response
 
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below, read_below
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below, opened, read_below
 from panolog.orchestrator.watch.views import queries
 from panolog.orchestrator.watch.views.pages.findings import Findings, finding_pictures, read_findings
 from panolog.orchestrator.watch.views.preparation import picture_path
@@ -29,6 +29,7 @@ from panolog.scene.stores.outline import made_here, whole
 
 _SIZE = 50_000_000  # bytes of a JPEG at most
 _MEASURED = 200_000_000  # bytes of a file of what was measured at most
+_COVER = 320  # pixels of the width of a run's picture in the list
 _REDUCED = 1024  # pixels of the width of a panorama's copy
 _CACHED = 64  # copies, of some hundred kilobytes each
 _PREVIEW_PATH = re.compile(r"(coarse|(district|blocks|round|repair)/\d{3,9})/previews/\d{6,12}\.jpg")
@@ -80,6 +81,18 @@ def view(entry: RunEntry, number: int) -> Response:
     """A comparison by the id of its event. Raises InputError and ValueError as `preview`."""
     name = str(_event(entry, number, "ViewEvaluated")["view"])
     return _jpeg(entry, entry.folder.picture(name))
+
+
+def cover(entry: RunEntry, number: int) -> Response:
+    """A small picture of a run: the render of a comparison or preview. Raises as `preview`."""
+    found = queries.event(entry.folder.database, number, "ViewEvaluated")
+    path = (
+        entry.folder.picture(str(found["view"]))
+        if found
+        else entry.folder.root / str(_event(entry, number, "PreviewSaved")["path"])
+    )
+    with opened(path, entry.folder.root) as file:
+        return _response(small_copy(file, path.name, _COVER, rendered=True))
 
 
 def of_preparation(entry: RunEntry, name: str) -> Response:

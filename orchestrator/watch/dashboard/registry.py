@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from panolog.orchestrator.watch.dashboard.discovery import discover
-from panolog.orchestrator.watch.dashboard.messages import RunRow
 from panolog.orchestrator.watch.dashboard.queues.panel import QueuePanel
 from panolog.orchestrator.watch.dashboard.watch import Watch
 from panolog.orchestrator.watch.views.pages.encoding import encode
@@ -153,12 +152,12 @@ class RunRegistry:
             self._due[id] = now if watches[id].running else now + _IDLE_S * len(watches)
         rows = [watch.snapshot.row for watch in watches.values()]
         data = encode(
-            {"folder": str(self.root), "runs": sorted(rows, key=_newest), "queue": self.queue.read()}
+            {
+                "folder": str(self.root),
+                "runs": sorted(rows, key=lambda row: (-(row.created or 0.0), row.name)),
+                "queue": self.queue.read(),
+            }
         )
         if data != self.data:
             self.data, self.version = data, self.version + 1
         return self.version
-
-
-def _newest(row: RunRow) -> tuple[float, str]:
-    return -(row.created or 0.0), row.name

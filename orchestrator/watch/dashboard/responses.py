@@ -49,16 +49,23 @@ class Download(FileResponse):
 def model_download(entry: RunEntry) -> Download:
     """The merged model. Raises InputError if there is none."""
     handle = open_below(entry.folder.point_cloud, entry.folder.root)
-    return Download(handle, "application/octet-stream", {}, f"{_file_name(entry)}.ply")
+    return Download(handle, "application/octet-stream", {}, f"{file_name(entry)}.ply")
+
+
+def page_download(entry: RunEntry) -> Download:
+    """The model in 3D, as a page to show. Raises InputError if there is none."""
+    handle = open_below(entry.folder.page, entry.folder.root)
+    policy = f"{_SANDBOX}; connect-src data: blob:; worker-src blob:"
+    return Download(handle, "text/html; charset=utf-8", {"Content-Security-Policy": policy}, None)
 
 
 def report_download(entry: RunEntry, save: bool) -> Download:
     """The report, to save or to show. Raises InputError if there is none."""
     handle = open_below(entry.folder.report, entry.folder.root)
-    name = f"{_file_name(entry)}.html" if save else None
+    name = f"{file_name(entry)}.html" if save else None
     return Download(handle, "text/html; charset=utf-8", {"Content-Security-Policy": _SANDBOX}, name)
 
 
-def _file_name(entry: RunEntry) -> str:
+def file_name(entry: RunEntry) -> str:
     """A run's name in characters that every file system accepts."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", entry.folder.root.name).lstrip(".") or "run"

@@ -22,7 +22,9 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from panolog.orchestrator.watch.dashboard.api import router
 from panolog.orchestrator.watch.dashboard.guard import Access, Guard
 from panolog.orchestrator.watch.dashboard.maps import MapCache
-from panolog.orchestrator.watch.dashboard.model_pages import ModelPages
+from panolog.orchestrator.watch.dashboard.models.downloads import Downloads
+from panolog.orchestrator.watch.dashboard.models.pages import ModelPages
+from panolog.orchestrator.watch.dashboard.models.routes import router as model_router
 from panolog.orchestrator.watch.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.watch.dashboard.registry import RunRegistry
 from panolog.orchestrator.watch.views.pages.encoding import encode
@@ -45,7 +47,7 @@ _SHUTDOWN_S = 4  # for open answers and the last messages of streams when the se
 
 def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
     """The dashboard of all runs below `root`. Args: queue, folder of the queue that it shows, if any."""
-    registry, pages = RunRegistry(root, queue), ModelPages()
+    registry, pages, downloads = RunRegistry(root, queue), ModelPages(), Downloads()
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -54,12 +56,14 @@ def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
         await compression
         registry.close()
         pages.close()
+        downloads.close()
         registry.end()
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
-    app.state.registry, app.state.pages = registry, pages
+    app.state.registry, app.state.pages, app.state.downloads = registry, pages, downloads
     app.state.maps, app.state.panoramas = MapCache(), PanoramaCache()
     app.include_router(router)
+    app.include_router(model_router)
     app.add_api_route("/", _index)
     app.add_api_route("/runs/{id}", _run)
     app.add_api_route("/compare", _compare)

@@ -186,6 +186,7 @@ class Watch:
         result = Results(
             model=folder.point_cloud.is_file(),
             report=folder.report.is_file(),
+            view=folder.page.is_file(),
             map=folder.known_plan.is_file(),
             exposure=version_of(folder.exposure),
             findings=findings_version(folder),
@@ -267,7 +268,8 @@ class Watch:
         whole, changed = version, {}
         if tasks is not None and not fresh and old.page and _extends(page.summary, old.page.summary):
             whole, changed = old.whole, old.tasks | dict.fromkeys(tasks, version)
-        row, last = RunRow.of_page(page), self.history.last
+        cover = queries.cover(self.database, evaluated=page.summary.metrics is not None)
+        row, last = RunRow.of_page(page, cover), self.history.last
         self.snapshot = Snapshot(row, version, page, data, whole, changed, self._recent, last)
 
     def _fail(self, error: Exception) -> None:

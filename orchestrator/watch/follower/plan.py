@@ -53,7 +53,8 @@ def read_plan(
     references = References(environment)
     targets = read_targets(notify, references)
     choices = _once([_sink(text, environment) for text in log])
-    return FollowerPlan(targets, choices, _stalled(environment)), references.used
+    stalled = 60 * positive(STALLED, environment, _STALLED_MIN, "minutes, such as 30")
+    return FollowerPlan(targets, choices, stalled), references.used
 
 
 def words_elsewhere(notify: Sequence[str], log: Sequence[str]) -> list[str]:
@@ -135,7 +136,3 @@ def _sink(text: str, environment: Mapping[str, str]) -> SinkChoice:
             )
     local = choice.kind == "tensorboard" and place
     return SinkChoice(choice.kind, str(Path(place).absolute()) if local else place)
-
-
-def _stalled(environment: Mapping[str, str]) -> float:
-    return 60 * positive(STALLED, environment, _STALLED_MIN, "minutes, such as 30")

@@ -9,6 +9,7 @@ import base64
 import binascii
 import hashlib
 import hmac
+import html
 import json
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -43,7 +44,8 @@ def post_of(target: Target, notification: Notification, now: float) -> Post:
     """The request for a webhook, Slack or ntfy. Args: now, seconds since the epoch."""
     url, headers, content = target.url, dict[str, str](), payload(notification)
     if target.kind == "slack":
-        content = {"text": _for_slack(f"*{notification.title}*: {notification.text}")}
+        text = html.escape(f"*{notification.title}*: {notification.text}", quote=False)
+        content = {"text": text}
     elif target.kind == "ntfy":
         url, topic = _topic(target.url)
         tag, priority = _NTFY[notification.kind]
@@ -91,10 +93,6 @@ def mail_of(target: Target, notification: Notification) -> EmailMessage:
     facts = json.dumps(payload(notification), indent=2, allow_nan=False)
     message.set_content(f"{notification.text}\n\n{facts}\n")
     return message
-
-
-def _for_slack(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
 
 def _topic(url: str) -> tuple[str, str]:

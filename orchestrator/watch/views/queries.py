@@ -16,6 +16,7 @@ from panolog.orchestrator.runs.store import PICTURES
 LOCK_TIMEOUT_S = 5.0  # to wait for the driver, which locks the database for milliseconds
 SEARCHED = 50_000  # records that one search for a text reads
 _Item = TypeVar("_Item")
+_VIEWS = 2_000  # held-out panoramas of which the best is found
 _PREVIEWS = 200  # of a task, at most
 _EVENT = "SELECT id, time, type, payload FROM events"
 _KINDS = (  # the parts of the table that have an index by task, or are small
@@ -122,6 +123,20 @@ def views(path: Path, most: int) -> list[dict[str, Any]]:
     last = f"SELECT id FROM events INDEXED BY pictures WHERE {PICTURES} AND type = 'ViewEvaluated'"
     sql = f"{_EVENT} WHERE id IN ({last} ORDER BY id DESC LIMIT ?) ORDER BY id DESC"
     return [_event(row) for row in query(path, sql, (most,), timeout_s=LOCK_TIMEOUT_S)]
+
+
+def cover(path: Path, *, evaluated: bool) -> int | None:
+    """The id of the comparison of the best held-out panorama, or of the latest picture of a training.
+
+    Args: evaluated, whether all comparisons have been made.
+    Raises InputError as `reading.query`, ValueError if a record is no JSON.
+    """
+    if not path.exists():
+        return None
+    if evaluated and (found := views(path, _VIEWS)):
+        return int(max(found, key=lambda event: (event.get("metrics") or {}).get("psnr") or 0.0)["id"])
+    rows = query(path, f"SELECT MAX(id) FROM events WHERE {PICTURES}", timeout_s=LOCK_TIMEOUT_S)
+    return rows[0][0] if rows else None
 
 
 def usages(path: Path) -> dict[str, dict[str, Any]]:

@@ -173,12 +173,13 @@ def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: fl
         left_out.add(Stage.DISTRICT)
     if Stage.PREPARE not in history.spans:
         left_out.add(Stage.PREPARE)
+    every = tasks_of(state)
     for name in map(Stage, STAGES):
         span = history.spans.get(name)
         older = Stage.PREPARE not in history.spans  # that have not recorded it
         known = span is not None or name is not Stage.CALIBRATE or not older
         if known and name not in left_out:
-            tasks = [task for task in tasks_of(state) if task.id.stage is name]
+            tasks = [task for task in every if task.id.stage is name]
             cut = history.cut(name)
             at_end = state if cut is None else replace(state, ended=cut)
             yield _stage(name, tasks, at_end, span, running=running and cut is None, now=now)

@@ -1,6 +1,7 @@
 """How far a run is and how long it still takes."""
 
 from collections.abc import Sequence
+from itertools import groupby
 
 from panolog.orchestrator.runs.state import RunState, Status, TaskState
 from panolog.workers.tasks import COARSE, Stage, TaskId
@@ -14,7 +15,7 @@ def tasks_of(state: RunState) -> list[TaskState]:
     """All tasks that are known, in the order of the stages; those of the plan also before they start."""
     tasks = set(state.tasks) | {TaskId.block(b.block) for b in state.plan or () if b.train}
     tasks.update(state.measures, *state.between)
-    return [state.task(task) for task in sorted(tasks)]
+    return [state.task(task) for task in sorted(tasks, key=lambda task: task.order)]
 
 
 def share_of(task: TaskState) -> float:
@@ -94,14 +95,14 @@ def progress_of(state: RunState, now: float, prepared: float | None = None) -> f
 def _time_left(state: RunState, now: float) -> float | None:
     """Seconds that the stages of a run still need; None if that of one is not known."""
     stages = [stage for stage in Stage if state.estimate is None or stage in state.estimate]
-    left = [_stage_left(state, stage, now) for stage in stages]
+    tasks = {stage: list(of_stage) for stage, of_stage in groupby(tasks_of(state), lambda it: it.id.stage)}
+    left = [_stage_left(state, stage, tasks.get(stage, []), now) for stage in stages]
     known = [seconds for seconds in left if seconds is not None]
     return sum(known) if len(known) == len(left) else None
 
 
-def _stage_left(state: RunState, stage: Stage, now: float) -> float | None:
-    """Seconds that a stage still needs; None if that is not known."""
-    tasks = [task for task in tasks_of(state) if task.id.stage is stage]
+def _stage_left(state: RunState, stage: Stage, tasks: Sequence[TaskState], now: float) -> float | None:
+    """Seconds that a stage, with these tasks, still needs; None if that is not known."""
     left = [task for task in tasks if task.status not in (Status.DONE, Status.FAILED)]
     over = not left and (tasks or (stage is Stage.BLOCK and state.plan is not None))
     if stage is Stage.DISTRICT and tasks:

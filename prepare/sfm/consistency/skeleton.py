@@ -18,6 +18,7 @@ Edge = tuple[int, int]  # rows of two panoramas, ascending
 _ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
 _WEAK = 0.5  # of the median coverage of neighbours: they come before others that share more, but are doubted
 _AMONG_BEST = 0.75  # of the best coverage of either panorama
+_AT_ONCE = 256  # panoramas whose ways to all others are found together
 
 
 @dataclass(frozen=True)
@@ -114,12 +115,22 @@ def _strongest_tree(
     return tree - {pair.between for pair in pairs if pair.coverage < least} | (tree & weak)
 
 
-def hops(edges: Iterable[Edge], count: int) -> NDArray[np.float64]:
-    """(count, count) how many edges lead from one panorama to another, infinite if none do."""
-    ordered = sorted(edges)
-    rows, columns = zip(*ordered, strict=True) if ordered else ((), ())
-    graph = csr_array((np.ones(len(ordered)), (rows, columns)), shape=(count, count))
-    return np.asarray(dijkstra(graph, directed=False, unweighted=True))
+def hops(edges: Iterable[Edge], count: int, between: Iterable[Edge], most: float) -> dict[Edge, float]:
+    """How many edges lead from one panorama to the other of each pair, infinite if more than `most` do.
+
+    Of few panoramas to all others at a time: a table of all of them would take gigabytes.
+    """
+    rows, columns = zip(*edges, strict=True) if (edges := sorted(edges)) else ((), ())
+    graph = csr_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    others: dict[int, list[int]] = {}
+    for one, other in between:
+        others.setdefault(one, []).append(other)
+    found, all_ = dict[Edge, float](), sorted(others)
+    for first in range(0, len(all_), _AT_ONCE):
+        some = all_[first : first + _AT_ONCE]
+        away = dijkstra(graph, directed=False, indices=some, unweighted=True, limit=most)
+        found |= {(one, b): float(row[b]) for one, row in zip(some, away, strict=True) for b in others[one]}
+    return found
 
 
 def components(edges: Iterable[Edge], count: int) -> NDArray[np.int32]:

@@ -153,7 +153,8 @@ def _thicker(evidence: Evidence, skeleton: Skeleton, geometries: Geometries, gui
 def _agreeing(solution: Solution, drift: float) -> Kept:
     """The tree, pairs that fit the poses and points, and all of panoramas that have no pose yet."""
     evidence, tree, poses = solution.evidence, solution.skeleton.tree, solution.found.poses
-    way = hops(tree, len(evidence.rays))
+    pairs = [pair.between for pair in evidence.pairs] if drift else []
+    way = hops(tree, len(evidence.rays), pairs, _FARTHEST / max(drift, _DRIFT))
     kept: Kept = {}
     for pair in evidence.pairs:
         bound = min(_CLOSE + drift * way[pair.between], _FARTHEST) if drift else _CLOSE

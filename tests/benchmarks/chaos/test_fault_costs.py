@@ -47,6 +47,14 @@ BROKEN_NODE = (
         ("9 began, 12 started coarse", fault(3.0, Kind.DRIVER), (), 0.0, 9.0),
         # a bad node costs each attempt that fails there
         (BROKEN_NODE, fault(2.0, Kind.BADNODE), (COARSE, ZERO), 2.0 + 1.0, 2.0 + 1.0),
+        # a node that restarts with another version costs the attempt that it ends as well
+        (
+            "0 began, 1 started 0, 3 lost 0, 5 started 0, 6 unread 0, 8 started 1, 30 model 1",
+            fault(2.0, Kind.VERSION),
+            (ZERO,),
+            2.0 + 1.0,
+            2.0 + 2.0,
+        ),
         # what had ended or had not begun loses no work
         ("0 began, 1 started coarse, 9 model coarse", fault(3.0, Kind.WORKER), (), 0.0, 0.0),
         ("3 began, 4 lost coarse, 6 started coarse", fault(2.0, Kind.RAYLET), (COARSE,), 0.0, 4.0),

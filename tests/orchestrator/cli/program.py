@@ -16,7 +16,13 @@ from panolog.workers.tasks import COARSE
 from panolog.workers.training.initialise import scene_gaussians
 from tests.orchestrator.messages import without_progress
 
-STEPS = ("starting Ray", "connecting to the cluster", "measuring exposures", "calibrating")  # of a preflight
+STEPS = (  # of a preflight
+    "starting Ray",
+    "connecting to the cluster",
+    "checking panoramas",
+    "measuring exposures",
+    "calibrating",
+)
 GONE = SceneRef(path="/gone", fingerprint="f")
 
 

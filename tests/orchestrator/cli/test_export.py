@@ -23,7 +23,7 @@ from tests.orchestrator.cli.program import begun, one_line, shown
 from tests.orchestrator.cli.program import call as panolog
 from tests.scenes import write_scene
 
-MODELS = ("sog", "spz", "compressed-ply")
+MODELS = ("sog", "spz", "compressed-ply", "ply")
 PLACE = Origin(latitude=48.137, longitude=11.575, altitude=520.0)
 
 
@@ -74,10 +74,18 @@ def seen(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> NDArray[np
 
 def test_all_formats_at_once(run: RunFolder, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    kinds = ("sog", "web", "spz", "compressed-ply", "glb", "3dtiles", "sky-image")
+    kinds = ("sog", "web", "spz", "compressed-ply", "ply", "glb", "3dtiles", "sky-image")
     content = shown("export", run.root, "-o", out, *(f"--{kind}" for kind in kinds))
     files = {Path(file["path"]).name: file["bytes"] for file in content["files"]}
-    models = {"place.sog", "web", "place.spz", "place-sky.spz", "place.compressed.ply", "place.glb"}
+    models = {
+        "place.sog",
+        "web",
+        "place.spz",
+        "place-sky.spz",
+        "place.compressed.ply",
+        "place.ply",
+        "place.glb",
+    }
     assert set(files) == models | {"3dtiles", "sky.jpg", "sky.exr", "georef.json"}
     assert {path.name for path in out.iterdir()} == set(files)
     assert all(size > 0 for size in files.values())
@@ -139,8 +147,27 @@ def test_choices(run: RunFolder, tmp_path: Path) -> None:
     assert panolog("export", run.point_cloud, "-o", file, "--min-opacity", 0.95).exit_code == 2
 
 
+def test_choices_of_a_plain_ply(run: RunFolder, tmp_path: Path) -> None:
+    """Its sky is its last rows, and what has a lower degree has fewer columns."""
+    whole, file = read_ply(run.point_cloud), tmp_path / "model.ply"
+    scene = len(whole) - whole.sky
+    export(run.root, "-o", file, "--sh", 1)
+    assert file.stat().st_size < run.point_cloud.stat().st_size / 2
+    found = read_ply(file)
+    assert (len(found), found.sky) == (len(whole), whole.sky)
+    assert not found.shN[:, 3:].any()
+    torch.testing.assert_close(found.scales, whole.scales)
+    x = float(whole.means[:scene, 0].median())
+    export(run.root, "-o", file, "--without-sky", "--crop", f"{x},-1e9,-1e9,1e9,1e9,1e9")
+    found = read_ply(file)
+    assert (len(found), found.sky) == (int((whole.means[:scene, 0] >= x).sum()), 0)
+    before = run.point_cloud.read_bytes()
+    assert "is the model itself" in one_line(panolog("export", run.root, "-o", run.point_cloud))
+    assert run.point_cloud.read_bytes() == before
+
+
 def test_up(run: RunFolder, tmp_path: Path) -> None:
-    """+y of an SPZ is up, of an SOG down: of a PLY -y, of a run's scene with a place +z."""
+    """+y of an SPZ is up, of SOG and PLY down: of a PLY -y, of a run's scene with a place +z."""
     whole = read_ply(run.point_cloud)
     means = whole.means[whole.scene].numpy()
     for source, options, axis, sign in (
@@ -149,10 +176,14 @@ def test_up(run: RunFolder, tmp_path: Path) -> None:
         (run.point_cloud, ["--up", "-x"], 0, -1),
         (run.point_cloud, ["--up", "0,0,-2"], 2, -1),
     ):
-        for name, turned in (("up.spz", 1), ("up.sog", -1)):
+        for name, turned, read in (
+            ("up.spz", 1, read_model),
+            ("up.sog", -1, read_model),
+            ("up.ply", -1, read_ply),
+        ):
             file = tmp_path / name
             export(source, "-o", file, "--without-sky", *options)
-            heights = np.sort(turned * read_model(file).means[:, 1])
+            heights = np.sort(turned * np.asarray(read(file).means)[:, 1])
             expected = np.sort(sign * means[:, axis])
             offset = np.median(heights) - np.median(expected)  # the origin is among the cameras
             np.testing.assert_allclose(heights - offset, expected, atol=0.01)

@@ -5,11 +5,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from panolog.prepare.check.misplaced import find_misplaced, misplaced_lines
 from panolog.prepare.check.scene_check import check_scene
 from panolog.scene.colmap import read_colmap, write_colmap
 from panolog.scene.model import Scene
@@ -116,6 +118,54 @@ BROKEN: dict[str, tuple[Breakage, str]] = {
     "shuffled": (shuffled, "3 of 8 pictures fit another's pose better; street_00"),
     "noise": (noise, "points and pixels hardly correlate"),
 }
+
+
+SINGLE: dict[str, Callable[[Array, Array], tuple[Array, Array]]] = {  # of one pose, (3, 3) and (3,)
+    "at random": lambda R, C: (Rotation.random(random_state=3).as_matrix(), C + np.array([3.0, -4.0, 2.0])),
+    "kilometres away": lambda R, C: (R, C + np.array([8000.0, 50.0, -3000.0])),
+    "in another street": lambda R, C: (R, C + np.array([0.0, 5.0, 1.0])),
+}
+
+
+@pytest.mark.parametrize("tracks", [True, False])
+@pytest.mark.parametrize("change", SINGLE.values(), ids=SINGLE)
+def test_single_poses_are_named(
+    change: Callable[[Array, Array], tuple[Array, Array]], tracks: bool, town: Scene
+) -> None:
+    poses, centers = rotations(town), town.centers.copy()
+    for row in (2, 6):
+        poses[row], centers[row] = change(poses[row], centers[row])
+    found = check_scene(posed(town if tracks else without_tracks(town), poses, centers))
+    wrong = [town.panoramas[row].name for row in (2, 6)]
+    assert list(found.misplaced) == wrong
+    assert [problem.split(" is not where its pose says: ")[0] for problem in found.problems] == [
+        f"pose: {name}" for name in wrong
+    ]
+    assert found.verdict.startswith("verdict: 2 of 8 panoramas fit no more than by chance")
+
+
+def test_a_panorama_that_shows_nothing_or_is_damaged_is_not_misplaced(town: Scene, tmp_path: Path) -> None:
+    blank, damaged = tmp_path / "blank.png", tmp_path / "damaged.png"
+    cv2.imwrite(str(blank), np.full((town.height, town.width, 3), 90, np.uint8))
+    damaged.write_bytes(b"no picture")
+    images = [panorama.image for panorama in town.panoramas]
+    assert find_misplaced(pictured(without_tracks(town), [blank, damaged, *images[2:]])) == {}
+
+
+def test_many_misplaced_panoramas_are_all_named() -> None:
+    lines = misplaced_lines({f"{row}.jpg": "why" for row in range(23)})
+    assert len(lines) == 21
+    assert lines[-1] == "pose: 3 more are not: 20.jpg, 21.jpg, 22.jpg"
+
+
+@pytest.mark.parametrize("tracks", [True, False])
+def test_a_camera_far_away_is_named_without_colors_and_tracks(tracks: bool, town: Scene) -> None:
+    centers = town.centers.copy()
+    centers[5] += 8000.0
+    grey = replace(posed(town, rotations(town), centers), colors=np.full_like(town.colors, 128))
+    found = find_misplaced(grey if tracks else without_tracks(grey))
+    assert list(found) == [town.panoramas[5].name]
+    assert ("px from where" if tracks else "farther from all others") in found[town.panoramas[5].name]
 
 
 @pytest.mark.parametrize("tracks", [True, False])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from panolog.prepare.video import decode
 from panolog.prepare.video.decode import open_video
 from panolog.scene.errors import InputError
 from tests.prepare.video import containers
@@ -93,6 +94,44 @@ def test_the_same_frames_at_the_same_times(container: str, encoding: Encoding, t
             assert grey is not None and np.abs(grey - luma).max() < 0.6, number
         assert video.notes() == []
     assert times == pytest.approx([time / 1000 for time in TIMES], abs=1e-9)
+
+
+@pytest.mark.parametrize("container", ["mp4", "mkv"])
+@pytest.mark.parametrize("encoding", [H264, H265_10], ids=["H.264", "H.265"])
+def test_seeking_finds_the_frames_of_reading_in_order(
+    container: str, encoding: Encoding, tmp_path: Path
+) -> None:
+    many = Encoding(encoding.codec, encoding.pixels, encoding.options | {"g": "8"})
+    frames = known_frames(40, encoding.bits)
+    path = write_clip(tmp_path / f"clip.{container}", frames, many)
+    with open_video(path, "draft") as video:
+        times = [video.time for _ in video.frames()]
+        keys = video.keys
+        assert video.is_plain
+    assert len(times) == 40 and len(keys) > 2
+    chosen = [0, 1, 7, 8, 19, 33, 39]
+    with open_video(path, "chosen") as video:
+        for number, time in zip(chosen, video.frames_at([times[it] for it in chosen], keys), strict=True):
+            assert time == times[number]
+            assert same(video.picture(), expected(frames[number], bits=encoding.bits)), number
+    with open_video(path, "chosen") as video:
+        assert list(video.frames_at([times[3], times[4] + 0.001, times[9]], keys)) == [times[3]]
+
+
+def test_frames_that_none_refer_to_are_left_out_of_large_videos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(decode, "_LARGE", WIDTH)
+    encoding = Encoding("libx264", "yuv420p", {"qp": "18", "x264-params": "b-adapt=0:bframes=2:b-pyramid=0"})
+    path = write_clip(tmp_path / "clip.mp4", known_frames(40), encoding)
+    with open_video(path) as video:
+        every = [video.time for _ in video.frames()]
+    with open_video(path, "draft") as video:
+        some = [video.time for _ in video.frames() if video.grey(64) is not None]
+        assert video.passed >= 38
+        assert video.notes() == []
+    assert len(every) == 40
+    assert 12 < len(some) < 20 and set(some) < set(every)
 
 
 @pytest.mark.parametrize("range_", ["limited", "full"])

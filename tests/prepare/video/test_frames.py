@@ -9,12 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
+from panolog.prepare.video import decode as decode_module
 from panolog.prepare.video import frames as module
+from panolog.prepare.video.decode import Video
 from panolog.prepare.video.frames import extract_frames
 from panolog.prepare.video.motion import load_motion
 from panolog.scene.errors import InputError
 from panolog.scene.files import SUFFIX
 from panolog.scene.image_files import decode
+from panolog.scene.write import no_progress
 from tests.prepare.video.videos import (
     HEIGHT,
     WIDTH,
@@ -24,6 +27,7 @@ from tests.prepare.video.videos import (
     short_video,
     tour,
     tour_images,
+    walk,
     write_video,
 )
 
@@ -88,7 +92,7 @@ def test_goes_on_where_it_was_stopped(short: Path, tmp_path: Path, monkeypatch: 
     with pytest.raises(KeyboardInterrupt):
         extract_frames(short, out, parallax=PARALLAX, progress=stop)
     assert calls == [(n, 16) for n in range(1, 9)] + [
-        (9 + n, 9 + numbers(whole)[-1]) for n in range(len(calls) - 8)
+        (9 + number, 9 + numbers(whole)[-1]) for number in numbers(whole)[:2]
     ]
     kept = {path: path.stat().st_mtime_ns for path in sorted(out.glob("*.jpg"))}
     assert [path.name for path in kept] == [path.name for path in whole[:2]]
@@ -103,6 +107,30 @@ def test_goes_on_where_it_was_stopped(short: Path, tmp_path: Path, monkeypatch: 
     )
     monkeypatch.setattr(module, "open_video", None)  # all is there
     assert extract_frames(short, out, parallax=PARALLAX) == again
+
+
+def test_frames_that_seeking_does_not_find_are_read_in_order(
+    short: Path, extracted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Video, "frames_at", lambda self, times, keys: iter(times[:0]))
+    files = extract_frames(short, tmp_path / "out")
+    assert [file.read_bytes() for file in files] == [(extracted / file.name).read_bytes() for file in files]
+
+
+def test_of_a_large_video_that_moves_slowly_few_frames_are_looked_at(
+    short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And as many as before where the camera is faster."""
+    slow = write_video(tmp_path / "slow.avi", [render(shot) for shot in walk([0.004] * 30)])
+    for video in (short, slow):
+        monkeypatch.setattr(decode_module, "_LARGE", WIDTH + 1)
+        every = module._search(video, "", no_progress)
+        monkeypatch.setattr(decode_module, "_LARGE", WIDTH)
+        some = module._search(video, "", no_progress)
+        (all_, few) = (sum(len(piece.frames) for piece in it.pieces) for it in (every, some))
+        assert few == all_ if video == short else few < 0.5 * all_
+        ends = [max(piece.positions[-1] for piece in it.pieces) for it in (every, some)]
+        assert ends[1] == pytest.approx(ends[0], abs=0.3)
 
 
 def test_another_choice_replaces_the_first(short: Path, extracted: Path, tmp_path: Path) -> None:
@@ -132,7 +160,7 @@ def test_another_video_of_the_same_name_is_refused(extracted: Path, tmp_path: Pa
         lambda text: text[: len(text) // 2],
         lambda text: b"\xff\xfe",
         lambda text: b"[" * 100_000,
-        lambda text: text.replace(b'"version": 2', b'"version": 1'),
+        lambda text: text.replace(b'"version": 3', b'"version": 2'),
         lambda text: text.replace(b'"positions": [0.0', b'"positions": [NaN'),
         lambda text: text.replace(b'"frames": [0', b'"frames": [-1'),
         lambda text: text.replace(b'"decoded": 8', b'"decoded": 1e999'),

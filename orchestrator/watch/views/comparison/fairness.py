@@ -12,7 +12,7 @@ def warnings(runs: Sequence[Pair]) -> Iterator[str]:
     """The reasons, of runs that could be read; the first is what the others are compared with."""
     yield from _unfinished(runs)
     yield from (f"{run.name}: {run.problem}" for run, _ in runs if run.problem)
-    yield from _differing(runs, "not of the same scene", lambda _, shown: _short(shown.fingerprint))
+    yield from _differing(runs, "not of the same scene", lambda _, shown: (shown.fingerprint or "")[:12])
     measured = [pair for pair in runs if pair[0].measured is not None]
     missing = [shown.name for run, shown in runs if run.measured is None and not run.problem]
     if missing:
@@ -48,10 +48,6 @@ def _differing(runs: Sequence[Pair], what: str, text: Callable[[ReadRun, Compare
     texts = [(shown.name, text(run, shown)) for run, shown in runs]
     if len({value for _, value in texts if value}) > 1:
         yield f"{what}: {', '.join(f'{name} {value}' for name, value in texts if value)}"
-
-
-def _short(fingerprint: str | None) -> str:
-    return "" if fingerprint is None else fingerprint[:12]
 
 
 def _width(run: ReadRun) -> str:

@@ -145,14 +145,9 @@ def _mean(metric: MetricView | None, name: str) -> RenderableType:
     if metric.difference is not None:
         sign = -1 if name in LOWER_IS_BETTER else 1
         style = _GOOD if sign * metric.difference > 0 else _BAD if metric.difference else ""
-        text.append(f"  {_signed(metric.difference, name)}", style=style)
+        symbol = "−" if metric.difference < 0 else "+"
+        text.append(f"  {symbol}{metric_text(abs(metric.difference), name)}", style=style)
     return text
-
-
-def _signed(difference: float, name: str) -> str:
-    """A difference of a metric with its sign, a minus as long as a plus."""
-    text = metric_text(abs(difference), name)
-    return f"{'−' if difference < 0 else '+'}{text}"
 
 
 def _better(metric: MetricView | None) -> str:

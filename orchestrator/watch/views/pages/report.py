@@ -24,7 +24,12 @@ from panolog.orchestrator.watch.views.pages.findings import (
 )
 from panolog.orchestrator.watch.views.pages.shell import RUN, data_url, write_snapshot
 from panolog.orchestrator.watch.views.plan_map import read_points
-from panolog.orchestrator.watch.views.preparation import picture_path, version_of, view_preparation
+from panolog.orchestrator.watch.views.preparation import (
+    PreparationView,
+    picture_path,
+    version_of,
+    view_preparation,
+)
 from panolog.orchestrator.watch.views.queries import Filter, events, series, spread
 from panolog.orchestrator.watch.views.run_view import RunView, view_run
 from panolog.orchestrator.watch.views.site.photographs import WIDE, small_copy
@@ -41,6 +46,7 @@ _LINES = 24  # blocks that have curves: the first ones
 _POINTS = 300  # of a curve
 _EVENTS = 1_000  # the latest
 _PICTURES = 12  # held-out panoramas that are shown, from the worst to the best
+_INSTALL = "pip install"  # in notices for who has made the run, and not for who reads its report
 _SCORES = 100_000  # of all cameras, up to which each camera and block has its own
 
 
@@ -57,7 +63,8 @@ def write_report(folder: RunFolder, output: Path | None = None, *, running: bool
     prepared = view_preparation(folder, history.state, running=running)
     view = view_run(history, info, running=running, root=folder.root, preparation=prepared)
     answers = dict(_answers(folder, view, read_findings(folder)))
-    write_snapshot(path, RUN, answers, {"run": _message(folder, view)})
+    message = _message(folder, view, next_to=path.absolute().parent == folder.root.absolute())
+    write_snapshot(path, RUN, answers, {"run": message}, _own_paths(folder, info, prepared))
     return path
 
 
@@ -77,17 +84,33 @@ def report_or_notice(folder: RunFolder) -> list[Record]:
     return []
 
 
-def _message(folder: RunFolder, view: RunView) -> dict[str, Any]:
-    """The message of the stream with all about the run: RunPage of the dashboard."""
-    root = folder.root.absolute()
+def _own_paths(folder: RunFolder, info: dict[str, Any], prepared: PreparationView | None) -> list[str]:
+    """Paths of this machine that a reader elsewhere needs to know no more of than their names."""
+    found = [
+        str(folder.root.absolute()),
+        str(info["scene"]["path"]),
+        *([prepared.source] if prepared else []),
+    ]
+    return sorted((path for path in found if Path(path).is_absolute()), key=len, reverse=True)
+
+
+def _message(folder: RunFolder, view: RunView, *, next_to: bool) -> dict[str, Any]:
+    """The message of the stream with all about the run: RunPage of the dashboard.
+
+    Args: next_to, whether the report is in the run's folder, so that links lead to what is there.
+    """
+    root, summary = folder.root.absolute(), view.summary
+    notices = tuple(notice for notice in summary.notices if _INSTALL not in notice.message)
     return dict(view) | {
+        "summary": summary.model_copy(update={"notices": notices}),
         "id": _ID,
         "name": root.name,
-        "path": str(root),
+        "path": root.name,
         "actions": {"allowed": False, "why": None, "available": (), "failed": None},
         "result": {
-            "model": False,
+            "model": next_to and folder.point_cloud.is_file(),
             "report": False,
+            "view": next_to and folder.page.is_file(),
             "exposure": version_of(folder.exposure),
             "map": folder.known_plan.exists(),
             "findings": findings_version(folder),
@@ -114,7 +137,8 @@ def _answers(folder: RunFolder, view: RunView, found: Findings) -> Iterator[tupl
     if folder.database.exists():
         without = Filter(without=frozenset({Progressed.__name__}))
         latest = events(folder.database, without, _EVENTS)
-        yield f"{_PATH}/events", latest | {"more": False, "next": None}
+        shown = [event for event in latest["events"] if _INSTALL not in str(event.get("message"))]
+        yield f"{_PATH}/events", {"events": shown, "more": False, "next": None}
         yield from _curves(folder, view)
     yield from _held_out(folder, found)
 

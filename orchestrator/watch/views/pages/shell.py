@@ -9,7 +9,7 @@ untrusted text, which scripts show as text.
 import base64
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -54,15 +54,24 @@ def live_page(page: Page) -> str:
     return _render(page, url=lambda path: f"/static/{path}", imports=Markup(LIVE_IMPORTS), snapshot=None)
 
 
-def write_snapshot(path: Path, page: Page, answers: Mapping[str, Any], stream: Mapping[str, Any]) -> None:
+def write_snapshot(
+    path: Path,
+    page: Page,
+    answers: Mapping[str, Any],
+    stream: Mapping[str, Any],
+    own_paths: Sequence[str] = (),
+) -> None:
     """Writes a page as one file that needs no server, atomically.
 
-    Args: answers, JSON or URLs of pictures by their paths below /api; stream, the messages of the stream.
+    Args: answers, JSON or URLs of pictures by their paths below /api; stream, the messages of the stream;
+    own_paths, those of this machine, the longest first, of which only the last part is shown.
     Raises OSError if it cannot be written.
     """
     scripts = sorted(STATIC.glob(f"{_SHARED}/*.js")) + sorted(STATIC.glob(f"{page.folder}/*.js"))
     names = [script.relative_to(STATIC).as_posix() for script in scripts]
     snapshot = encode({"answers": answers, "stream": stream}).decode()
+    for own in own_paths:
+        snapshot = snapshot.replace(encode(own).decode()[1:-1], encode(Path(own).name).decode()[1:-1])
     text = _render(
         page,
         url=_data_url_of,

@@ -76,7 +76,7 @@ def site_of_run(folder: RunFolder, wanted: Wanted, locate: Locate = here) -> Sho
     """
     path = locate(model_of(folder, wanted.task))
     viewpoints = read_viewpoints(folder, wanted.task, wanted.camera, locate)
-    place = wanted.place or _georeference(folder, viewpoints, locate)
+    place = wanted.place or place_of(folder, viewpoints, locate)
     model = open_model(path, place.upside_down, wanted.selection)
     page = _page(f"{wanted.task or 'model'} of {folder.root.absolute().name}", model, place, wanted)
     scene = None
@@ -199,8 +199,12 @@ def _copied(path: Path, folder: Path) -> str:
     return MODEL
 
 
-def _georeference(folder: RunFolder, viewpoints: Viewpoints | None, locate: Locate) -> Georeference:
-    """What the run has written of its place, or what its cameras say."""
+def place_of(folder: RunFolder, viewpoints: Viewpoints | None, locate: Locate = here) -> Georeference:
+    """What the run has written of its place, or what its cameras say.
+
+    Args: locate says where the run's files are to be read.
+    Raises InputError if what it has written is damaged.
+    """
     file = folder.georeference
     if file.is_file():
         path = locate(file)

@@ -29,9 +29,10 @@ _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
 
 
-def small_copy(file: BinaryIO, name: str, width: int) -> bytes:
+def small_copy(file: BinaryIO, name: str, width: int, *, rendered: bool = False) -> bytes:
     """A JPEG of at most `width` pixels, half as high, without metadata such as where it was taken.
 
+    Args: rendered, take the upper half of a square picture, which has a render above a photograph.
     Raises InputError if the file is too large or no image.
     """
     require_size(file.seek(0, os.SEEK_END), name)
@@ -40,10 +41,13 @@ def small_copy(file: BinaryIO, name: str, width: int) -> bytes:
         with Image.open(file, formats=_FORMATS) as picture:  # reads the header alone
             if picture.width * picture.height > _PIXELS:
                 raise InputError(f"{name} has more than {_PIXELS:,} pixels")
-            picture.draft("RGB", (width, width // 2))  # JPEG can be decoded smaller
-            picture.thumbnail((width, width // 2), reducing_gap=3.0)
+            height = width if rendered else width // 2
+            picture.draft("RGB", (width, height))  # JPEG can be decoded smaller
+            picture.thumbnail((width, height), reducing_gap=3.0)
+            if rendered:
+                render = picture.crop((0, 0, picture.width, picture.height // 2))
             output = BytesIO()
-            in_srgb(picture).save(output, "JPEG", quality=85)
+            in_srgb(render if rendered else picture).save(output, "JPEG", quality=85)
     except _DAMAGED as error:
         raise InputError(f"{name} cannot be decoded") from error
     return output.getvalue()

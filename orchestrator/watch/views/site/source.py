@@ -67,7 +67,7 @@ def _of_checkpoint(path: Path, frame: Frame, chosen: Selection) -> Model:
     selection = replace(chosen, part="scene" if scene.any() else "all")
     kept = splats.select(selection.keeps(splats, scene))
     turned = kept.reduced(chosen.degree).turned(frame)
-    sky = _sky_of(gaussians) if gaussians.sky and scene.any() else None
+    sky = gaussians.select(_is_sky(gaussians)) if gaussians.sky and scene.any() else None
     return Model(InMemory(turned), sky, len(gaussians), saved.iteration)
 
 
@@ -82,7 +82,3 @@ def _is_checkpoint(file: Path) -> bool:
 def _is_sky(gaussians: Gaussians) -> torch.Tensor:
     """(N,) which of them are sky: the last ones."""
     return torch.arange(len(gaussians)) >= len(gaussians) - gaussians.sky
-
-
-def _sky_of(gaussians: Gaussians) -> Gaussians:
-    return gaussians.select(_is_sky(gaussians))

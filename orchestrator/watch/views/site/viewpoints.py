@@ -42,7 +42,7 @@ def read_viewpoints(
 
     Cameras are those that train the task, before there is a plan all, each towards the next; of a run that
     knows none, as one without blocks of an earlier version, those that train the scene. It begins at the
-    panorama `camera`, else at the most central of them, towards the farthest.
+    panorama `camera`, else at the most central of them, towards the next, as one walks.
 
     Args: camera, the name of a panorama of the plan, or of the scene if `locate` is `here`; locate says where
     the run's files are to be read.
@@ -63,7 +63,7 @@ def read_viewpoints(
     up = _up(centers)
     ahead = _towards_next(centers, up)
     every = {name: Viewpoint(*pose) for name, *pose in zip(names, centers, ahead, strict=True)}
-    start = _overview(np.stack([every[name].position for name in shown]), up)
+    start = every[shown[_central(np.stack([every[name].position for name in shown]))]]
     if camera is not None:
         start = every[camera] if camera in every else _of_scene(folder, camera, names, up, locate)
     return Viewpoints(up, start, {name: every[name] for name in shown})
@@ -106,12 +106,9 @@ def _towards_next(centers: NDArray[np.float64], up: NDArray[np.float64]) -> NDAr
     return _horizontal(np.diff(centers, axis=0, append=beyond), up)
 
 
-def _overview(centers: NDArray[np.float64], up: NDArray[np.float64]) -> Viewpoint:
-    """At the most central of K centres (K, 3), towards the farthest."""
-    position = centers[np.linalg.norm(centers - np.median(centers, axis=0), axis=1).argmin()]
-    away = centers - position
-    farthest = np.linalg.norm(away - (away @ up)[:, None] * up, axis=1).argmax()
-    return Viewpoint(position, _horizontal(away[farthest], up))
+def _central(centers: NDArray[np.float64]) -> int:
+    """The row of the most central of K centres (K, 3)."""
+    return int(np.linalg.norm(centers - np.median(centers, axis=0), axis=1).argmin())
 
 
 def _of_scene(

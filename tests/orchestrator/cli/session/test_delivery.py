@@ -37,7 +37,8 @@ def test_files_for_viewers(tmp_path: Path) -> None:
     assert page["total"] == len(whole)
     assert [camera["name"] for camera in page["cameras"]]
     assert (folder.web / page["model"]).is_file() and (folder.web / "index.html").is_file()
-    files = [folder.sky, folder.georeference, *folder.web.rglob("*")]
+    files = [folder.sky, folder.georeference, folder.page, *folder.web.rglob("*")]
+    assert b"engine.js" in folder.page.read_bytes()
     assert record.size == sum(file.stat().st_size for file in files if file.is_file())
     assert state.task(DELIVER).status == "done"
 

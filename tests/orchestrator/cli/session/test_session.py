@@ -91,7 +91,7 @@ def test_status_shows_a_run_before_its_preflight_is_over(scene: Path, tmp_path: 
     assert (done["status"], done["stage"], done["step"], done["resume"]) == ("done", "done", None, None)
     assert read_info(RunFolder(root)).config.device == "cpu"
     steps = [i.record.step for i in read_records(RunFolder(root).database) if isinstance(i.record, Preparing)]
-    assert steps == ["measuring exposures", "calibrating", "starting workers"]
+    assert steps == ["checking panoramas", "measuring exposures", "calibrating", "starting workers"]
 
 
 def test_a_run_killed_in_its_preflight_resumes_to_the_same_bytes(killed: Path, calm: Path) -> None:
@@ -221,7 +221,7 @@ def test_an_unforeseen_error_is_one_line_and_recorded(
     assert (answer.exit_code, answer.stdout) == (1, "")
     assert "Traceback" not in answer.stderr
     assert answer.stderr.splitlines()[-1].startswith(f"panolog: {line}")
-    notice, *_, ended = [item.record for item in read_records(RunFolder(killed).database)][-5:]
+    notice, *_, ended = [item.record for item in read_records(RunFolder(killed).database)][-6:]
     assert notice == Noticed(None, "resumed by the supervisor after: killed by signal 9")
     assert isinstance(ended, RunEnded)
     assert (ended.outcome, ended.transient) == ("failed", True)

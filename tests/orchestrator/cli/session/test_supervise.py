@@ -104,7 +104,8 @@ def state(pid: int = 7, outcome: Outcome | None = None, *, transient: bool = Fal
     ],
 )
 def test_what_is_resumed(code: int, after: RunState, expected: str | None) -> None:
-    assert cause(code, after, 7) == expected
+    own = after.driver is not None and after.driver.pid == 7
+    assert cause(code, after, own=own) == expected
 
 
 def test_a_run_is_resumed_until_it_is_done(script: Script) -> None:

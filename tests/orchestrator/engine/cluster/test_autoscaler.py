@@ -110,6 +110,7 @@ def come_and_go(address: str, folder: Path) -> list[str]:
     return said
 
 
+@pytest.mark.nightly
 @pytest.mark.system
 def test_machines_come_as_requested_and_go_when_they_are_idle(
     cluster: tuple[str, dict[str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

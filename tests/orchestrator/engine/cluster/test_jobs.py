@@ -110,6 +110,7 @@ def state_of(root: Path) -> RunState:
     return replay(read_milestones(database)) if database.exists() else RunState()
 
 
+@pytest.mark.nightly
 def test_a_run_is_submitted_watched_stopped_and_resumed(
     head: Head, panolog: Panolog, scene: Path, tmp_path: Path
 ) -> None:
@@ -184,6 +185,7 @@ def test_notifications_sinks_and_settings_are_words_of_the_job(
         assert ("iterations=10" in words) == (command == submit)
 
 
+@pytest.mark.nightly
 def test_a_wrong_token_is_one_line(head: Head, tmp_path: Path) -> None:
     command = [f"{BIN}/panolog", "cluster", "status", "/run", "--address", head.address]
     ours = head.environment | {"RAY_AUTH_TOKEN": "0" * 64, "HOME": str(tmp_path)}

@@ -2,17 +2,20 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from panolog.orchestrator.engine.driver.demands import Sizes, image_cache
 from panolog.orchestrator.engine.driver.job import Job
+from panolog.orchestrator.engine.estimates import estimate
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines.nodes import Gpu, Node, Placement
-from panolog.orchestrator.runs.records import Merged
+from panolog.orchestrator.runs.records import BlockPlan, Merged
 from panolog.orchestrator.runs.state import RunState
 from panolog.scene.ply import write_ply
+from panolog.workers.growth import Period, population
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from panolog.workers.training.initialise import scene_gaussians
 from panolog.workers.training.task_config import CacheConfig
@@ -47,6 +50,27 @@ def test_the_image_cache_is_as_set_or_what_its_place_leaves(
 ) -> None:
     found = image_cache(cache, where, replace(NODE, memory=memory * GIB), need * GIB, shortages)
     assert (found.memory, found.device) == pytest.approx(expected)
+
+
+def test_the_growth_of_few_blocks_is_forecast_for_thousands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forecasts: list[int] = []
+
+    def counted(start: int, *rest: Any) -> list[Period]:
+        forecasts.append(start)
+        return population(start, *rest)
+
+    monkeypatch.setattr(estimate, "population", counted)
+    scene, folder = small_scene(tmp_path), RunFolder(tmp_path / "run")
+    folder.model(COARSE).parent.mkdir(parents=True)
+    write_ply(folder.model(COARSE), scene_gaussians(scene))
+    blocks = tuple(BlockPlan(i, 3, 1000 + i, train=True) for i in range(3000))
+    sizes = Sizes(Job(folder, scene, RunConfig(width=WIDTH, device="cpu")))
+    state = RunState(plan=blocks)
+    bytes_ = [sizes.of(TaskId.block(block.block), state) for block in blocks]
+    assert bytes_ == sorted(bytes_) and bytes_[0] < bytes_[-1]
+    assert len(forecasts) < 100
 
 
 def test_shards_demand_what_their_cameras_distinguish(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -185,6 +186,23 @@ def test_cores_are_shared_as_far_as_memory_goes(tasks: int, cpus: int, fit: int,
 def test_tasks_spread_over_the_nodes() -> None:
     nodes = [node("a", cpus=4), node("b", cpus=2), node("c", cpus=0)]
     assert cores([block("x"), block("y"), block("z")], nodes) == {"x": ("a", 2), "y": ("a", 2), "z": ("b", 2)}
+
+
+def test_thousands_of_tasks_are_not_compared_with_each_of_thousands_of_nodes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looks, plain = 0, Demand.avoids
+
+    def counted(demand: Demand, device: Any) -> float:
+        nonlocal looks
+        looks += 1
+        return plain(demand, device)
+
+    monkeypatch.setattr(Demand, "avoids", counted)
+    nodes = [node(str(i), cpus=1 + i % 2, memory=(4 + i % 5) * GIB) for i in range(300)]
+    blocks = [block(str(i), seconds=i, gib=i % 7) for i in range(1000)]
+    assert len(placed(blocks, nodes, cuda=False)) > 300
+    assert looks < len(blocks)
 
 
 def test_what_runs_keeps_its_cores_and_memory() -> None:

@@ -43,7 +43,7 @@ def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> N
     assert notes.masks_picture(calm).read_bytes().startswith(b"\xff\xd8\xff")
     records = [stored.record for stored in read_records(calm.database)]
     steps = [str(it.task) for it in records if isinstance(it, Preparing)]
-    assert steps == ["prepare"] * 3 + ["calibrate"] * 3
+    assert steps == ["prepare"] * 3 + ["calibrate"] * 4
     noticed = [it.message for it in records if isinstance(it, Noticed) and str(it.task) == "prepare"]
     assert noticed[0] == "9 of 10 panoramas have a pose"
     assert noticed[1].startswith("without a pose: 1, contradictions: 1; ")

@@ -51,6 +51,8 @@ def test_the_list_has_a_row_for_each_run(tmp_path: Path) -> None:
     assert rows["a/b"]["scene"] == "town"
     assert rows["a/b"]["gaussians"] == 500
     assert rows["a/b"]["progress"] < 1
+    assert [rows["a/b"][name] for name in ("width", "iterations", "blocks")] == [64, 100, 2]
+    assert rows["a/b"]["cover"] is not None and rows["new"]["cover"] is None
     assert rows["done"]["progress"] == 1
     assert all(row["error"] is None for row in rows.values())
 
@@ -58,7 +60,7 @@ def test_the_list_has_a_row_for_each_run(tmp_path: Path) -> None:
 def test_the_page_of_a_run_has_its_results_and_settings(served: Served) -> None:
     run = served.get(f"/api/runs/{served.id('run')}")
     assert run["result"].pop("findings") == "- - - -"
-    assert run["result"] == {"model": True, "report": True, "map": True, "exposure": None}
+    assert run["result"] == {"model": True, "report": True, "view": False, "map": True, "exposure": None}
     settings = {setting["key"]: setting for setting in run["config"]}
     assert settings["iterations"]["changed"]
     assert run["config"][0]["key"] == "iterations"  # what was changed is first
@@ -206,11 +208,19 @@ def test_pictures(served: Served) -> None:
     assert served.get(f"{path}/previews", task="block/000") == {"previews": []}
     (view,) = served.get(f"{path}/views")["views"]
     assert (preview["task"], view["metrics"]) == ("coarse", {"psnr": 20.0})
-    for picture in (f"previews/{preview['event']}", f"views/{view['number']}"):
+    covers = [f"cover/{preview['event']}", f"cover/{view['number']}"]
+    assert served.errors(f"{path}/cover/1", 404)
+    for picture in (f"previews/{preview['event']}", f"views/{view['number']}", *covers):
         answer = served.client.get(f"{path}/{picture}")
         assert answer.headers["content-type"] == "image/jpeg"
         assert answer.content.startswith(b"\xff\xd8")
     assert served.errors(f"{path}/previews/{view['number']}", 404)
+    whole, render = (
+        cv2.imdecode(np.frombuffer(served.client.get(f"{path}/{name}").content, np.uint8), cv2.IMREAD_COLOR)
+        for name in (f"views/{view['number']}", covers[1])
+    )
+    assert whole is not None and render is not None
+    assert render.shape[:2] == (whole.shape[0] // 2, whole.shape[1])
 
 
 def test_downloads(served: Served) -> None:

@@ -12,8 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Download, Page, expect
 
+from panolog.export.reading import read_model
 from panolog.orchestrator.engine.stages.partitioning import plan_records, write_plan
 from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs.control import Action, ControlRequest
@@ -151,6 +152,13 @@ def the_driver_goes(page: Page, folder: RunFolder, driver: ExitStack) -> None:
     expect(page.locator("#stages")).not_to_contain_text(re.compile(r"^running", re.MULTILINE))
 
 
+def saved(download: Download, folder: RunFolder, name: str) -> Path:
+    """What a browser has saved, in a file next to the run."""
+    path = folder.root.parent / name
+    download.save_as(path)
+    return path
+
+
 def all_is_done(page: Page, folder: RunFolder, driver: ExitStack) -> None:
     names = ("street/0.png", "street/1.png")
     for name in names:
@@ -171,9 +179,14 @@ def all_is_done(page: Page, folder: RunFolder, driver: ExitStack) -> None:
     expect(page.locator("#view-source optgroup[label='Held-out views'] option")).to_have_count(2)
     page.locator("#view-source").select_option(label=names[0])
     expect(page.locator(".frames")).to_contain_text("held out: PSNR")
+    page.get_by_text("Download", exact=True).click()
     with page.expect_download() as download:
-        page.get_by_role("link", name="Download PLY").click()
+        page.get_by_role("link", name="Raw PLY").click()
     assert Path(download.value.path()).read_bytes() == folder.point_cloud.read_bytes()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="SOG").click()
+    assert download.value.suggested_filename == f"{folder.root.name}.sog"
+    assert len(read_model(saved(download.value, folder, "model.sog"))) == 30
     expect(page.get_by_role("link", name="Report")).to_be_visible()
     with page.expect_popup() as view:
         page.locator("#actions").get_by_role("button", name="3D view").click()

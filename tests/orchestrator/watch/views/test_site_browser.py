@@ -115,7 +115,11 @@ def test_the_panel_finds_cameras_and_shows_their_photographs(browser: Browser, s
         page.keyboard.press("Enter")
         expect(page.locator("#cameras")).to_be_hidden()  # at a desk it stays
         rests(page)
+        assert page.evaluate("panolog.walk._picture.opacity") == 0
+        expect(page.locator("#tag")).to_be_hidden()
+        page.evaluate("document.getElementById('photograph').click()")
         until(page, "panolog.walk._picture.opacity === 1")
+        expect(page.locator("#tag")).to_have_text("photograph")
         assert np.allclose(place(page), [5, 0, -0.3 - 0.15 + 0.15], atol=0.5)
         assert page.evaluate("decodeURIComponent(location.hash)") == "#camera=<b>&evil.png"
         assert np.allclose(colour(page), [220, 35, 128], atol=6)
@@ -130,6 +134,9 @@ def test_the_panel_finds_cameras_and_shows_their_photographs(browser: Browser, s
         until(page, "panolog.walk._picture.opacity === 0")
         rests(page)
         assert np.allclose(place(page), begin)
+        expect(page.locator("#photograph")).to_have_attribute("aria-pressed", "false")
+        page.evaluate("document.getElementById('photograph').click()")  # it goes to the nearest camera
+        until(page, "panolog.walk._picture.opacity === 0.5")
 
 
 def test_keys_move_turn_and_close(page: Page) -> None:

@@ -1,5 +1,6 @@
 """Which pairs carry a reconstruction, and which of its pairs contradict it."""
 
+import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -82,7 +83,21 @@ def test_ways_along_a_tree() -> None:
     tree = {(0, 1), (1, 4), (2, 4)}
     assert tree_path(tree, (0, 2)) == [(2, 4), (1, 4), (0, 1)]
     assert tree_path(tree, (0, 3)) == []
-    assert hops(tree, 5)[0].tolist() == [0, 1, 3, np.inf, 2]
+
+
+def test_edges_between_pairs_in_little_memory() -> None:
+    tree, pairs = {(0, 1), (1, 4), (2, 4)}, [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2)]
+    assert hops(tree, 5, pairs, 9) == dict(zip(pairs, (1, 3, np.inf, 2, 2), strict=True))
+    assert hops(tree, 5, pairs, 2) == dict(zip(pairs, (1, np.inf, np.inf, 2, 2), strict=True))
+    assert hops([], 5, pairs, 9) == dict.fromkeys(pairs, np.inf)
+    count = 20_000
+    chain, near = [[(row, row + step) for row in range(count - step)] for step in (1, 3)]
+    tracemalloc.start()
+    found = hops(chain, count, near, 20)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert set(found.values()) == {3}
+    assert most < 2e8  # a table of all takes 3.2 GB
 
 
 def test_trust() -> None:

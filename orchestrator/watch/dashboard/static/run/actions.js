@@ -11,11 +11,19 @@ import { taskLabel } from "panolog/shared/format.js";
 
 /** Title, text and button of each confirmation; {} is the block, the blocks or the machine. @type {Record<Action, [string, string, string]>} */
 const TEXTS = {
-  stop: ["Stop the run?", "Every task that trains saves a checkpoint first. The run can be resumed from there.", "Stop"],
+  stop: [
+    "Stop the run?",
+    "Every task that trains saves a checkpoint first. The run can be resumed from there.",
+    "Stop",
+  ],
   resume: ["Resume the run?", "A new driver starts on this machine and resumes from the last checkpoints.", "Resume"],
   pause: ["Pause {}?", "It saves a checkpoint and waits. The others continue; the merge waits for it.", "Pause"],
   unpause: ["Resume {}?", "From the last checkpoint, when a worker is free.", "Resume"],
-  release: ["Release {}?", "It gets the next task that waits. If tasks fail there again, it goes back into quarantine.", "Release"],
+  release: [
+    "Release {}?",
+    "It gets the next task that waits. If tasks fail there again, it goes back into quarantine.",
+    "Release",
+  ],
   retry: ["Retry {}?", "It gets all its attempts again and resumes from its last checkpoint.", "Retry"],
 };
 /** The states of a block in which an action is possible. @type {Partial<Record<Action, string[]>>} */
@@ -24,6 +32,16 @@ const POSSIBLE = {
   unpause: ["paused", "pausing"],
   retry: ["failed", "waiting", "running"],
 };
+
+/** The files that are made of a model on request: kind, name, and what for. */
+const FILES = [
+  ["sog", "SOG", "for SuperSplat, PlayCanvas, Spark: the smallest file"],
+  ["spz", "SPZ", "for Scaniverse, Spark, Babylon.js; without the sky"],
+  ["ply", "Upright PLY", "for every other viewer: y down, as they expect it"],
+  ["html", "Page", "the 3D view as one file, which opens without a server"],
+];
+
+const RAW = "for training and GIS: the run's own axes, on its side in viewers";
 
 /** @param {number[]} blocks one at least */
 const blocksLabel = (blocks) => (blocks.length > 1 ? `${blocks.length} blocks` : taskLabel(`block/${blocks[0]}`));
@@ -52,7 +70,18 @@ export function actions(path) {
       for (const block of blocks.length ? blocks : [null]) await post(`${path}/actions`, { action, block, node });
     };
     const click = () => why || confirm(texts, stop, send);
-    return el("button", { type: "button", "data-action": action, class: stop && !why ? "danger" : null, "aria-disabled": why ? "true" : null, title: why || null, on: { click } }, label);
+    return el(
+      "button",
+      {
+        type: "button",
+        "data-action": action,
+        class: stop && !why ? "danger" : null,
+        "aria-disabled": why ? "true" : null,
+        title: why || null,
+        on: { click },
+      },
+      label,
+    );
   }
 
   /** Resumes all blocks that are paused. @param {number[]} blocks */
@@ -64,7 +93,8 @@ export function actions(path) {
 
   /** Why an action is not possible; empty if it is. @param {Action} action @param {Row} [row] */
   const refusal = (action, row) => {
-    if (!given.available.includes(action)) return given.why || (action === "resume" ? "the run is running" : "no driver is at work on the run");
+    if (!given.available.includes(action))
+      return given.why || (action === "resume" ? "the run is running" : "no driver is at work on the run");
     return !row || POSSIBLE[action]?.includes(row.status) ? "" : `the block is ${row.status}`;
   };
 
@@ -92,15 +122,54 @@ export function actions(path) {
 
   /** @param {string | null} task @param {string | null} camera */
   const viewer = (task, camera = null) => {
-    const button = el("button", { type: "button", on: { click: () => open(task, camera, button) } }, camera ? "Open in 3D from here" : "3D view");
+    const button = el(
+      "button",
+      { type: "button", on: { click: () => open(task, camera, button) } },
+      camera ? "Open in 3D from here" : "3D view",
+    );
     return button;
   };
 
   /** @param {string} file @param {string} label */
   const link = (file, label) => {
     const page = file.endsWith(".html");
-    return el("a", { class: "button", href: `/api/${path}/${file}`, download: page ? null : "", target: page ? "_blank" : null, rel: "noopener" }, label);
+    return el(
+      "a",
+      {
+        class: "button",
+        href: `/api/${path}/${file}`,
+        download: page ? null : "",
+        target: page ? "_blank" : null,
+        rel: "noopener",
+      },
+      label,
+    );
   };
+
+  /** Makes a file of the model and saves it. @param {string} kind @param {HTMLElement} button */
+  async function save(kind, button) {
+    button.setAttribute("aria-busy", "true");
+    setMessage(byId("why"), "Making the file: this takes seconds, or minutes of a large model.");
+    try {
+      const { url } = await post(`${path}/downloads`, { kind });
+      setMessage(byId("why"), "");
+      location.assign(url);
+    } catch (error) {
+      setMessage(byId("why"), `No file: ${messageOf(error)}`);
+    } finally {
+      button.removeAttribute("aria-busy");
+    }
+  }
+
+  /** The model in all formats, those that are made on request first. */
+  function downloads() {
+    const made = FILES.map(([kind, name, use]) => {
+      const button = el("button", { type: "button", on: { click: () => save(kind, button) } }, name);
+      return el("li", {}, button, el("span", { class: "muted small" }, use));
+    });
+    const raw = el("li", {}, link("point_cloud.ply", "Raw PLY"), el("span", { class: "muted small" }, RAW));
+    return el("details", { class: "menu" }, el("summary", { class: "button" }, "Download"), el("ul", {}, ...made, raw));
+  }
 
   return {
     viewer,
@@ -123,12 +192,17 @@ export function actions(path) {
       given = current;
       const model = tasks.some((task) => task.checkpoint || task.status === "done");
       replaceIfChanged(byId("actions"), [given, result, status, model, paused], () => {
-        setMessage(byId("why"), status === "done" || given.allowed ? given.failed ?? "" : `Actions are disabled: ${given.why}`);
+        setMessage(
+          byId("why"),
+          status === "done" || given.allowed ? (given.failed ?? "") : `Actions are disabled: ${given.why}`,
+        );
         return [
           status === "running" && paused.length > 0 && unpause(paused),
-          status === "running" ? button("stop", [], refusal("stop")) : status !== "done" && button("resume", [], refusal("resume")),
+          status === "running"
+            ? button("stop", [], refusal("stop"))
+            : status !== "done" && button("resume", [], refusal("resume")),
           model && viewer(null),
-          result.model && link("point_cloud.ply", "Download PLY"),
+          result.model && downloads(),
           result.report && link("report.html", "Report"),
         ];
       });

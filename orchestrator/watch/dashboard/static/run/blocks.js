@@ -1,10 +1,24 @@
 // The table of Stage I and all blocks. Only the visible rows are in the page, so a thousand cost no more than thirty.
 
+import { lastError, STATES } from "panolog/run/rows.js";
 /** @import { Choose } from "./run.js" */
 /** @import { Row } from "./rows.js" */
-import { addHeadings, bar, byId, childrenOf, compare, el, first, markSorted, matches, pill, setBar, setPill, setText } from "panolog/shared/dom.js";
+import {
+  addHeadings,
+  bar,
+  byId,
+  childrenOf,
+  compare,
+  el,
+  first,
+  markSorted,
+  matches,
+  pill,
+  setBar,
+  setPill,
+  setText,
+} from "panolog/shared/dom.js";
 import { bytes, count, duration, fixed, short, significant, taskLabel } from "panolog/shared/format.js";
-import { STATES, lastError } from "panolog/run/rows.js";
 
 const ROW = 44; // pixels, as in run.css
 const MARGIN = 8; // rows beyond each edge
@@ -24,7 +38,13 @@ const COLUMNS = [
   { key: "rate", label: "it/s", value: rate, text: (row) => fixed(rate(row), 1), number: true },
   { key: "eta", label: "ETA", value: (row) => row.eta, text: (row) => duration(row.eta), number: true },
   { key: "seconds", label: "Time", value: (row) => row.seconds, text: (row) => duration(row.seconds), number: true },
-  { key: "cameras", label: "Cameras", value: (row) => row.plan?.cameras, text: (row) => count(row.plan?.cameras), number: true },
+  {
+    key: "cameras",
+    label: "Cameras",
+    value: (row) => row.plan?.cameras,
+    text: (row) => count(row.plan?.cameras),
+    number: true,
+  },
   { key: "loss", label: "Loss", value: (row) => row.loss, text: (row) => significant(row.loss), number: true },
   { key: "psnr", label: "PSNR", value: (row) => row.psnr, text: (row) => fixed(row.psnr), number: true },
   { key: "gaussians", label: "Gaussians", value: gaussians, text: (row) => short(gaussians(row)), number: true },
@@ -43,7 +63,10 @@ export function blockTable(choose) {
   const [scroll, search] = [byId("block-scroll"), byId("block-search", HTMLInputElement)];
   /** @type {{rows: Row[], shown: Row[], key: string, down: boolean, marked: number | null, color: (block: number) => string}} */
   const view = { rows: [], shown: [], key: "block", down: false, marked: null, color: () => "transparent" };
-  const spacers = [el("tr", { class: "spacer", "aria-hidden": "true" }), el("tr", { class: "spacer", "aria-hidden": "true" })];
+  const spacers = [
+    el("tr", { class: "spacer", "aria-hidden": "true" }),
+    el("tr", { class: "spacer", "aria-hidden": "true" }),
+  ];
 
   addHeadings("#block-table", COLUMNS, (key) => {
     view.down = view.key === key && !view.down;
@@ -66,7 +89,8 @@ export function blockTable(choose) {
   function make() {
     const cells = COLUMNS.map((column) => {
       const cell = el("td", { class: column.number ? "number" : null, "data-column": column.key });
-      if (column.key === "block") cell.append(el("span", { class: "chip" }), el("button", { type: "button", class: "row-name" }));
+      if (column.key === "block")
+        cell.append(el("span", { class: "chip" }), el("button", { type: "button", class: "row-name" }));
       if (column.key === "status") cell.append(pill("waiting"));
       if (column.key === "iteration") cell.append(el("span"), bar(0, "progress"));
       return cell;
@@ -90,7 +114,9 @@ export function blockTable(choose) {
     setText(iterations, row.iterations ? `${count(row.iteration ?? 0)} / ${count(row.iterations)}` : "–");
     setBar(progress, row.kept ? 0 : row.share, `progress of ${taskLabel(row.name)}`);
     cells[2].dataset.status = row.status;
-    COLUMNS.forEach(({ text }, i) => { if (text) setText(cells[i], text(row)); });
+    COLUMNS.forEach(({ text }, i) => {
+      if (text) setText(cells[i], text(row));
+    });
     cells[COLUMNS.length - 1].title = lastError(row);
   }
 
@@ -111,15 +137,26 @@ export function blockTable(choose) {
   }
 
   scroll.addEventListener("scroll", () => requestAnimationFrame(paint), { passive: true });
-  search.addEventListener("input", () => { scroll.scrollTop = 0; arrange(); });
+  search.addEventListener("input", () => {
+    scroll.scrollTop = 0;
+    arrange();
+  });
 
   return {
     /** @param {Row[]} rows @param {boolean} running whether the run is */
     update(rows, running) {
       view.rows = rows;
       byId("block-table").classList.toggle("ended", !running);
-      const groups = Object.groupBy(rows.filter((row) => row.block >= 0), (row) => row.status);
-      setText(byId("tally"), Object.entries(groups).map(([status, some]) => `${some?.length} ${status}`).join(" · "));
+      const groups = Object.groupBy(
+        rows.filter((row) => row.block >= 0),
+        (row) => row.status,
+      );
+      setText(
+        byId("tally"),
+        Object.entries(groups)
+          .map(([status, some]) => `${some?.length} ${status}`)
+          .join(" · "),
+      );
       arrange();
     },
     /** Marks the row of a block and scrolls to it. @param {number | null} block */
@@ -127,7 +164,11 @@ export function blockTable(choose) {
       view.marked = block;
       const index = view.shown.findIndex((row) => row.block === block);
       const [top, bottom] = [index * ROW, (index + 2) * ROW];
-      if (index >= 0 && scroll.classList.contains("many") && (top < scroll.scrollTop || bottom > scroll.scrollTop + scroll.clientHeight)) {
+      if (
+        index >= 0 &&
+        scroll.classList.contains("many") &&
+        (top < scroll.scrollTop || bottom > scroll.scrollTop + scroll.clientHeight)
+      ) {
         scroll.scrollTop = top - scroll.clientHeight / 2;
       }
       paint();

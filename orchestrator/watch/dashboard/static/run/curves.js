@@ -27,10 +27,10 @@ export function curves(path, table) {
   let blockColors = [];
   const nodes = CHARTS.map((kind) => el("div", { class: "plot chart", role: "img", "aria-label": chartTitle(kind) }));
   byId("charts").append(...CHARTS.map((kind, i) => el("figure", {}, el("figcaption", {}, chartTitle(kind)), nodes[i])));
-  table.colored((block) => (block < 0 ? "var(--ink)" : blockColors[block] ?? "transparent"));
+  table.colored((block) => (block < 0 ? "var(--ink)" : (blockColors[block] ?? "transparent")));
 
   /** @param {number} block -1 for Stage I */
-  const color = (block) => (block < 0 ? token("--ink") : blockColors[block] ?? token("--accent"));
+  const color = (block) => (block < 0 ? token("--ink") : (blockColors[block] ?? token("--accent")));
 
   /** @param {string} task */
   async function load(task) {
@@ -55,12 +55,25 @@ export function curves(path, table) {
   function chips() {
     const offered = begun.filter((row, i) => shown.has(row.name) || i < MOST);
     const key = [offered.map((row) => [row.name, shown.has(row.name)]), blockColors, token("--ink")];
-    replaceIfChanged(byId("shown"), key, () => offered.map(({ name, block }) => {
-      const mark = el("span", { class: "chip" });
-      mark.style.background = color(block);
-      const on = shown.has(name);
-      return el("button", { type: "button", class: "chip-button", "data-task": name, "aria-pressed": String(on), on: { click: () => toggle(name, !on) } }, mark, taskLabel(name));
-    }));
+    replaceIfChanged(byId("shown"), key, () =>
+      offered.map(({ name, block }) => {
+        const mark = el("span", { class: "chip" });
+        mark.style.background = color(block);
+        const on = shown.has(name);
+        return el(
+          "button",
+          {
+            type: "button",
+            class: "chip-button",
+            "data-task": name,
+            "aria-pressed": String(on),
+            on: { click: () => toggle(name, !on) },
+          },
+          mark,
+          taskLabel(name),
+        );
+      }),
+    );
   }
 
   /** @param {string} task @param {boolean} on */
@@ -76,7 +89,10 @@ export function curves(path, table) {
     render();
   }
 
-  document.addEventListener("themechange", () => { chips(); render(); });
+  document.addEventListener("themechange", () => {
+    chips();
+    render();
+  });
   narrow.addEventListener("change", render);
 
   return {
@@ -117,7 +133,7 @@ export function curves(path, table) {
     /** @param {string[]} colors */
     colors(colors) {
       blockColors = colors;
-      table.colored((block) => (block < 0 ? "var(--ink)" : colors[block] ?? "transparent"));
+      table.colored((block) => (block < 0 ? "var(--ink)" : (colors[block] ?? "transparent")));
       chips();
       render();
     },

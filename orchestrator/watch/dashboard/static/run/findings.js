@@ -2,10 +2,14 @@
 
 /** @import { Findings, HeldOutMetrics, MovedCamera, MoverShare, RunPage, Seam } from "../shared/messages.js" */
 /** @import { Choose } from "./run.js" */
-import { get, urlOf } from "panolog/shared/api.js";
+import { get, snapshot, urlOf } from "panolog/shared/api.js";
 import { byId, childrenOf, el, table } from "panolog/shared/dom.js";
-import { METRICS, count, fixed } from "panolog/shared/format.js";
+import { count, fixed, METRICS } from "panolog/shared/format.js";
 
+const MEANING =
+  "PSNR is how far colours are off, in decibels: six more are half the error. " +
+  "SSIM compares structure, 1 is equal; LPIPS what a network sees, 0 is equal. WS-PSNR and WS-SSIM count each pixel " +
+  "by the area that it has on the sphere, because a panorama enlarges what is above and below.";
 const OPEN = 24; // rows up to which a table is open
 
 /** @param {...import("../shared/dom.js").Child} text */
@@ -13,66 +17,113 @@ const note = (...text) => el("p", { class: "muted small note" }, ...text);
 
 /** A table that is closed while it is long. @param {string} label @param {HTMLTableElement} content @param {number} rows */
 const listed = (label, content, rows) =>
-  el("details", { open: rows <= OPEN }, el("summary", {}, label), el("div", { class: "scroll tall", tabindex: 0, role: "region", "aria-label": label }, content));
+  el(
+    "details",
+    { open: rows <= OPEN },
+    el("summary", {}, label),
+    el("div", { class: "scroll tall", tabindex: 0, role: "region", "aria-label": label }, content),
+  );
 
 /** @param {number} number @param {string} what */
 const counted = (number, what) => `${count(number)} ${what}${number === 1 ? "" : "s"}`;
 
 /** The metrics that there are, as text. @param {Record<string, number | null>} values @param {string} [prefix] of their names */
-const metricsText = (values, prefix = "") => METRICS.flatMap(({ key, label, unit, digits }) => {
-  const value = values[prefix + key] ?? null;
-  return value === null ? [] : [`${label} ${fixed(value, digits)}${unit === "dB" ? " dB" : ""}`];
-}).join(", ");
+const metricsText = (values, prefix = "") =>
+  METRICS.flatMap(({ key, label, unit, digits }) => {
+    const value = values[prefix + key] ?? null;
+    return value === null ? [] : [`${label} ${fixed(value, digits)}${unit === "dB" ? " dB" : ""}`];
+  }).join(", ");
 
 /** @param {HeldOutMetrics} metrics @param {Set<string>} pictured @param {Choose} choose */
 function quality({ mean, views, lpips_reason: reason }, pictured, choose) {
   const rows = Object.entries(views);
   const [all, fitted] = [metricsText(mean), metricsText(mean, "cc_")];
   /** @param {[string, Record<string, number | null>]} row */
-  const name = ([view]) => (pictured.has(view) ? el("button", { type: "button", class: "row-name", on: { click: () => choose.view(view) } }, view) : view);
+  const name = ([view]) =>
+    pictured.has(view)
+      ? el("button", { type: "button", class: "row-name", on: { click: () => choose.view(view) } }, view)
+      : view;
   return [
     all && note(`On average ${all}.`, fitted && ` After a fit of each render's colours ${fitted}.`),
-    reason && note(reason),
-    rows.length > 0 && listed(counted(rows.length, "held-out panorama"), table(rows, [
-      ["Panorama", name],
-      ...METRICS.map(({ key, label, digits }) => /** @type {const} */ ([label, (/** @type {typeof rows[number]} */ [, values]) => fixed(values[key], digits), "number"])),
-    ]), rows.length),
+    note(MEANING),
+    reason && !snapshot && note(reason),
+    rows.length > 0 &&
+      listed(
+        counted(rows.length, "held-out panorama"),
+        table(rows, [
+          ["Panorama", name],
+          ...METRICS.map(
+            ({ key, label, digits }) =>
+              /** @type {const} */ ([
+                label,
+                (/** @type {typeof rows[number]} */ [, values]) => fixed(values[key], digits),
+                "number",
+              ]),
+          ),
+        ]),
+        rows.length,
+      ),
   ];
 }
 
 /** The pictures of a face, if it has some. @param {string} path @param {Seam} face @param {string[]} pictures */
 function faceFigures(path, { blocks: [below, above], seam }, pictures) {
-  const parts = { truth: "Photograph", merged: "Model", below: `Block ${below}, Stage I elsewhere`, above: `Block ${above}, Stage I elsewhere` };
-  const names = Object.entries(parts).map(([name, label]) => /** @type {const} */ ([`seam-${below}-${above}-${name}.jpg`, label]));
+  const parts = {
+    truth: "Photograph",
+    merged: "Model",
+    below: `Block ${below}, Stage I elsewhere`,
+    above: `Block ${above}, Stage I elsewhere`,
+  };
+  const names = Object.entries(parts).map(
+    ([name, label]) => /** @type {const} */ ([`seam-${below}-${above}-${name}.jpg`, label]),
+  );
   const line = `seam-${below}-${above}-face.png`;
   if (![line, ...names.map(([name]) => name)].every((name) => pictures.includes(name))) return null;
   /** @param {string} name @param {string} alt @param {string | null} kind */
   const picture = (name, alt, kind = null) => el("img", { src: urlOf(`${path}/findings/${name}`), alt, class: kind });
-  return el("div", { class: "face" },
+  return el(
+    "div",
+    { class: "face" },
     el("h3", {}, `Blocks ${below} and ${above}: seam ${fixed(seam)}`),
     el("label", { class: "small" }, el("input", { type: "checkbox", class: "mark" }), " Mark the face"),
-    el("div", { class: "strips" }, names.map(([name, label]) => el("figure", {}, el("div", {}, picture(name, label), picture(line, "", "line")), el("figcaption", {}, label)))));
+    el(
+      "div",
+      { class: "strips" },
+      names.map(([name, label]) =>
+        el("figure", {}, el("div", {}, picture(name, label), picture(line, "", "line")), el("figcaption", {}, label)),
+      ),
+    ),
+  );
 }
 
 /** @param {string} path @param {Findings} found */
 function seams(path, { seams: faces, colors, pictures }) {
   /** @param {Seam} face */
-  const name = (face) => [el("span", { class: "chip", style: `background: ${colors[faces.indexOf(face)] ?? "var(--line)"}` }), face.blocks.join(" | ")];
+  const name = (face) => [
+    el("span", { class: "chip", style: `background: ${colors[faces.indexOf(face)] ?? "var(--line)"}` }),
+    face.blocks.join(" | "),
+  ];
   return [
-    note("How much more the error of the model steps at a face between two blocks than along planes within them, divided by the same of the Stage I model, which has no blocks: at 1 a face is as invisible as any other place."),
+    note(
+      "How much more the error of the model steps at a face between two blocks than along planes within them, divided by the same of the Stage I model, which has no blocks: at 1 a face is as invisible as any other place.",
+    ),
     ...faces.map((face) => faceFigures(path, face, pictures)),
-    listed(counted(faces.length, "face"), table(faces, [
-      ["Blocks", name, "name"],
-      ["Seam", ({ seam }) => fixed(seam), "number"],
-      ["Step", ({ merged }) => fixed(merged.step, 4), "number"],
-      ["Step within blocks", ({ merged }) => fixed(merged.step_floor, 4), "number"],
-      ["Ratio in Stage I", ({ coarse }) => fixed(coarse.step_ratio), "number"],
-      ["Error", ({ merged }) => fixed(merged.error, 4), "number"],
-      ["Error within blocks", ({ merged }) => fixed(merged.error_floor, 4), "number"],
-      ["Difference in colour", ({ difference }) => fixed(difference.color, 4), "number"],
-      ["Difference in depth", ({ difference }) => fixed(difference.depth, 4), "number"],
-      ["Difference in opacity", ({ difference }) => fixed(difference.opacity, 4), "number"],
-    ]), faces.length),
+    listed(
+      counted(faces.length, "face"),
+      table(faces, [
+        ["Blocks", name, "name"],
+        ["Seam", ({ seam }) => fixed(seam), "number"],
+        ["Step", ({ merged }) => fixed(merged.step, 4), "number"],
+        ["Step within blocks", ({ merged }) => fixed(merged.step_floor, 4), "number"],
+        ["Ratio in Stage I", ({ coarse }) => fixed(coarse.step_ratio), "number"],
+        ["Error", ({ merged }) => fixed(merged.error, 4), "number"],
+        ["Error within blocks", ({ merged }) => fixed(merged.error_floor, 4), "number"],
+        ["Difference in colour", ({ difference }) => fixed(difference.color, 4), "number"],
+        ["Difference in depth", ({ difference }) => fixed(difference.depth, 4), "number"],
+        ["Difference in opacity", ({ difference }) => fixed(difference.opacity, 4), "number"],
+      ]),
+      faces.length,
+    ),
   ];
 }
 
@@ -84,16 +135,22 @@ function poses(moves, metrics) {
   return [
     note(
       `Refining the poses of ${counted(moves.length, "camera")} moved what they see by ${fixed(pixels)} pixels on average.`,
-      bounded.length > 0 && ` ${count(bounded.length)} would have moved farther than their bound: look at ${bounded[0].name}.`,
-      fit && ` Stage I does not refine held-out panoramas. At the poses that fit the finished model best, ${fixed(fit.pixels)} pixels away on average, they have ${metricsText(fit)}; as they are ${metricsText({ psnr: metrics.mean.psnr ?? null })}.`,
+      bounded.length > 0 &&
+        ` ${count(bounded.length)} would have moved farther than their bound: look at ${bounded[0].name}.`,
+      fit &&
+        ` Stage I does not refine held-out panoramas. At the poses that fit the finished model best, ${fixed(fit.pixels)} pixels away on average, they have ${metricsText(fit)}; as they are ${metricsText({ psnr: metrics.mean.psnr ?? null })}.`,
     ),
-    listed(`${counted(moves.length, "camera")}, the farthest first`, table(moves, [
-      ["Panorama", ({ name }) => name],
-      ["Pixels", (camera) => fixed(camera.pixels), "number"],
-      ["Moved", ({ moved }) => fixed(moved, 4), "number"],
-      ["Turned, degrees", ({ turned }) => fixed(turned, 3), "number"],
-      ["At its bound", ({ at_bound: bound }) => (bound ? "yes" : "–")],
-    ]), moves.length),
+    listed(
+      `${counted(moves.length, "camera")}, the farthest first`,
+      table(moves, [
+        ["Panorama", ({ name }) => name],
+        ["Pixels", (camera) => fixed(camera.pixels), "number"],
+        ["Moved", ({ moved }) => fixed(moved, 4), "number"],
+        ["Turned, degrees", ({ turned }) => fixed(turned, 3), "number"],
+        ["At its bound", ({ at_bound: bound }) => (bound ? "yes" : "–")],
+      ]),
+      moves.length,
+    ),
   ];
 }
 
@@ -105,11 +162,20 @@ function movers(path, all, pictures) {
     const file = `mover-${i}.jpg`;
     if (!pictures.includes(file)) return null;
     const caption = el("figcaption", {}, el("b", {}, name), ` · ${fixed(100 * share, 1)} %`);
-    return el("figure", {}, el("img", { src: urlOf(`${path}/findings/${file}`), alt: `${name}, its movers tinted` }), caption);
+    return el(
+      "figure",
+      {},
+      el("img", { src: urlOf(`${path}/findings/${file}`), alt: `${name}, its movers tinted` }),
+      caption,
+    );
   });
   return [
-    note("What single training panoramas show and those around them do not, such as passers-by, is left out of the training. ",
-      found ? `${count(found)} of ${counted(all.length, "panorama")} have some, ${fixed(100 * part)} % of all that they show.` : `None of ${counted(all.length, "panorama")} has any.`),
+    note(
+      "What single training panoramas show and those around them do not, such as passers-by, is left out of the training. ",
+      found
+        ? `${count(found)} of ${counted(all.length, "panorama")} have some, ${fixed(100 * part)} % of all that they show.`
+        : `None of ${counted(all.length, "panorama")} has any.`,
+    ),
     el("div", { class: "movers" }, figures),
   ];
 }

@@ -1,5 +1,6 @@
 // The partition from above: cells by status and progress, points, and cameras by the blocks that they train.
 
+import { BLOCK_STATUSES, STATES } from "panolog/run/rows.js";
 /** @import { Chart, MapFigure, Trace } from "../shared/plotly.js" */
 /** @import { RunPage } from "../shared/messages.js" */
 /** @import { Choose } from "./run.js" */
@@ -8,7 +9,6 @@ import { narrow } from "panolog/shared/charts.js";
 import { byId, el, setText, throttled, token } from "panolog/shared/dom.js";
 import { percent } from "panolog/shared/format.js";
 import { draw, plotly, themed, unpack } from "panolog/shared/plot.js";
-import { BLOCK_STATUSES, STATES } from "panolog/run/rows.js";
 
 const STEP = 1.6; // of one zoom
 const PAUSE = 900; // milliseconds between two drawings
@@ -27,13 +27,19 @@ const MARKED = [
 const coarse = matchMedia("(pointer: coarse)"); // a finger on the map scrolls the page
 
 /** @param {string} color @param {number} alpha */
-const withAlpha = (color, alpha) => color.replace(/rgba?\(([^)]*)\)/, (_, parts) => `rgba(${parts.split(",").slice(0, 3)},${alpha})`);
+const withAlpha = (color, alpha) =>
+  color.replace(/rgba?\(([^)]*)\)/, (_, parts) => `rgba(${parts.split(",").slice(0, 3)},${alpha})`);
 
 /** For each status the colour of the open and of the filled part of a cell, as [red, green, blue, alpha] bytes. */
 function tints() {
   return BLOCK_STATUSES.flatMap((status) => {
-    const tone = (token(`--cell-${status === "kept" ? "waiting" : status}`).match(/[\d.]+/g) ?? []).slice(0, 3).map(Number);
-    return [[...tone, 255 * OPEN], [...tone, 255 * FULL]];
+    const tone = (token(`--cell-${status === "kept" ? "waiting" : status}`).match(/[\d.]+/g) ?? [])
+      .slice(0, 3)
+      .map(Number);
+    return [
+      [...tone, 255 * OPEN],
+      [...tone, 255 * FULL],
+    ];
   });
 }
 
@@ -97,7 +103,9 @@ export function planMap(path, choose) {
     base = { cells: unpack(trace("blocks").z), labels: trace("labels").customdata };
     levels = levelsOf(base.cells);
     byId("layer-label").hidden = layers < 2;
-    layerSelect.replaceChildren(...Array.from({ length: layers }, (_, i) => el("option", { value: i }, `${i + 1} of ${layers}`)));
+    layerSelect.replaceChildren(
+      ...Array.from({ length: layers }, (_, i) => el("option", { value: i }, `${i + 1} of ${layers}`)),
+    );
     layerSelect.value = String(layer);
     shift(figure);
     byId("map-empty").hidden = true;
@@ -106,7 +114,9 @@ export function planMap(path, choose) {
     const drawn = MARKED.filter(([, , ofPlan]) => planned || !ofPlan);
     byId("legend").replaceChildren(
       ...drawn.map(([mark, text]) => el("li", { class: "mark" }, el("span", { "aria-hidden": "true" }, mark), text)),
-      ...(planned ? BLOCK_STATUSES : []).map((status) => el("li", { "data-block-status": status }, `${MARKS[status] ?? ""} ${STATES[status] ?? status}`)),
+      ...(planned ? BLOCK_STATUSES : []).map((status) =>
+        el("li", { "data-block-status": status }, `${MARKS[status] ?? ""} ${STATES[status] ?? status}`),
+      ),
       ...figure.blocks.grades.map(([text, color]) => el("li", { class: "grade", style: `--tone: ${color}` }, text)),
     );
     const [across, up] = [figure.layout.xaxis, figure.layout.yaxis].map(({ range: [low, high] }) => high - low);
@@ -141,7 +151,9 @@ export function planMap(path, choose) {
     const known = Array.from({ length: blocks.count }, (_, block) => {
       const [status, share] = statusOf(block);
       const code = 2 * Math.max(BLOCK_STATUSES.indexOf(status), 0);
-      const [open, filled] = colors.slice(code, code + 2).map((color) => pixel(color, block === marked.block ? MARK : 0));
+      const [open, filled] = colors
+        .slice(code, code + 2)
+        .map((color) => pixel(color, block === marked.block ? MARK : 0));
       return { open, filled, share };
     });
     const [rows, columns] = [cells.length, cells[0].length];
@@ -149,10 +161,12 @@ export function planMap(path, choose) {
     const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
     const image = context.createImageData(columns, rows);
     const pixels = new Uint32Array(image.data.buffer);
-    cells.forEach((row, i) => row.forEach((block, j) => {
-      const { open, filled, share } = known[block];
-      pixels[(rows - 1 - i) * columns + j] = levels[i][j] < share ? filled : open;
-    }));
+    cells.forEach((row, i) =>
+      row.forEach((block, j) => {
+        const { open, filled, share } = known[block];
+        pixels[(rows - 1 - i) * columns + j] = levels[i][j] < share ? filled : open;
+      }),
+    );
     context.putImageData(image, 0, 0);
     return canvas.toDataURL();
   }
@@ -160,7 +174,8 @@ export function planMap(path, choose) {
   /** Updates the text for screen readers. */
   function label() {
     drawn = key();
-    if (!figure?.blocks.planned) return plot.setAttribute("aria-label", `The ${cameraRows().length} cameras and the points from above`);
+    if (!figure?.blocks.planned)
+      return plot.setAttribute("aria-label", `The ${cameraRows().length} cameras and the points from above`);
     const shares = [...statuses.values()].map(([, share]) => share);
     const done = percent(shares.reduce((sum, share) => sum + share, 0) / Math.max(shares.length, 1));
     const groups = Object.entries(Object.groupBy(statuses.values(), ([status]) => status));
@@ -180,7 +195,11 @@ export function planMap(path, choose) {
   function style() {
     trace("blocks").customdata = cells; // invisible, for the pointer
     const [ink, surface, text, line] = ["--points", "--surface", "--ink", "--line-strong"].map(token);
-    trace("points").colorscale = [[0, withAlpha(ink, 0)], [0.02, withAlpha(ink, 0.3)], [1, withAlpha(ink, 0.95)]];
+    trace("points").colorscale = [
+      [0, withAlpha(ink, 0)],
+      [0.02, withAlpha(ink, 0.3)],
+      [1, withAlpha(ink, 0.95)],
+    ];
     for (const name of ["faces", "box"]) trace(name).line.color = line;
     const labels = trace("labels");
     /** @type {number[]} */
@@ -190,7 +209,9 @@ export function planMap(path, choose) {
     labels.textfont.color = text;
     labels.textfont.size = narrow.matches ? 10 : 12;
     labels.text = ids.map((block) => `${block}${MARKS[statusOf(block)[0]] ?? ""}`);
-    labels.marker.size = ids.map((block, i) => scale * ((block === marked.block ? 34 : 26) + 6 * Math.max(labels.text[i].length - 2, 0)));
+    labels.marker.size = ids.map(
+      (block, i) => scale * ((block === marked.block ? 34 : 26) + 6 * Math.max(labels.text[i].length - 2, 0)),
+    );
     marks = states();
     labels.marker.line.width = ids.map((block) => (block === marked.block ? 4 : 2));
     for (const item of cameras()) {
@@ -211,14 +232,26 @@ export function planMap(path, choose) {
     const { x0, dx, y0, dy } = trace("blocks");
     const [rows, columns] = [cells.length, cells[0].length];
     const image = {
-      source: picture(figure), xref: "x", yref: "y", layer: "below", sizing: "stretch",
-      x: x0 - dx / 2, y: y0 + (rows - 0.5) * dy, sizex: columns * dx, sizey: rows * dy,
+      source: picture(figure),
+      xref: "x",
+      yref: "y",
+      layer: "below",
+      sizing: "stretch",
+      x: x0 - dx / 2,
+      y: y0 + (rows - 0.5) * dy,
+      sizex: columns * dx,
+      sizey: rows * dy,
     };
     const data = figure.data.map((item) => ({ ...item }));
-    await draw(plot, data, { ...layout, images: figure.blocks.planned ? [image] : [], dragmode: coarse.matches ? false : "pan" });
+    await draw(plot, data, {
+      ...layout,
+      images: figure.blocks.planned ? [image] : [],
+      dragmode: coarse.matches ? false : "pan",
+    });
   }
 
-  const key = () => JSON.stringify([...statuses].map(([block, [status, share]]) => [block, status, Math.floor(share * 200)]));
+  const key = () =>
+    JSON.stringify([...statuses].map(([block, [status, share]]) => [block, status, Math.floor(share * 200)]));
   const states = () => [...statuses.values()].map(([status]) => status).join();
   const soon = throttled(repaint, PAUSE);
 
@@ -244,11 +277,16 @@ export function planMap(path, choose) {
   byId("zoom-in").addEventListener("click", () => zoom(STEP));
   byId("zoom-out").addEventListener("click", () => zoom(1 / STEP));
   byId("zoom-all").addEventListener("click", () => zoom(0));
-  layerSelect.addEventListener("change", () => { if (figure) shift(figure); render(); });
+  layerSelect.addEventListener("change", () => {
+    if (figure) shift(figure);
+    render();
+  });
   document.addEventListener("themechange", render);
   narrow.addEventListener("change", render);
   // Also when the window stays as it is: a scroll bar that appears makes the card narrower.
-  new ResizeObserver(async () => { if (plot.layout && plot.offsetWidth) (await plotly()).Plots.resize(plot); }).observe(plot);
+  new ResizeObserver(async () => {
+    if (plot.layout && plot.offsetWidth) (await plotly()).Plots.resize(plot);
+  }).observe(plot);
 
   return {
     /** @param {RunPage} run @param {Map<number, [string, number]>} current */

@@ -3,8 +3,35 @@
 /** @import { ActionButtons } from "./actions.js" */
 /** @import { NodeView, RunPage, SettingView, StageView, SummaryHead, UsageView } from "../shared/messages.js" */
 import { snapshot } from "panolog/shared/api.js";
-import { bar, byId, childrenOf, el, first, pill, reconcile, replaceIfChanged, setBar, setMessage, setPill, setText, table } from "panolog/shared/dom.js";
-import { ago, bytes, clock, count, decibel, duration, fixed, percent, shellWord, short, significant, taskLabel } from "panolog/shared/format.js";
+import {
+  bar,
+  byId,
+  childrenOf,
+  el,
+  first,
+  pill,
+  reconcile,
+  replaceIfChanged,
+  setBar,
+  setMessage,
+  setPill,
+  setText,
+  table,
+} from "panolog/shared/dom.js";
+import {
+  ago,
+  bytes,
+  clock,
+  count,
+  decibel,
+  duration,
+  fixed,
+  percent,
+  shellWord,
+  short,
+  significant,
+  taskLabel,
+} from "panolog/shared/format.js";
 
 const REFRESH = 5000; // milliseconds between two updates of times without a message
 const FULL = 0.9; // share of what a machine has from which on little is left
@@ -47,51 +74,66 @@ function costs(money) {
 function showCost(money) {
   byId("cost").hidden = byId("to-cost").hidden = !money || money.used.cost === null;
   if (!money) return;
-  replaceIfChanged(byId("cost-table"), money, () => [table(money.kinds, [
-    ["Machine", ({ kind }) => kind],
-    ["Machines", (kind) => count(kind.count), "number"],
-    [`${money.currency} per hour`, ({ price }) => significant(price), "number"],
-    ["Hours", ({ used }) => fixed(used.seconds / 3600), "number"],
-    ["Cost", ({ used }) => fixed(used.cost), "number"],
-    ["Idle", ({ idle }) => fixed(idle.cost), "number"],
-    ["Lost", ({ lost }) => fixed(lost.cost), "number"],
-  ])]);
+  replaceIfChanged(byId("cost-table"), money, () => [
+    table(money.kinds, [
+      ["Machine", ({ kind }) => kind],
+      ["Machines", (kind) => count(kind.count), "number"],
+      [`${money.currency} per hour`, ({ price }) => significant(price), "number"],
+      ["Hours", ({ used }) => fixed(used.seconds / 3600), "number"],
+      ["Cost", ({ used }) => fixed(used.cost), "number"],
+      ["Idle", ({ idle }) => fixed(idle.cost), "number"],
+      ["Lost", ({ lost }) => fixed(lost.cost), "number"],
+    ]),
+  ]);
 }
 
 /** What to do about a run that ended before it was done. @param {RunPage} run @returns {[string, string] | null} */
 function hint({ summary: { status, stage }, progress, eta, latest, path }) {
+  if (snapshot && status !== "running") return null;
+  const left = eta === null ? "" : `, about ${duration(eta)} left`;
+  if (snapshot) return [`The run was still running when this was written: ${percent(progress)} done${left}.`, ""];
   const resume = `panolog resume ${shellWord(path)}`;
   const kept = stage === "prepare" ? "What is done is kept" : "The checkpoints are kept";
-  if (snapshot && status === "running") {
-    return [`The run was still running when this was written: ${percent(progress)} done${eta === null ? "" : `, about ${duration(eta)} left`}. To write it again:`, `panolog report ${shellWord(path)}`];
-  }
   const last = latest ? ` Last update: ${clock(latest)}, ${ago(latest)}.` : "";
   if (status === "stopped") return [`${kept}.${last} To resume the run:`, resume];
-  if (status === "limited") return ["A limit has ended the training early; the model is what there was. To complete the run, also with a higher limit:", `${resume} --max-cost none --deadline none`];
+  if (status === "limited")
+    return [
+      "A limit has ended the training early; the model is what there was. To complete the run, also with a higher limit:",
+      `${resume} --max-cost none --deadline none`,
+    ];
   if (status === "interrupted") return [`The run was stopped. ${kept}. To resume it:`, resume];
   return status === "failed" ? ["To try again from the last checkpoints:", resume] : null;
 }
 
 function makeStage() {
-  return el("li", { class: "stage" }, el("span", { class: "stage-name" }), el("span", { class: "stage-note" }), bar(0, "progress of the stage"));
+  return el(
+    "li",
+    { class: "stage" },
+    el("span", { class: "stage-name" }),
+    el("span", { class: "stage-note" }),
+    bar(0, "progress of the stage"),
+  );
 }
 
 /**
  * @param {HTMLElement} node
  * @param {StageView} stage
- * @param {number} now the time up to which the stage is known, by the server's clock
+ * @param {number} since seconds for which it has run since the message
  * @param {boolean} live
  * @param {number | null} first when the run began
  */
-function fillStage(node, stage, now, live, first) {
+function fillStage(node, stage, since, live, first) {
   const running = stage.status === "running";
   node.dataset.status = live || !running ? stage.status : "waiting";
   const [name, note, progress] = childrenOf(node);
   setText(name, stage.label);
-  const time = stage.began && (stage.ended || running) ? duration((stage.ended ?? now) - stage.began) : "";
+  const time = stage.seconds === null ? "" : duration(stage.seconds + (running ? since : 0));
   const tally = stage.tasks > 1 && stage.status !== "done" ? `${stage.done} of ${stage.tasks}` : "";
   const from = stage.began ? `from ${clock(stage.began, first ?? undefined)}` : "";
-  setText(note, [live || !running ? stage.status : "last state: running", tally, time, from].filter(Boolean).join(" · "));
+  setText(
+    note,
+    [live || !running ? stage.status : "last state: running", tally, time, from].filter(Boolean).join(" · "),
+  );
   setBar(progress, stage.status === "done" ? 1 : stage.progress, `progress of ${stage.label}`);
 }
 
@@ -108,21 +150,40 @@ export function overview() {
     const running = summary.status === "running";
     const live = running && lost === null;
     const since = Math.max((lost ?? Date.now() / 1000) - came, 0); // by this machine's clock alone
-    const name = run.name === "." ? run.path.split("/").filter(Boolean).pop() ?? "" : run.name;
+    const name = run.name === "." ? (run.path.split("/").filter(Boolean).pop() ?? "") : run.name;
     document.title = `${live ? `${percent(run.progress)} ` : ""}${name} · PanoLOG`;
     setText(byId("name"), name);
-    setText(byId("scene"), [run.info.scene?.path, run.began && `began ${clock(run.began)}`].filter(Boolean).join(" · "));
-    setPill(byId("status"), running && !live ? "unknown" : summary.waiting ? "paused" : summary.status, running && !live ? "last state: running" : summary.label);
+    setText(
+      byId("scene"),
+      [run.info.scene?.path, run.began && `began ${clock(run.began)}`].filter(Boolean).join(" · "),
+    );
+    setPill(
+      byId("status"),
+      running && !live ? "unknown" : summary.waiting ? "paused" : summary.status,
+      running && !live ? "last state: running" : summary.label,
+    );
     setMessage(byId("reason"), summary.waiting === summary.label ? "" : summary.waiting || (summary.reason ?? ""));
     const [text, command] = hint(run) ?? ["", ""];
     byId("hint").hidden = !text;
     setText(byId("hint-text"), text);
     setText(byId("hint-command"), command);
-    reconcile(byId("facts"), facts(run, live, running ? since : 0), ([label]) => label, () => el("div", {}, el("dt"), el("dd")), (node, fact) => {
-      childrenOf(node).forEach((child, i) => setText(child, fact[i]));
-    });
+    reconcile(
+      byId("facts"),
+      facts(run, live, running ? since : 0),
+      ([label]) => label,
+      () => el("div", {}, el("dt"), el("dd")),
+      (node, fact) => {
+        childrenOf(node).forEach((child, i) => setText(child, fact[i]));
+      },
+    );
     showCost(summary.money);
-    reconcile(byId("stages"), run.stages, (stage) => stage.name, makeStage, (node, stage) => fillStage(node, stage, running ? run.now + since : run.latest ?? run.now, live, run.began));
+    reconcile(
+      byId("stages"),
+      run.stages,
+      (stage) => stage.name,
+      makeStage,
+      (node, stage) => fillStage(node, stage, running ? since : 0, live, run.began),
+    );
   }
 
   setInterval(show, REFRESH);
@@ -153,7 +214,9 @@ function meters({ cpu, memory_used, memory_total, disk_used, disk_total, gpus })
     }),
     ["Disk", `${bytes(disk_used)} of ${bytes(disk_total)}`, disk_used / disk_total],
   ];
-  return all.flatMap(([label, text, share]) => (share === null || !Number.isFinite(share) ? [] : [[label, text, share]]));
+  return all.flatMap(([label, text, share]) =>
+    share === null || !Number.isFinite(share) ? [] : [[label, text, share]],
+  );
 }
 
 /** Why a machine gets no tasks, and its release. @param {HTMLElement} node @param {NodeView} host @param {number} now @param {ActionButtons} acts */
@@ -162,11 +225,15 @@ function fillQuarantine(node, { quarantine }, now, acts) {
   setPill(mark, "failed", "quarantined");
   node.hidden = !quarantine;
   const left = quarantine && duration(Math.max(quarantine.until - now, 0));
-  replaceIfChanged(node, [quarantine, left, acts.key()], () => (quarantine ? [
-    el("p", {}, mark, ` ${left} left, until ${clock(quarantine.until)}`),
-    el("p", { class: "small" }, quarantine.reason),
-    acts.ofMachine(quarantine),
-  ] : []));
+  replaceIfChanged(node, [quarantine, left, acts.key()], () =>
+    quarantine
+      ? [
+          el("p", {}, mark, ` ${left} left, until ${clock(quarantine.until)}`),
+          el("p", { class: "small" }, quarantine.reason),
+          acts.ofMachine(quarantine),
+        ]
+      : [],
+  );
 }
 
 /** That a machine leaves, and when. @param {HTMLElement} node @param {NodeView} host @param {number} now */
@@ -175,10 +242,9 @@ function fillLeaving(node, { leaving }, now) {
   setPill(mark, "paused", "leaves");
   node.hidden = !leaving;
   const left = leaving && leaving.until !== null ? `${duration(Math.max(leaving.until - now, 0))} left` : "";
-  replaceIfChanged(node, [leaving, left], () => (leaving ? [
-    el("p", {}, mark, ` ${left}`),
-    el("p", { class: "small" }, leaving.reason),
-  ] : []));
+  replaceIfChanged(node, [leaving, left], () =>
+    leaving ? [el("p", {}, mark, ` ${left}`), el("p", { class: "small" }, leaving.reason)] : [],
+  );
 }
 
 /** @param {HTMLElement} node @param {NodeView} host @param {number} now by the server's clock @param {ActionButtons} acts */
@@ -189,16 +255,32 @@ function fillMachine(node, host, now, acts) {
   const rest = host.tasks.length - MOST;
   setText(title, host.node);
   setText(device, host.gpus.join(", ") || host.device);
-  setText(work, host.tasks.length ? host.tasks.slice(0, MOST).map(taskLabel).join(", ") + (rest > 0 ? ` and ${rest} more` : "") : host.quarantine || host.leaving ? "" : "idle");
-  setText(numbers, host.tasks.length ? `${bytes(host.memory)} used by tasks${host.rate ? ` · ${fixed(host.rate, 1)} it/s` : ""}` : "");
+  setText(
+    work,
+    host.tasks.length
+      ? host.tasks.slice(0, MOST).map(taskLabel).join(", ") + (rest > 0 ? ` and ${rest} more` : "")
+      : host.quarantine || host.leaving
+        ? ""
+        : "idle",
+  );
+  setText(
+    numbers,
+    host.tasks.length ? `${bytes(host.memory)} used by tasks${host.rate ? ` · ${fixed(host.rate, 1)} it/s` : ""}` : "",
+  );
   const makeMeter = () => el("li", {}, el("span"), bar(0, ""), el("span", { class: "number" }));
-  reconcile(usage, host.usage ? meters(host.usage) : [], ([label]) => label, makeMeter, (item, [label, text, share]) => {
-    const [name, meter, value] = childrenOf(item);
-    setText(name, label);
-    setBar(meter, share, `${label} of ${host.node}`);
-    setText(value, text);
-    item.dataset.full = String(share >= FULL);
-  });
+  reconcile(
+    usage,
+    host.usage ? meters(host.usage) : [],
+    ([label]) => label,
+    makeMeter,
+    (item, [label, text, share]) => {
+      const [name, meter, value] = childrenOf(item);
+      setText(name, label);
+      setBar(meter, share, `${label} of ${host.node}`);
+      setText(value, text);
+      item.dataset.full = String(share >= FULL);
+    },
+  );
   setMessage(measured, host.usage ? `measured ${clock(host.usage.time)}` : "");
 }
 
@@ -207,21 +289,47 @@ export function machines(acts) {
   return {
     /** @param {RunPage} run */
     update({ nodes, now }) {
-      const make = () => el("li", {}, el("h3"), el("span", { class: "muted small" }), el("div", { class: "quarantine" }), el("div", { class: "quarantine" }), el("p"), el("p", { class: "muted small" }), el("ul", { class: "meters" }), el("p", { class: "muted small" }));
-      reconcile(byId("nodes"), nodes, (host) => host.node, make, (node, host) => fillMachine(node, host, now, acts));
-      if (!nodes.length) byId("nodes").replaceChildren(el("li", { class: "empty", "data-key": "" }, "No machine is in use yet."));
+      const make = () =>
+        el(
+          "li",
+          {},
+          el("h3"),
+          el("span", { class: "muted small" }),
+          el("div", { class: "quarantine" }),
+          el("div", { class: "quarantine" }),
+          el("p"),
+          el("p", { class: "muted small" }),
+          el("ul", { class: "meters" }),
+          el("p", { class: "muted small" }),
+        );
+      reconcile(
+        byId("nodes"),
+        nodes,
+        (host) => host.node,
+        make,
+        (node, host) => fillMachine(node, host, now, acts),
+      );
+      if (!nodes.length)
+        byId("nodes").replaceChildren(el("li", { class: "empty", "data-key": "" }, "No machine is in use yet."));
     },
   };
 }
 
 /** @param {any} value */
-const valueText = (value) => (value === null || value === undefined ? "none" : typeof value === "string" ? value : JSON.stringify(value));
+const valueText = (value) =>
+  value === null || value === undefined ? "none" : typeof value === "string" ? value : JSON.stringify(value);
 
 /** @param {SettingView} setting */
 function settingRow(setting) {
   const name = el("td", {}, el("code", {}, setting.key), el("span", { class: "doc" }, setting.unit_or_doc));
   const value = el("td", {}, valueText(setting.value), setting.changed && el("span", { class: "changed" }, "changed"));
-  return el("tr", { class: setting.changed ? "differs" : null }, name, value, el("td", { class: "muted" }, valueText(setting.default)));
+  return el(
+    "tr",
+    { class: setting.changed ? "differs" : null },
+    name,
+    value,
+    el("td", { class: "muted" }, valueText(setting.default)),
+  );
 }
 
 export function settings() {
@@ -230,9 +338,15 @@ export function settings() {
   let config = [];
   const show = () => {
     const word = search.value.toLowerCase();
-    const found = config.filter((setting) => (!changed.checked || setting.changed) && `${setting.key} ${setting.unit_or_doc}`.toLowerCase().includes(word));
-    const none = config.length && changed.checked && !word ? "All settings are the defaults." : "No setting has these words.";
-    replaceIfChanged(first("#setting-table tbody"), found, () => (found.length ? found.map(settingRow) : [el("tr", {}, el("td", { colspan: 3, class: "muted" }, none))]));
+    const found = config.filter(
+      (setting) =>
+        (!changed.checked || setting.changed) && `${setting.key} ${setting.unit_or_doc}`.toLowerCase().includes(word),
+    );
+    const none =
+      config.length && changed.checked && !word ? "All settings are the defaults." : "No setting has these words.";
+    replaceIfChanged(first("#setting-table tbody"), found, () =>
+      found.length ? found.map(settingRow) : [el("tr", {}, el("td", { colspan: 3, class: "muted" }, none))],
+    );
   };
   changed.addEventListener("change", show);
   search.addEventListener("input", show);
@@ -242,7 +356,12 @@ export function settings() {
       config = run.config;
       const versions = Object.entries(run.info.versions ?? {}).map(([name, version]) => `${name} ${version}`);
       const { created, seed, scene } = run.info;
-      setText(byId("versions"), [`created ${created ?? "?"}`, ...versions, `seed ${seed ?? "?"}`, `scene ${scene?.fingerprint ?? "?"}`].join(" · "));
+      setText(
+        byId("versions"),
+        [`created ${created ?? "?"}`, ...versions, `seed ${seed ?? "?"}`, `scene ${scene?.fingerprint ?? "?"}`].join(
+          " · ",
+        ),
+      );
       show();
     },
   };

@@ -2,7 +2,17 @@
 
 /** @import { PictureView, PreparationView, RunPage, StepView } from "../shared/messages.js" */
 import { snapshot, urlOf } from "panolog/shared/api.js";
-import { bar, byId, childrenOf, el, reconcile, replaceIfChanged, setBar, setMessage, setText } from "panolog/shared/dom.js";
+import {
+  bar,
+  byId,
+  childrenOf,
+  el,
+  reconcile,
+  replaceIfChanged,
+  setBar,
+  setMessage,
+  setText,
+} from "panolog/shared/dom.js";
 import { count, duration } from "panolog/shared/format.js";
 
 /** What is known of the panoramas. @param {PreparationView} view @returns {[string, string][]} */
@@ -43,7 +53,12 @@ function fillStep(node, step, live) {
 function figure(path, { name, label, version }) {
   const url = urlOf(`${path}/preparation/${name}?${version}`);
   const image = el("img", { src: url, alt: label, loading: "lazy" });
-  return el("figure", {}, snapshot ? image : el("a", { href: url, target: "_blank" }, image), el("figcaption", {}, label));
+  return el(
+    "figure",
+    {},
+    snapshot ? image : el("a", { href: url, target: "_blank" }, image),
+    el("figcaption", {}, label),
+  );
 }
 
 /** @param {string} path of the run below /api */
@@ -62,11 +77,25 @@ export function preparation(path) {
       if (now !== making) details.open = now; // later the rest of the page matters more
       making = now;
       setMessage(byId("preparation-source"), `of ${view.source}`);
-      reconcile(byId("steps"), view.steps, (step) => step.name, makeStep, (node, step) => fillStep(node, step, connected));
-      reconcile(byId("kept"), numbers(view), ([label]) => label, () => el("div", {}, el("dt"), el("dd")), (node, pair) => {
-        childrenOf(node).forEach((child, i) => setText(child, pair[i]));
-      });
-      replaceIfChanged(byId("prepared-pictures"), view.pictures, () => view.pictures.map((picture) => figure(path, picture)));
+      reconcile(
+        byId("steps"),
+        view.steps,
+        (step) => step.name,
+        makeStep,
+        (node, step) => fillStep(node, step, connected),
+      );
+      reconcile(
+        byId("kept"),
+        numbers(view),
+        ([label]) => label,
+        () => el("div", {}, el("dt"), el("dd")),
+        (node, pair) => {
+          childrenOf(node).forEach((child, i) => setText(child, pair[i]));
+        },
+      );
+      replaceIfChanged(byId("prepared-pictures"), view.pictures, () =>
+        view.pictures.map((picture) => figure(path, picture)),
+      );
     },
   };
 }

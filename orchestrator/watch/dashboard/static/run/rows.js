@@ -21,10 +21,12 @@ export const STATES = { kept: "as Stage I left it" };
  */
 export function blockStatuses({ summary }) {
   const tasks = new Map(summary.tasks.map((task) => [task.name, task]));
-  return new Map(summary.blocks.map(({ block, train }) => {
-    const task = tasks.get(blockTask(block));
-    return [block, !train ? ["kept", 1] : task ? [task.status, task.share] : ["waiting", 0]];
-  }));
+  return new Map(
+    summary.blocks.map(({ block, train }) => {
+      const task = tasks.get(blockTask(block));
+      return [block, !train ? ["kept", 1] : task ? [task.status, task.share] : ["waiting", 0]];
+    }),
+  );
 }
 
 /** @param {RunPage} run @returns {Row[]} */
@@ -40,10 +42,13 @@ export function trainingRows({ summary, nodes, paused }) {
     return { ...task, block, place: 0, plan, kept, device, status, share: kept ? 1 : task.share };
   };
   /** @param {string} stage */
-  const others = (stage) => summary.tasks.filter(({ name }) => name.startsWith(`${stage}/`)).map(({ name }) => row(name, -1));
+  const others = (stage) =>
+    summary.tasks.filter(({ name }) => name.startsWith(`${stage}/`)).map(({ name }) => row(name, -1));
   const blocks = summary.blocks.map((plan) => row(blockTask(plan.block), plan.block, plan));
   const rows = [...others("district"), row("coarse", -1), ...blocks, ...others("round"), ...others("repair")];
-  rows.forEach((each, place) => { each.place = place; });
+  rows.forEach((each, place) => {
+    each.place = place;
+  });
   return rows;
 }
 

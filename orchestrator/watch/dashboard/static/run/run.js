@@ -1,9 +1,5 @@
 // The page of one run: passes the server's messages to its parts.
 
-/** @import { EventList, RunChanges, RunPage } from "../shared/messages.js" */
-import { connectionLine, get, messageOf, snapshot, statusOf, stream } from "panolog/shared/api.js";
-import { byId, setMessage } from "panolog/shared/dom.js";
-import { shellWord } from "panolog/shared/format.js";
 import { actions } from "panolog/run/actions.js";
 import { blockTable } from "panolog/run/blocks.js";
 import { curves } from "panolog/run/curves.js";
@@ -13,9 +9,14 @@ import { log } from "panolog/run/log.js";
 import { planMap } from "panolog/run/map.js";
 import { machines, overview, settings } from "panolog/run/overview.js";
 import { preparation } from "panolog/run/preparation.js";
+import { report } from "panolog/run/report.js";
 import { blockStatuses, trainingRows } from "panolog/run/rows.js";
 import { selection } from "panolog/run/selection.js";
 import { views } from "panolog/run/views.js";
+/** @import { EventList, RunChanges, RunPage } from "../shared/messages.js" */
+import { connectionLine, get, messageOf, snapshot, statusOf, stream } from "panolog/shared/api.js";
+import { byId, setMessage } from "panolog/shared/dom.js";
+import { shellWord } from "panolog/shared/format.js";
 
 const id = snapshot ? "report" : encodeURIComponent(location.pathname.split("/").filter(Boolean).pop() ?? "");
 const path = `runs/${id}`;
@@ -40,6 +41,8 @@ const choose = {
   /** @param {string} task */
   curve(task) {
     charts.toggle(task, true);
+    const folded = document.querySelector("#curves.folded .fold");
+    if (folded instanceof HTMLElement) folded.click();
     byId("curves").scrollIntoView();
   },
   /** @param {string} task */
@@ -93,7 +96,8 @@ function show(sent) {
   byId("missing").hidden = true;
   const rows = trainingRows(run);
   head.update(run, lost);
-  if (!snapshot) acts.update(run);
+  if (snapshot) report(path, run);
+  else acts.update(run);
   prepared.update(run, lost === null);
   map.update(run, blockStatuses(run));
   table.update(rows, run.summary.status === "running");
@@ -130,7 +134,8 @@ async function explain() {
 function lastState() {
   if (!known) return ", trying again …";
   const { status, label } = known.summary;
-  const then = status === "running" ? "; trying again …" : `. To open it again: panolog dashboard ${shellWord(known.path)}`;
+  const then =
+    status === "running" ? "; trying again …" : `. To open it again: panolog dashboard ${shellWord(known.path)}`;
   return ` — last state: ${label}${then}`;
 }
 
@@ -139,32 +144,37 @@ const line = connectionLine((time) => {
   document.body.classList.toggle("lost", time !== null);
   if (known) show(known);
 }, lastState);
-stream(`?run=${id}&changes=1`, () => {
-  line.good();
-  events.refresh();
-  charts.refresh();
-  pictures.refresh();
-}, (refused) => {
-  line.lost();
-  if (refused) explain();
-}, {
-  /** @param {RunPage} run */
-  run(run) {
+stream(
+  `?run=${id}&changes=1`,
+  () => {
     line.good();
-    show(run);
+    events.refresh();
+    charts.refresh();
+    pictures.refresh();
   },
-  /** @param {RunChanges} changes */
-  changes(changes) {
-    if (known) show(changed(known, changes));
+  (refused) => {
+    line.lost();
+    if (refused) explain();
   },
-  /** @param {{error: string}} message */
-  gone({ error }) {
-    line.lost(`The run cannot be read: ${error}`);
+  {
+    /** @param {RunPage} run */
+    run(run) {
+      line.good();
+      show(run);
+    },
+    /** @param {RunChanges} changes */
+    changes(changes) {
+      if (known) show(changed(known, changes));
+    },
+    /** @param {{error: string}} message */
+    gone({ error }) {
+      line.lost(`The run cannot be read: ${error}`);
+    },
+    /** @param {EventList} message */
+    events({ events: recent }) {
+      events.add(recent);
+      charts.add(recent);
+      pictures.add(recent);
+    },
   },
-  /** @param {EventList} message */
-  events({ events: recent }) {
-    events.add(recent);
-    charts.add(recent);
-    pictures.add(recent);
-  },
-});
+);

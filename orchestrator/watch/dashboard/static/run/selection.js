@@ -1,5 +1,6 @@
 // What is selected on the map or in the table: a camera with its gradient scores, or a block with its actions.
 
+import { lastError } from "panolog/run/rows.js";
 /** @import { BlockCameras, CameraView, PreviewList, RunPage, SavedPreview } from "../shared/messages.js" */
 /** @import { ActionButtons } from "./actions.js" */
 /** @import { PlanMap } from "./map.js" */
@@ -8,7 +9,6 @@
 import { get, messageOf, snapshot, urlOf } from "panolog/shared/api.js";
 import { bar, byId, el, pill, replaceIfChanged } from "panolog/shared/dom.js";
 import { bytes, count, duration, fixed, percent, short, significant, taskLabel } from "panolog/shared/format.js";
-import { lastError } from "panolog/run/rows.js";
 
 const SCORES = 24; // bars drawn for one camera; of the rest only the number is shown
 const REASONS = {
@@ -32,24 +32,55 @@ const OPEN = 12; // cameras of a block up to which their list is open
 function cameraPictures(path, camera, previews, choose) {
   const broken = el("figcaption", {}, "Panorama");
   const panorama = el("img", {
-    alt: `the panorama ${camera.name}`, src: camera.no_picture ? null : urlOf(`${path}/camera/${camera.row}/panorama`),
-    on: { error: () => { panorama.remove(); broken.textContent = "Its picture cannot be decoded."; } },
+    alt: `the panorama ${camera.name}`,
+    src: camera.no_picture ? null : urlOf(`${path}/camera/${camera.row}/panorama`),
+    on: {
+      error: () => {
+        panorama.remove();
+        broken.textContent = "Its picture cannot be decoded.";
+      },
+    },
   });
-  const renders = previews.filter(({ view }) => view === camera.name).map(({ event, task, iteration }) => {
-    const label = `${taskLabel(task)}, iteration ${count(iteration)}`;
-    const image = el("img", { alt: "", src: urlOf(`${path}/previews/${event}`), loading: "lazy" });
-    return el("figure", {}, el("button", { type: "button", class: "picture", on: { click: () => choose.preview(task) } }, image, el("span", {}, label)));
-  });
-  return el("div", { class: "pictures" },
-    camera.no_picture ? el("p", { class: "muted small" }, `No picture: ${camera.no_picture}.`) : el("figure", {}, panorama, broken), renders);
+  const renders = previews
+    .filter(({ view }) => view === camera.name)
+    .map(({ event, task, iteration }) => {
+      const label = `${taskLabel(task)}, iteration ${count(iteration)}`;
+      const image = el("img", { alt: "", src: urlOf(`${path}/previews/${event}`), loading: "lazy" });
+      return el(
+        "figure",
+        {},
+        el(
+          "button",
+          { type: "button", class: "picture", on: { click: () => choose.preview(task) } },
+          image,
+          el("span", {}, label),
+        ),
+      );
+    });
+  return el(
+    "div",
+    { class: "pictures" },
+    camera.no_picture
+      ? el("p", { class: "muted small" }, `No picture: ${camera.no_picture}.`)
+      : el("figure", {}, panorama, broken),
+    renders,
+  );
 }
 
 /** The cameras that train a block. @param {BlockCameras} block @param {Choose} choose */
 function cameraList({ cameras }, choose) {
   const groups = Object.groupBy(cameras, ({ reason }) => reason);
-  const tally = Object.entries(groups).map(([reason, some]) => `${count(some?.length)} by ${CRITERIA[reason]}`).join(", ");
-  const items = cameras.map(({ row, name, reason }) => el("li", {},
-    el("button", { type: "button", class: "row-name", on: { click: () => choose.camera(row) } }, name), el("span", { class: "muted" }, CRITERIA[reason])));
+  const tally = Object.entries(groups)
+    .map(([reason, some]) => `${count(some?.length)} by ${CRITERIA[reason]}`)
+    .join(", ");
+  const items = cameras.map(({ row, name, reason }) =>
+    el(
+      "li",
+      {},
+      el("button", { type: "button", class: "row-name", on: { click: () => choose.camera(row) } }, name),
+      el("span", { class: "muted" }, CRITERIA[reason]),
+    ),
+  );
   if (!items.length) return el("p", { class: "muted small" }, "No camera trains it.");
   const summary = el("summary", {}, `${count(cameras.length)} camera${cameras.length > 1 ? "s" : ""}: ${tally}`);
   return el("details", { open: items.length <= OPEN }, summary, el("ul", { class: "cameras" }, items));
@@ -57,19 +88,35 @@ function cameraList({ cameras }, choose) {
 
 /** @param {CameraView} camera @param {Choose} choose */
 function cameraPanel(camera, choose) {
-  if (!camera.scores.length) return [el("p", { class: "muted small" }, "Which blocks it trains is decided after Stage I.")];
+  if (!camera.scores.length)
+    return [el("p", { class: "muted small" }, "Which blocks it trains is decided after Stage I.")];
   const most = Math.max(...camera.scores, 0);
   const order = camera.scores.map((score, block) => ({ score, block, reason: camera.assigned[block] }));
   order.sort((a, b) => Number(Boolean(b.reason)) - Number(Boolean(a.reason)) || b.score - a.score);
   const rows = order.slice(0, SCORES).map(({ score, block, reason }) => {
     const share = most > 0 ? score / most : 0;
-    const name = el("button", { type: "button", class: "row-name", on: { click: () => choose.block(block) } }, `Block ${block}`);
+    const name = el(
+      "button",
+      { type: "button", class: "row-name", on: { click: () => choose.block(block) } },
+      `Block ${block}`,
+    );
     const meter = bar(share, `score of block ${block} relative to the largest`);
-    return el("li", { class: reason ? "serves" : null }, name, meter, el("span", { class: "number", title: String(score) }, percent(share)), el("span", { class: "why" }, reason ? `trains it: ${REASONS[reason]}` : "not trained"));
+    return el(
+      "li",
+      { class: reason ? "serves" : null },
+      name,
+      meter,
+      el("span", { class: "number", title: String(score) }, percent(share)),
+      el("span", { class: "why" }, reason ? `trains it: ${REASONS[reason]}` : "not trained"),
+    );
   });
   const rest = order.length - rows.length;
   return [
-    el("p", { class: "muted small" }, `In block ${camera.block}. Gradient scores, as shares of its largest (${significant(most)}):`),
+    el(
+      "p",
+      { class: "muted small" },
+      `In block ${camera.block}. Gradient scores, as shares of its largest (${significant(most)}):`,
+    ),
     el("ul", { class: "scores" }, rows),
     rest > 0 && el("p", { class: "muted small" }, `${count(rest)} more blocks have lower scores.`),
   ];
@@ -96,8 +143,17 @@ function blockNumbers(row) {
   ].filter(([, value]) => value && value !== "–");
   return [
     el("div", { class: "panel-title" }, el("h3", {}, taskLabel(row.name)), pill(row.status)),
-    row.kept && el("p", { class: "muted small" }, "Not trained: it has next to no Gaussians or too few cameras, so it keeps its Stage I Gaussians."),
-    el("dl", { class: "numbers" }, numbers.map(([label, value]) => el("div", {}, el("dt", {}, label), el("dd", {}, value)))),
+    row.kept &&
+      el(
+        "p",
+        { class: "muted small" },
+        "Not trained: it has next to no Gaussians or too few cameras, so it keeps its Stage I Gaussians.",
+      ),
+    el(
+      "dl",
+      { class: "numbers" },
+      numbers.map(([label, value]) => el("div", {}, el("dt", {}, label), el("dd", {}, value))),
+    ),
     error && el("p", { class: "notice error" }, error),
   ];
 }
@@ -110,7 +166,11 @@ function blockButtons(row, choose, acts) {
     !snapshot && acts.viewer(row.name),
   ];
   const block = row.block >= 0 && !snapshot;
-  return [el("div", { class: "row" }, shows), block && el("div", { class: "row" }, acts.ofBlock(row)), block && acts.whyNot(row)];
+  return [
+    el("div", { class: "row" }, shows),
+    block && el("div", { class: "row" }, acts.ofBlock(row)),
+    block && acts.whyNot(row),
+  ];
 }
 
 /**
@@ -141,7 +201,9 @@ export function selection(path, choose, acts, map) {
       if (row) return blockButtons(row, choose, acts);
       return camera && !snapshot ? [el("div", { class: "row" }, acts.viewer(null, camera.name))] : [];
     });
-    replaceIfChanged(parts[2], [key, cameras], () => (camera ? cameraPanel(camera, choose) : cameras ? [cameraList(cameras, choose)] : []));
+    replaceIfChanged(parts[2], [key, cameras], () =>
+      camera ? cameraPanel(camera, choose) : cameras ? [cameraList(cameras, choose)] : [],
+    );
     if (parts[0].parentElement !== panel) panel.replaceChildren(...parts);
   }
 
@@ -194,13 +256,23 @@ export function selection(path, choose, acts, map) {
       show();
       const { notices } = run.summary;
       /** @param {typeof notices} some */
-      const list = (some) => el("ul", { class: "noticed" }, some.map(({ task, message }) => el("li", {}, el("b", {}, taskLabel(task)), " ", message)));
+      const list = (some) =>
+        el(
+          "ul",
+          { class: "noticed" },
+          some.map(({ task, message }) => el("li", {}, el("b", {}, taskLabel(task)), " ", message)),
+        );
       const earlier = notices.slice(-NOTICES[1], -NOTICES[0]);
-      replaceIfChanged(byId("notices"), notices, () => (notices.length ? [
-        el("h3", {}, "Notices"),
-        list(notices.slice(-NOTICES[0])),
-        earlier.length > 0 && el("details", {}, el("summary", {}, `${count(earlier.length)} earlier`), list(earlier)),
-      ] : []));
+      replaceIfChanged(byId("notices"), notices, () =>
+        notices.length
+          ? [
+              el("h3", {}, "Notices"),
+              list(notices.slice(-NOTICES[0])),
+              earlier.length > 0 &&
+                el("details", {}, el("summary", {}, `${count(earlier.length)} earlier`), list(earlier)),
+            ]
+          : [],
+      );
     },
   };
 }

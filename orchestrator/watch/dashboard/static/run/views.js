@@ -7,8 +7,10 @@ import { byId, el, replaceIfChanged, setText } from "panolog/shared/dom.js";
 import { count, decibel, fixed, taskLabel } from "panolog/shared/format.js";
 
 /** @param {HeldOutView} view */
-const heldOutText = ({ name, metrics }) => `${name}, held out: PSNR ${decibel(metrics?.psnr)}, SSIM ${fixed(metrics?.ssim, 4)}, WS-PSNR ${decibel(metrics?.ws_psnr)}`;
+const heldOutText = ({ name, metrics }) =>
+  `${name}, held out: PSNR ${decibel(metrics?.psnr)}, SSIM ${fixed(metrics?.ssim, 4)}, WS-PSNR ${decibel(metrics?.ws_psnr)}`;
 
+const HATCHED = ["block/", "round/", "repair/"]; // stages whose tasks train a part of the place
 const STAGES = ["district", "coarse", "block", "round", "repair"];
 
 /** Stage I first. @param {string} a @param {string} b */
@@ -41,15 +43,32 @@ export function views(path) {
     state.tasks = lists[0].previews.map((preview) => preview.task).sort(byStage);
     state.heldOut = lists[1].views;
     byId("views").hidden = byId("to-views").hidden = Boolean(snapshot) && !state.heldOut.length;
+    if (state.done && state.heldOut.length) lead();
     replaceIfChanged(source, [state.tasks, state.heldOut.map((view) => view.name)], options);
     if (source.value) await show(source.value);
   }
 
+  /** A finished run begins with its best held-out panorama. */
+  function lead() {
+    if (byId("lead").classList.contains("pictured")) return;
+    byId("lead").classList.add("pictured");
+    byId("lead").prepend(byId("views"));
+    const best = state.heldOut.reduce((a, b) => ((b.metrics?.psnr ?? 0) > (a.metrics?.psnr ?? 0) ? b : a));
+    state.chosen ??= `view/${best.number}`;
+  }
+
   /** Fills the list of pictures, and keeps what was selected. */
   function options() {
-    const trained = state.tasks.map((task) => el("option", { value: task, selected: task === (state.chosen ?? state.tasks.at(-1)) }, taskLabel(task)));
-    const held = state.heldOut.map(({ number, name }) => el("option", { value: `view/${number}`, selected: `view/${number}` === state.chosen }, name));
-    return [trained.length ? el("optgroup", { label: "Training views" }, trained) : null, held.length ? el("optgroup", { label: "Held-out views" }, held) : null];
+    const trained = state.tasks.map((task) =>
+      el("option", { value: task, selected: task === (state.chosen ?? state.tasks.at(-1)) }, taskLabel(task)),
+    );
+    const held = state.heldOut.map(({ number, name }) =>
+      el("option", { value: `view/${number}`, selected: `view/${number}` === state.chosen }, name),
+    );
+    return [
+      trained.length ? el("optgroup", { label: "Training views" }, trained) : null,
+      held.length ? el("optgroup", { label: "Held-out views" }, held) : null,
+    ];
   }
 
   /** Shows the pictures of an option. @param {string} value */
@@ -59,11 +78,18 @@ export function views(path) {
     if (view) {
       state.frames = [{ url: urlOf(`${path}/views/${view.number}`) ?? "", text: heldOutText(view) }];
     } else {
+      const part = HATCHED.some((stage) => value.startsWith(stage));
+      const hatched = part ? " · what is hatched is not trained by this block" : "";
       /** @type {PreviewList} */
-      const { previews } = await get(`${path}/previews?task=${encodeURIComponent(value)}`).catch(() => ({ previews: [] }));
-      state.frames = previews.sort((a, b) => a.event - b.event).map((preview) => ({
-        url: urlOf(`${path}/previews/${preview.event}`) ?? "", text: `${preview.view}, iteration ${count(preview.iteration)}`,
+      const { previews } = await get(`${path}/previews?task=${encodeURIComponent(value)}`).catch(() => ({
+        previews: [],
       }));
+      state.frames = previews
+        .sort((a, b) => a.event - b.event)
+        .map((preview) => ({
+          url: urlOf(`${path}/previews/${preview.event}`) ?? "",
+          text: `${preview.view}, iteration ${count(preview.iteration)}${hatched}`,
+        }));
     }
     const last = state.frames.length - 1;
     frame.max = String(Math.max(last, 0));
@@ -115,7 +141,7 @@ export function views(path) {
     /** @param {RunPage} run */
     update(run) {
       const done = run.summary.status === "done";
-      if (done && state.done === false) refresh(); // the held-out views are complete
+      if (done && !state.done) setTimeout(refresh); // the held-out views are complete
       state.done = done;
     },
   };

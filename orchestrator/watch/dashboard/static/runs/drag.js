@@ -4,7 +4,8 @@
 const [EDGE, SCROLL] = [48, 12];
 
 /** The rows among which a row is moved. @param {HTMLElement} row */
-const rowsOf = (row) => /** @type {HTMLElement[]} */ ([...(row.parentElement?.querySelectorAll(":scope > .waits") ?? [])]);
+const rowsOf = (row) =>
+  /** @type {HTMLElement[]} */ ([...(row.parentElement?.querySelectorAll(":scope > .waits") ?? [])]);
 
 /** The place among the other rows at a height in the window. @param {HTMLElement} row @param {number} y */
 function placeAt(row, y) {
@@ -44,18 +45,26 @@ export function draggable(handle, row, drop) {
       for (const one of rowsOf(row)) one.classList.remove("drop-above", "drop-below");
     };
     row.classList.add("dragged");
-    handle.addEventListener("pointermove", (move) => {
-      const { clientY: y, pageY } = move;
-      row.style.translate = `0 ${pageY - down.pageY}px`;
-      if (y < EDGE || y > innerHeight - EDGE) scrollBy(0, y < EDGE ? -SCROLL : SCROLL);
-      mark(row, placeAt(row, y));
-    }, options);
-    handle.addEventListener("pointerup", (up) => {
-      const waits = row.classList.contains("waits"); // it may have started meanwhile
-      const place = placeAt(row, up.clientY);
-      end();
-      if (waits) drop(row.dataset.key ?? "", place);
-    }, options);
+    handle.addEventListener(
+      "pointermove",
+      (move) => {
+        const { clientY: y, pageY } = move;
+        row.style.translate = `0 ${pageY - down.pageY}px`;
+        if (y < EDGE || y > innerHeight - EDGE) scrollBy(0, y < EDGE ? -SCROLL : SCROLL);
+        mark(row, placeAt(row, y));
+      },
+      options,
+    );
+    handle.addEventListener(
+      "pointerup",
+      (up) => {
+        const waits = row.classList.contains("waits"); // it may have started meanwhile
+        const place = placeAt(row, up.clientY);
+        end();
+        if (waits) drop(row.dataset.key ?? "", place);
+      },
+      options,
+    );
     handle.addEventListener("lostpointercapture", end, options);
     addEventListener("keydown", (key) => key.key === "Escape" && end(), options);
   }

@@ -1,12 +1,12 @@
 // The queue above the list of runs: in its order, with buttons that move, remove and retry entries, and handles
 // by which those that wait are dragged.
 
+import { draggable } from "panolog/runs/drag.js";
 /** @import { QueueList, QueueRow } from "../shared/messages.js" */
 import { messageOf, post } from "panolog/shared/api.js";
 import { confirm } from "panolog/shared/confirm.js";
 import { byId, el, first, pill, reconcile, setMessage, setPill, setText } from "panolog/shared/dom.js";
 import { ago } from "panolog/shared/format.js";
-import { draggable } from "panolog/runs/drag.js";
 
 /** @typedef {"up" | "down" | "retry" | "remove"} Button */
 /** What each button shows, and what screen readers say; {} is the run. @type {Record<Button, [string, string]>} */
@@ -48,12 +48,14 @@ async function act(button, id) {
   if (!row || refusal(button, row)) return;
   if (button === "remove") {
     const text = "It is not run any more. Its run folder, if there is one, stays as it is.";
-    confirm([`Remove ${row.name} from the queue?`, text, "Remove"], true, () => request(row, "remove", null, `${row.name} is removed`));
+    confirm([`Remove ${row.name} from the queue?`, text, "Remove"], true, () =>
+      request(row, "remove", null, `${row.name} is removed`),
+    );
     return;
   }
   const order = waiting().map((one) => one.id);
   const at = order.indexOf(id);
-  const before = button === "up" ? order[at - 1] : button === "down" ? order[at + 2] ?? null : null;
+  const before = button === "up" ? order[at - 1] : button === "down" ? (order[at + 2] ?? null) : null;
   if (button === "retry") await attempt(row, "retry", null, `${row.name} waits again`);
   else await attempt(row, "move", before, `${row.name} is moved ${button}`);
 }
@@ -101,15 +103,26 @@ function fillRow(node, row) {
   setText(first(".scene", node), row.reason || [`${verb} ${ago(row.time)}`, row.share].filter(Boolean).join(" · "));
   setPill(first(".pill", node), row.label);
   const wanted = buttonsOf(row);
-  reconcile(first(".queue-buttons", node), wanted, String, (button) => {
-    const [text, label] = BUTTONS[button];
-    const words = { type: "button", class: "queue-button", "data-action": button, "aria-label": label.replace("{}", row.name) };
-    return el("button", { ...words, on: { click: () => act(button, row.id) } }, text);
-  }, (shown, button) => {
-    const why = refusal(button, row);
-    shown.setAttribute("aria-disabled", String(Boolean(why)));
-    shown.title = why;
-  });
+  reconcile(
+    first(".queue-buttons", node),
+    wanted,
+    String,
+    (button) => {
+      const [text, label] = BUTTONS[button];
+      const words = {
+        type: "button",
+        class: "queue-button",
+        "data-action": button,
+        "aria-label": label.replace("{}", row.name),
+      };
+      return el("button", { ...words, on: { click: () => act(button, row.id) } }, text);
+    },
+    (shown, button) => {
+      const why = refusal(button, row);
+      shown.setAttribute("aria-disabled", String(Boolean(why)));
+      shown.title = why;
+    },
+  );
 }
 
 /** Shows the queue, if there is one. @param {QueueList | null} queue */
@@ -126,7 +139,11 @@ export function showQueue(queue) {
   const [entry, button] = [active?.closest("li")?.dataset.key, active?.dataset.action];
   reconcile(list, rows, (row) => String(row.id), makeRow, fillRow);
   // a row that is moved in the document loses the focus
-  if (entry && document.activeElement !== active) first(`li[data-key="${entry}"] [data-action="${button}"]`, list)?.focus();
+  if (entry && document.activeElement !== active)
+    first(`li[data-key="${entry}"] [data-action="${button}"]`, list)?.focus();
   const more = queue.hidden ? `${queue.hidden} more are not shown; panolog queue list shows all.` : "";
-  setMessage(byId("queue-more"), rows.length || queue.error ? more : "The queue is empty. Add a run with: panolog queue add SCENE -o RUN");
+  setMessage(
+    byId("queue-more"),
+    rows.length || queue.error ? more : "The queue is empty. Add a run with: panolog queue add SCENE -o RUN",
+  );
 }

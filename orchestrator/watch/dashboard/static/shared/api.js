@@ -10,7 +10,7 @@ import { clock } from "panolog/shared/format.js";
 export const snapshot = JSON.parse(document.getElementById("snapshot")?.textContent ?? "null");
 
 /** The URL of a picture. @param {string} path below /api @returns {string | null} */
-export const urlOf = (path) => (snapshot ? snapshot.answers[path] ?? null : `/api/${path}`);
+export const urlOf = (path) => (snapshot ? (snapshot.answers[path] ?? null) : `/api/${path}`);
 
 /** An answer that is an error, with the server's own line. */
 class ApiError extends Error {
@@ -109,13 +109,17 @@ export function stream(query, open, lost, handlers) {
       lost(refused);
       if (refused) timer = setTimeout(connect, RETRY);
     };
-    for (const [kind, handle] of Object.entries(handlers)) opened.addEventListener(kind, (event) => handle(JSON.parse(event.data)));
+    for (const [kind, handle] of Object.entries(handlers))
+      opened.addEventListener(kind, (event) => handle(JSON.parse(event.data)));
   };
   // A browser has few connections to one server: pages in the background release theirs after a while.
   document.addEventListener("visibilitychange", () => {
     clearTimeout(timer);
     if (document.hidden) {
-      timer = setTimeout(() => { source?.close(); source = null; }, HIDDEN);
+      timer = setTimeout(() => {
+        source?.close();
+        source = null;
+      }, HIDDEN);
     } else if (source === null || source.readyState === EventSource.CLOSED) connect();
   });
   connect();

@@ -21,8 +21,12 @@ export const CHARTS = [
 ];
 /** The parameters of a Gaussian with the dashes of their learning rates. @type {Record<string, [string, string]>} */
 const PARAMETERS = {
-  means: ["position", "solid"], scales: ["scale", "dash"], quats: ["rotation", "dot"], opacities: ["opacity", "dashdot"],
-  sh0: ["base colour", "longdash"], shN: ["SH colour", "longdashdot"],
+  means: ["position", "solid"],
+  scales: ["scale", "dash"],
+  quats: ["rotation", "dot"],
+  opacities: ["opacity", "dashdot"],
+  sh0: ["base colour", "longdash"],
+  shN: ["SH colour", "longdashdot"],
 };
 
 /** @param {ChartKind} kind */
@@ -35,17 +39,34 @@ const parameter = (name) => PARAMETERS[name.slice(RATES.length)] ?? [name.slice(
 export function chartTraces({ key, size }, curves) {
   /** @param {string} name */
   const wanted = (name) => (key === RATES ? name.startsWith(RATES) : name === key);
-  const lines = curves.flatMap(({ label, color, series }) => Object.entries(series).filter(([name]) => wanted(name)).map(([name, { iteration, value }]) => {
-    const [rate, dash] = key === RATES ? parameter(name) : ["", "solid"];
-    return {
-      type: "scatter", mode: value.length > 1 ? "lines" : "markers", x: iteration, y: size ? value.map((one) => one && one / size) : value,
-      name: rate ? `${label}, ${rate}` : label, line: { color, width: 1.7, dash }, showlegend: false, hovertemplate: "%{y:.4~g}",
-    };
-  }));
+  const lines = curves.flatMap(({ label, color, series }) =>
+    Object.entries(series)
+      .filter(([name]) => wanted(name))
+      .map(([name, { iteration, value }]) => {
+        const [rate, dash] = key === RATES ? parameter(name) : ["", "solid"];
+        return {
+          type: "scatter",
+          mode: value.length > 1 ? "lines" : "markers",
+          x: iteration,
+          y: size ? value.map((one) => one && one / size) : value,
+          name: rate ? `${label}, ${rate}` : label,
+          line: { color, width: 1.7, dash },
+          showlegend: false,
+          hovertemplate: "%{y:.4~g}",
+        };
+      }),
+  );
   if (key !== RATES) return lines;
   const names = new Set(curves.flatMap(({ series }) => Object.keys(series).filter(wanted)));
   const entries = [...names].map(parameter).map(([name, dash]) => ({
-    type: "scatter", mode: "lines", x: [null], y: [null], name, line: { color: "#7b8696", width: 1.7, dash }, showlegend: true, hoverinfo: "skip",
+    type: "scatter",
+    mode: "lines",
+    x: [null],
+    y: [null],
+    name,
+    line: { color: "#7b8696", width: 1.7, dash },
+    showlegend: true,
+    hoverinfo: "skip",
   }));
   return [...lines, ...entries];
 }
@@ -54,11 +75,38 @@ export function chartTraces({ key, size }, curves) {
 export function chartLayout({ key }) {
   const log = key === RATES;
   return {
-    margin: { l: 8, r: 10, t: 6, b: 8 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", showlegend: log,
-    legend: { orientation: "h", x: 0, y: 1, yanchor: "bottom", font: { size: 11 }, itemclick: false, itemdoubleclick: false, itemwidth: 30, entrywidth: narrow.matches ? 0.5 : 0.33, entrywidthmode: "fraction" },
-    hovermode: "x unified", dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom", uirevision: "curves",
+    margin: { l: 8, r: 10, t: 6, b: 8 },
+    paper_bgcolor: "rgba(0,0,0,0)",
+    plot_bgcolor: "rgba(0,0,0,0)",
+    showlegend: log,
+    legend: {
+      orientation: "h",
+      x: 0,
+      y: 1,
+      yanchor: "bottom",
+      font: { size: 11 },
+      itemclick: false,
+      itemdoubleclick: false,
+      itemwidth: 30,
+      entrywidth: narrow.matches ? 0.5 : 0.33,
+      entrywidthmode: "fraction",
+    },
+    hovermode: "x unified",
+    dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
+    uirevision: "curves",
     font: { family: "system-ui, sans-serif", size: 11.5 },
-    xaxis: { automargin: true, rangemode: "tozero", zeroline: false, nticks: 6, title: { text: "iteration", standoff: 6, font: { size: 11.5 } } },
-    yaxis: { automargin: true, type: log ? "log" : "linear", zeroline: false, ...(log ? { dtick: 1, exponentformat: "power" } : { nticks: 6, exponentformat: "SI" }) },
+    xaxis: {
+      automargin: true,
+      rangemode: "tozero",
+      zeroline: false,
+      nticks: 6,
+      title: { text: "iteration", standoff: 6, font: { size: 11.5 } },
+    },
+    yaxis: {
+      automargin: true,
+      type: log ? "log" : "linear",
+      zeroline: false,
+      ...(log ? { dtick: 1, exponentformat: "power" } : { nticks: 6, exponentformat: "SI" }),
+    },
   };
 }

@@ -1,12 +1,15 @@
 // Two pictures of a panorama, such as a render and its ground truth: flat with a slider between the two, or as a 360° view.
 
-import { panorama } from "panolog/shared/panorama.js";
 import { el } from "panolog/shared/dom.js";
+import { panorama } from "panolog/shared/panorama.js";
 
 /** A part of a picture: the ground truth at its bottom, or the render at its top. @typedef {{url: string, truth: boolean, label: string}} Side */
 
 /** The two sides of one picture. @param {string} url @returns {[Side, Side]} */
-const sidesOf = (url) => [{ url, truth: false, label: "render" }, { url, truth: true, label: "ground truth" }];
+const sidesOf = (url) => [
+  { url, truth: false, label: "render" },
+  { url, truth: true, label: "ground truth" },
+];
 
 const JOINED = 4096; // pixels of a joined picture at most
 
@@ -17,7 +20,19 @@ function joined(images, sides) {
   const half = canvas.height / 2;
   images.forEach((image, i) => {
     const [width, height] = [image.naturalWidth, image.naturalWidth / 2];
-    canvas.getContext("2d")?.drawImage(image, 0, sides[i].truth ? image.naturalHeight - height : 0, width, height, 0, i * half, canvas.width, half);
+    canvas
+      .getContext("2d")
+      ?.drawImage(
+        image,
+        0,
+        sides[i].truth ? image.naturalHeight - height : 0,
+        width,
+        height,
+        0,
+        i * half,
+        canvas.width,
+        half,
+      );
   });
   return canvas;
 }
@@ -31,7 +46,15 @@ export function comparison(name) {
   const [render, truth] = [el("img", { alt: "" }), el("img", { alt: "" })];
   const halves = [el("div", { class: "half render" }, render), el("div", { class: "half truth" }, truth)];
   const tags = ["left", "right"].map((side) => el("span", { class: `tag ${side}`, "aria-hidden": "true" }));
-  const box = el("div", { class: "compare" }, halves[1], halves[0], el("span", { class: "divider", "aria-hidden": "true" }), tags, split);
+  const box = el(
+    "div",
+    { class: "compare" },
+    halves[1],
+    halves[0],
+    el("span", { class: "divider", "aria-hidden": "true" }),
+    tags,
+    split,
+  );
   let sides = sidesOf("");
   /** Made when it is first wanted: a browser has few contexts of WebGL. @type {ReturnType<typeof panorama> | null} */
   let sphere = null;

@@ -7,9 +7,22 @@ import { byId, el, setText } from "panolog/shared/dom.js";
 function made() {
   const known = byId("confirm", HTMLDialogElement);
   if (known) return known;
-  const menu = el("menu", {}, el("button", { value: "cancel" }, "Cancel"), el("button", { id: "confirm-yes", value: "yes", type: "button" }));
-  const text = [el("h2", { id: "confirm-title" }), el("p", { id: "confirm-text" }), el("p", { id: "confirm-error", class: "error", role: "alert" })];
-  const dialog = el("dialog", { id: "confirm", "aria-labelledby": "confirm-title" }, el("form", { method: "dialog" }, text, menu));
+  const menu = el(
+    "menu",
+    {},
+    el("button", { value: "cancel" }, "Cancel"),
+    el("button", { id: "confirm-yes", value: "yes", type: "button" }),
+  );
+  const text = [
+    el("h2", { id: "confirm-title" }),
+    el("p", { id: "confirm-text" }),
+    el("p", { id: "confirm-error", class: "error", role: "alert" }),
+  ];
+  const dialog = el(
+    "dialog",
+    { id: "confirm", "aria-labelledby": "confirm-title" },
+    el("form", { method: "dialog" }, text, menu),
+  );
   document.body.append(dialog);
   return dialog;
 }

@@ -13,8 +13,11 @@
 export function el(tag, properties = {}, ...children) {
   const node = document.createElement(tag);
   for (const [name, value] of Object.entries(properties)) {
-    if (name === "on") for (const [event, listener] of Object.entries(value)) node.addEventListener(event, /** @type {any} */ (listener));
-    else if (value !== null && value !== undefined && value !== false) node.setAttribute(name, value === true ? "" : value);
+    if (name === "on")
+      for (const [event, listener] of Object.entries(value))
+        node.addEventListener(event, /** @type {any} */ (listener));
+    else if (value !== null && value !== undefined && value !== false)
+      node.setAttribute(name, value === true ? "" : value);
   }
   node.append(...children.flat().filter((child) => child !== null && child !== undefined && child !== false));
   return node;
@@ -101,7 +104,10 @@ export function replaceIfChanged(parent, key, content) {
   parent.dataset.key = text;
   const focused = parent.contains(document.activeElement) ? document.activeElement?.textContent : null;
   parent.replaceChildren(...content().filter((child) => child !== null && child !== undefined && child !== false));
-  if (focused) /** @type {HTMLElement[]} */ ([...parent.querySelectorAll("button, a")]).find((node) => node.textContent === focused)?.focus({ preventScroll: true });
+  if (focused)
+    /** @type {HTMLElement[]} */ ([...parent.querySelectorAll("button, a")])
+      .find((node) => node.textContent === focused)
+      ?.focus({ preventScroll: true });
 }
 
 const ROWS = 2_000; // of a table at most
@@ -114,7 +120,13 @@ const ROWS = 2_000; // of a table at most
  */
 export function table(items, columns) {
   const heads = columns.map(([label, , kind]) => el("th", { scope: "col", class: kind }, label));
-  const rows = items.slice(0, ROWS).map((item) => el("tr", {}, columns.map(([, content, kind]) => el("td", { class: kind }, content(item)))));
+  const rows = items.slice(0, ROWS).map((item) =>
+    el(
+      "tr",
+      {},
+      columns.map(([, content, kind]) => el("td", { class: kind }, content(item))),
+    ),
+  );
   return el("table", {}, el("thead", {}, el("tr", {}, heads)), el("tbody", {}, rows));
 }
 
@@ -125,16 +137,19 @@ export function table(items, columns) {
  * @param {(key: string) => void} sortBy
  */
 export function addHeadings(table, columns, sortBy) {
-  first(`${table} thead tr`).append(...columns.map(({ key, label, number }) => {
-    const button = el("button", { type: "button", class: "sorter", on: { click: () => sortBy(key) } }, label);
-    return el("th", { scope: "col", class: number ? "number" : null, "data-column": key }, button);
-  }));
+  first(`${table} thead tr`).append(
+    ...columns.map(({ key, label, number }) => {
+      const button = el("button", { type: "button", class: "sorter", on: { click: () => sortBy(key) } }, label);
+      return el("th", { scope: "col", class: number ? "number" : null, "data-column": key }, button);
+    }),
+  );
 }
 
 /** Marks the column that a table is sorted by. @param {string} table selector @param {string} key @param {boolean} down */
 export function markSorted(table, key, down) {
   for (const head of childrenOf(first(`${table} thead tr`))) {
-    if (head.matches("th")) head.setAttribute("aria-sort", head.dataset.column !== key ? "none" : down ? "descending" : "ascending");
+    if (head.matches("th"))
+      head.setAttribute("aria-sort", head.dataset.column !== key ? "none" : down ? "descending" : "ascending");
   }
 }
 
@@ -153,7 +168,10 @@ export function compare(x, y, down) {
 
 /** Whether a text contains all words of a search. @param {string} text @param {string} search */
 export function matches(text, search) {
-  return search.toLowerCase().split(/\s+/).every((word) => text.toLowerCase().includes(word));
+  return search
+    .toLowerCase()
+    .split(/\s+/)
+    .every((word) => text.toLowerCase().includes(word));
 }
 
 /** A colour of the style sheet in the current theme, by the name of its property. @param {string} name */

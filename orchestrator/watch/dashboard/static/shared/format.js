@@ -5,7 +5,8 @@
 const NONE = "–";
 
 /** @param {(value: number) => string} format @returns {(value: Maybe) => string} */
-const orDash = (format) => (value) => (value !== null && value !== undefined && Number.isFinite(value) ? format(value) : NONE);
+const orDash = (format) => (value) =>
+  value !== null && value !== undefined && Number.isFinite(value) ? format(value) : NONE;
 
 /** @param {Maybe} value */
 export const fixed = (value, digits = 2) => orDash((known) => known.toFixed(digits))(value);
@@ -62,7 +63,22 @@ export const METRICS = [
 ];
 
 /** @type {Record<string, string>} */
-const TASKS = { prepare: "preparation", district: "district", coarse: "Stage I", score: "scoring", plan: "partition", block: "block", union: "union", round: "second round of block", repair: "repair of seam", merge: "merge", measure: "measurement", eval: "evaluation", deliver: "delivery", calibrate: "calibration" };
+const TASKS = {
+  prepare: "preparation",
+  district: "district",
+  coarse: "Stage I",
+  score: "scoring",
+  plan: "partition",
+  block: "block",
+  union: "union",
+  round: "second round of block",
+  repair: "repair of seam",
+  merge: "merge",
+  measure: "measurement",
+  eval: "evaluation",
+  deliver: "delivery",
+  calibrate: "calibration",
+};
 
 /** A task as people read it: "Stage I", "block 3", "scoring 0", "merge"; "run" for "". @param {string} task */
 export function taskLabel(task) {

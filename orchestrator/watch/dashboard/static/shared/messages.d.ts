@@ -354,6 +354,7 @@ export interface Ratios {
 export interface Results {
   model: boolean;
   report: boolean;
+  view: boolean;
   map: boolean;
   exposure: string | null;
   findings: string;
@@ -439,6 +440,10 @@ export interface RunRow {
   created: number | null;
   latest: number | null;
   seconds: number | null;
+  width: number | null;
+  iterations: number | null;
+  blocks: number | null;
+  cover: number | null;
   error: string | null;
 }
 

@@ -29,7 +29,10 @@ const FOCAL = [0.35, 4]; // widest and narrowest
 /** @param {WebGLRenderingContext} gl */
 function program(gl) {
   const made = gl.createProgram();
-  for (const [kind, text] of /** @type {const} */ ([[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]])) {
+  for (const [kind, text] of /** @type {const} */ ([
+    [gl.VERTEX_SHADER, VERTEX],
+    [gl.FRAGMENT_SHADER, FRAGMENT],
+  ])) {
     const shader = /** @type {WebGLShader} */ (gl.createShader(kind));
     gl.shaderSource(shader, text);
     gl.compileShader(shader);
@@ -113,8 +116,13 @@ export function panorama(splitter) {
   canvas.addEventListener("keydown", (event) => {
     /** @type {Record<string, () => void>} */
     const keys = {
-      ArrowLeft: () => turn(-STEP, 0), ArrowRight: () => turn(STEP, 0), ArrowUp: () => turn(0, STEP), ArrowDown: () => turn(0, -STEP),
-      "+": () => zoom(1.2), "=": () => zoom(1.2), "-": () => zoom(1 / 1.2),
+      ArrowLeft: () => turn(-STEP, 0),
+      ArrowRight: () => turn(STEP, 0),
+      ArrowUp: () => turn(0, STEP),
+      ArrowDown: () => turn(0, -STEP),
+      "+": () => zoom(1.2),
+      "=": () => zoom(1.2),
+      "-": () => zoom(1 / 1.2),
     };
     if (!keys[event.key]) return;
     event.preventDefault();

@@ -8,16 +8,18 @@ const CONFIG = { displayModeBar: false, responsive: true, doubleClick: "reset", 
 let loading = null;
 
 export function plotly() {
-  loading ??= window.Plotly ? Promise.resolve(window.Plotly) : new Promise((resolve, reject) => {
-    const script = document.createElement("script");
-    script.src = "/static/plotly.min.js";
-    script.onload = () => resolve(window.Plotly);
-    script.onerror = () => {
-      loading = null;
-      reject(new Error("the charts could not be loaded"));
-    };
-    document.head.append(script);
-  });
+  loading ??= window.Plotly
+    ? Promise.resolve(window.Plotly)
+    : new Promise((resolve, reject) => {
+        const script = document.createElement("script");
+        script.src = "/static/plotly.min.js";
+        script.onload = () => resolve(window.Plotly);
+        script.onerror = () => {
+          loading = null;
+          reject(new Error("the charts could not be loaded"));
+        };
+        document.head.append(script);
+      });
   return loading;
 }
 
@@ -40,7 +42,11 @@ export function themed(layout) {
   const line = token("--line");
   /** @param {Axis} given @returns {Axis} */
   const axis = (given) => ({ ...given, gridcolor: line, linecolor: line, zerolinecolor: line });
-  const label = { bgcolor: token("--surface"), bordercolor: token("--line-strong"), font: { color: token("--ink"), size: 12 } };
+  const label = {
+    bgcolor: token("--surface"),
+    bordercolor: token("--line-strong"),
+    font: { color: token("--ink"), size: 12 },
+  };
   return {
     ...layout,
     font: { ...layout.font, color: token("--muted") },

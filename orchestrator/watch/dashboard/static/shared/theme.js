@@ -3,7 +3,11 @@
   const KEY = "panolog-theme";
   const root = document.documentElement;
   const stored = () => {
-    try { return localStorage.getItem(KEY); } catch { return null; } // storage may be forbidden
+    try {
+      return localStorage.getItem(KEY);
+    } catch {
+      return null;
+    } // storage may be forbidden
   };
   const isDark = () =>
     (root.dataset.theme ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light")) === "dark";
@@ -19,7 +23,11 @@
     const label = () => button?.setAttribute("aria-label", isDark() ? "Switch to light" : "Switch to dark");
     button?.addEventListener("click", () => {
       const theme = isDark() ? "light" : "dark";
-      try { localStorage.setItem(KEY, theme); } catch { /* it lasts as long as the page */ }
+      try {
+        localStorage.setItem(KEY, theme);
+      } catch {
+        /* it lasts as long as the page */
+      }
       apply(theme);
     });
     document.addEventListener("themechange", label);

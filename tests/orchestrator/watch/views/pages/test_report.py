@@ -21,7 +21,7 @@ from panolog.orchestrator.engine.scheduling.pool import Failed
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
+from panolog.orchestrator.runs.info import SceneRef, make_info, read_info, write_info
 from panolog.orchestrator.runs.records import Noticed, RunBegan, Stored, TaskFailed
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.dashboard.messages import (
@@ -82,6 +82,21 @@ def test_a_finished_run_is_one_self_contained_page(done: RunFolder) -> None:
     assert set(report[f"series?task={COARSE}"]) == {"loss", "rate"}
     assert report["map"]["blocks"]["colors"][0] and report["findings"]["metrics"]["mean"]["psnr"] == 24
     assert report["views/0"].startswith("data:image/jpeg;base64,")
+
+
+def test_a_reader_elsewhere_sees_no_path_and_what_is_next_to_the_report(
+    done: RunFolder, tmp_path: Path
+) -> None:
+    scene = read_info(done).scene.path
+    done.page.write_text("a page")
+    within = Report(write_report(done))
+    elsewhere = Report(write_report(done, tmp_path / "page.html"))
+    done.page.unlink()
+    for report in (within, elsewhere):
+        assert str(done.root) not in report.text and scene not in report.text
+        assert report.run.info["scene"]["path"] == Path(scene).name
+    assert (within.run.result.view, within.run.result.model) == (True, True)
+    assert (elsewhere.run.result.view, elsewhere.run.result.model) == (False, False)
 
 
 def test_its_answers_are_those_of_the_dashboard(done: RunFolder) -> None:

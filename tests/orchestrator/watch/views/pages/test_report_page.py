@@ -1,6 +1,7 @@
 """The report in a real browser, opened from disk without a network, wide and narrow, light and dark."""
 
 import shutil
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -10,11 +11,20 @@ from playwright.sync_api import Browser, Page, expect
 
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.runs.records import Noticed, TaskFailed
+from panolog.orchestrator.runs.records import (
+    EvaluationSaved,
+    Noticed,
+    Outcome,
+    RunEnded,
+    TaskFailed,
+    ViewEvaluated,
+)
+from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import write_report
 from panolog.orchestrator.watch.views.palette import SEAM_GRADES
 from panolog.workers.seams.schema import SeamsFile
-from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.history import AGAIN, BEGAN, model
 from tests.orchestrator.watch.dashboard.browser import DESK, PHONE, SMALL, opened, unreachable
 from tests.orchestrator.watch.dashboard.served import (
     EVIL,
@@ -22,6 +32,7 @@ from tests.orchestrator.watch.dashboard.served import (
     progressed,
     serving,
     started,
+    write_run,
     write_whole_run,
 )
 from tests.orchestrator.watch.views.models import save_model
@@ -41,6 +52,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_model(folder, COARSE)
     append(folder, *(progressed(COARSE, iteration) for iteration in range(51, 100)))
     append(folder, started(TaskId.block(1)), TaskFailed(TaskId.block(1), 1, "out of memory " * 9, final=True))
+    append(folder, Noticed(EVAL, "LPIPS needs the package lpips: pip install lpips"))
     append(folder, *(Noticed(COARSE, f"{EVIL} {number}") for number in range(8)))
     _measure(folder)
     path = write_report(folder, folder.root.parent / "page.html", running=False)
@@ -74,6 +86,12 @@ def _measure(folder: RunFolder) -> None:
     cv2.imwrite(str(folder.mover_picture("0.jpg")), np.full((64, 128, 3), RED, np.uint8))
 
 
+def _unfold(page: Page) -> None:
+    """Shows all cards."""
+    for button in page.locator(".fold:visible").all():
+        button.click()
+
+
 def _colors(page: Page, selector: str) -> tuple[int, int, int]:
     """The mean colour that the page shows there, as blue, green and red."""
     data = page.locator(selector).first.screenshot()
@@ -81,6 +99,18 @@ def _colors(page: Page, selector: str) -> tuple[int, int, int]:
     assert picture is not None
     blue, green, red = picture.reshape(-1, 3).mean(axis=0).round().astype(int).tolist()
     return blue, green, red
+
+
+def test_no_time_counts_in_which_no_driver_was_at_work(browser: Browser, tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    with closing(Database(folder.database)) as database:
+        database.store([(0.0, BEGAN), (0.0, started(COARSE)), (10.0, RunEnded(Outcome.INTERRUPTED))])
+        database.store([(7000.0, AGAIN), (7000.0, started(COARSE)), (7015.0, model(COARSE))])
+        database.store([(7015.0, RunEnded(Outcome.FAILED, "no"))])
+    report = write_report(folder, tmp_path / "page.html", running=False)
+    with opened(browser, report.as_uri()) as page:
+        expect(page.locator("#facts")).to_contain_text("Elapsed25 s")
+        expect(page.locator("#stages li[data-key='coarse']")).to_contain_text("done · 25 s")
 
 
 def test_all_is_there_without_network(browser: Browser, report: Path) -> None:
@@ -104,6 +134,11 @@ def test_all_is_there_without_network(browser: Browser, report: Path) -> None:
         expect(page.locator("#movers")).to_contain_text("1 of 2 panoramas have some, 1.50 %")
         expect(page.locator("#events")).to_contain_text("given up")
         expect(page.locator("#setting-table")).to_contain_text("iterations")
+        assert "pip install" not in str(page.locator("body").text_content())
+        expect(page.locator("#map-plot")).to_be_hidden()
+        expect(page.locator("#quality")).not_to_contain_text("LPIPS needs")  # it is of no use to a reader
+        _unfold(page)
+        expect(page.locator("#map-plot")).to_be_visible()
         expect(page.locator("#actions button, #selected button, #cost:visible")).to_have_count(0)
         assert page.evaluate("[...document.images].filter((image) => !image.naturalWidth).length") == 0
         page.locator(".face .mark").check()
@@ -123,6 +158,7 @@ def test_the_dashboard_shows_it_in_a_sandbox(browser: Browser, report: Path, tmp
 
 def test_the_map_is_that_of_the_dashboard(browser: Browser, report: Path) -> None:
     with opened(browser, report.as_uri()) as page:
+        _unfold(page)
         expect(page.locator("#map-plot .imagelayer image")).to_have_count(1)
         expect(page.locator("#map-plot")).to_have_attribute(
             "aria-label", "The partition from above: 2 blocks (1 kept, 1 failed), 50% done"
@@ -140,6 +176,7 @@ def test_the_map_is_that_of_the_dashboard(browser: Browser, report: Path) -> Non
 
 def test_pictures_are_shown_flat_and_around(browser: Browser, report: Path) -> None:
     with opened(browser, report.as_uri()) as page:
+        _unfold(page)
         page.locator("#quality").get_by_role("button", name=NAME).click()
         stage = page.locator("#stage .compare")
         expect(stage).to_be_visible()
@@ -158,6 +195,7 @@ def test_pictures_are_shown_flat_and_around(browser: Browser, report: Path) -> N
 def test_all_can_be_read_and_reached(browser: Browser, report: Path, width: int) -> None:
     with opened(browser, report.as_uri(), width=width) as page:
         page.emulate_media(reduced_motion="reduce")  # a smooth scroll would still be on its way
+        _unfold(page)
         lines = page.locator(".chart").first.locator(".scatterlayer .trace")
         expect(lines).to_have_count(2)
         page.locator("#shown").get_by_role("button", name="Stage I").click()
@@ -177,4 +215,31 @@ def test_a_report_of_a_live_run_says_so(browser: Browser, tmp_path: Path) -> Non
     with opened(browser, page_file.as_uri()) as page:
         expect(page.locator("#status")).to_have_text("last state: running")
         expect(page.locator("#hint")).to_contain_text("still running when this was written: ")
-        expect(page.locator("#hint-command")).to_contain_text("panolog report ")
+        expect(page.locator("#hint-command")).to_be_empty()
+
+
+def test_a_finished_one_begins_with_a_picture_and_is_short(browser: Browser, tmp_path: Path) -> None:
+    folder = write_whole_run(tmp_path / "run")
+    save_model(folder, COARSE)
+    _measure(folder)
+    names, values = ("good.jpg", "better.jpg", "bad.jpg"), (21.0, 26.0, 18.0)
+    views: dict[str, dict[str, float | None]] = {
+        name: {"psnr": psnr, "ssim": 0.9, "ws_psnr": psnr} for name, psnr in zip(names, values, strict=True)
+    }
+    for name in names:
+        shutil.copy((folder.images / NAME).with_suffix(".jpg"), folder.picture(name))
+    write_json(folder.metrics, {"mean": {"psnr": 20.0}, "views": views})
+    folder.page.write_text("a page")
+    append(folder, *(ViewEvaluated(EVAL, name, metrics) for name, metrics in views.items()))
+    append(folder, EvaluationSaved("eval/metrics.json", {"psnr": 20.0}), RunEnded(Outcome.DONE))
+    with opened(browser, write_report(folder, running=False).as_uri(), width=PHONE) as page:
+        expect(page.locator("#lead .frames")).to_contain_text("better.jpg, held out: PSNR 26.00 dB")
+        expect(page.locator("#verdict")).to_contain_text("From 3 places")
+        expect(page.locator("#verdict")).to_contain_text("by 10.0 % of full brightness")
+        expect(page.get_by_role("link", name="Open in 3D")).to_have_attribute("href", "view.html")
+        expect(page.locator("#scene")).to_be_hidden()
+        assert page.evaluate("document.documentElement.scrollHeight") <= 3000
+        page.get_by_role("button", name="Show Curves").click()
+        expect(page.locator(".chart").first).to_be_visible()
+        page.get_by_role("button", name="Hide Curves").click()
+        expect(page.locator(".chart").first).to_be_hidden()

@@ -1,7 +1,7 @@
 """Pages of models in 3D for the dashboard: what a finished run has written, or made by a process on request.
 
 A model needs torch and far more memory than a server should use, so this file is also the program that
-makes one page: `python -m panolog.orchestrator.watch.dashboard.model_pages ROOT RUN TASK OUTPUT`.
+makes one page: `python -m panolog.orchestrator.watch.dashboard.models.pages ROOT RUN TASK OUTPUT`.
 
 A page is a folder whose scripts fetch the model in parts. It runs in an origin of its own, from which
 browsers send no cookie, so its address has a random key that grants its files, and nothing else.
@@ -9,7 +9,6 @@ browsers send no cookie, so its address has a random key that grants its files, 
 
 import asyncio
 import json
-import os
 import re
 import secrets
 import shutil
@@ -26,17 +25,17 @@ from panolog.export.site.page import described, photograph_number
 from panolog.export.site.write import media_type
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import model_of
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, by_handle, open_below, read_below
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below, read_below
+from panolog.orchestrator.watch.dashboard.models.making import reading, run_program
 from panolog.orchestrator.watch.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.watch.dashboard.responses import Download
 from panolog.orchestrator.watch.views.site.photographs import WIDE
-from panolog.scene.errors import InputError, PanologError
+from panolog.scene.errors import InputError
 from panolog.workers.tasks import TaskId
 
 _CACHED = 8  # pages
 _REFRESH_S = 10  # between two looks of a page for a newer model of a training
 _QUEUED = 4  # requests that may wait at a time
-_TIMEOUT_S = 300.0  # for one page
 _MOST = 1_000_000  # Gaussians of a page that is made on request
 _DESCRIPTION_BYTES = 32_000_000  # of a scene.json at most
 _PATH = re.compile(r"/models/([0-9a-f]{48})/.*", re.DOTALL)
@@ -198,52 +197,18 @@ class ModelPages:
         return await asyncio.to_thread(_Site.of, output, scene, temporary=True, live=live)
 
     async def _write(self, entry: RunEntry, task: str | None, output: Path) -> None:
-        arguments = [str(entry.root), entry.path, task or "", str(output)]
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", __name__, *arguments),
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.DEVNULL,
-            stderr=asyncio.subprocess.PIPE,
-        )
-        try:
-            _, errors = await asyncio.wait_for(process.communicate(), _TIMEOUT_S)
-        except asyncio.TimeoutError as error:
-            raise InputError(f"the 3D view was not made within {_TIMEOUT_S:.0f} seconds") from error
-        finally:
-            if process.returncode is None:
-                process.kill()
-                await process.wait()
-        if process.returncode:
-            lines = errors.decode(errors="replace").strip().splitlines()
-            raise InputError(lines[-1] if lines else "the 3D view could not be made")
+        await run_program(__name__, [str(entry.root), entry.path, task or "", str(output)], "the 3D view")
 
 
 def _main(root: str, run: str, task: str, output: str) -> None:
     """Makes one page, of files that are really below the run alone."""
-    import torch  # noqa: PLC0415
-
     from panolog.export.site.write import write_site  # noqa: PLC0415
     from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run  # noqa: PLC0415
 
-    os.nice(10)  # the run may be training on this machine
-    torch.set_num_threads(1)
-    folder = RunEntry(Path(root), run).folder
-    names: dict[str, str] = {}
-
-    def locate(path: Path) -> Path:
-        opened = by_handle(open_below(path, folder.root))
-        names[str(opened)] = path.name
-        return opened
-
-    try:
+    with reading(RunEntry(Path(root), run)) as (folder, locate):
         wanted = Wanted(TaskId.parse(task) if task else None, most=_MOST)
         shown = site_of_run(folder, wanted, locate)
         write_site(Path(output), shown.write_model, shown.page)
-    except PanologError as error:
-        text = str(error)
-        for opened, name in names.items():
-            text = text.replace(opened, name)
-        sys.exit(text)
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ from playwright.sync_api import Browser, expect
 from panolog.orchestrator.engine.stages.partitioning import write_plan
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.watch.dashboard import model_pages
-from panolog.orchestrator.watch.dashboard.model_pages import page_policy
+from panolog.orchestrator.watch.dashboard.models import pages
+from panolog.orchestrator.watch.dashboard.models.pages import page_policy
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import write_ply
@@ -163,7 +163,7 @@ def test_a_model_in_training_is_replaced_by_newer_ones_and_the_view_stays(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From its first checkpoint on: upright, at a panorama, with cameras, before there is a plan."""
-    monkeypatch.setattr(model_pages, "_REFRESH_S", 1)
+    monkeypatch.setattr(pages, "_REFRESH_S", 1)
     folder = write_run(tmp_path / "run")
     write_json(folder.outline, plan().to_json())
     save_checkpoint(folder, COARSE)
@@ -209,6 +209,7 @@ def test_what_a_run_has_written_is_shown_with_the_scenes_photographs(
         with opened(browser, served.url + url, width=SIZE[0], height=SIZE[1]) as page:
             ready(page)
             page.evaluate("panolog.walk.go(panolog.walk.cameras[2])")
+            page.click("#photograph")
             until(page, "panolog.walk._picture.opacity === 1")
             assert np.allclose(shown(page)[SIZE[1] // 2, SIZE[0] // 2], (250, 20, 10), atol=8)
         later = time.time() + 100

@@ -1,5 +1,6 @@
 """Simulated workers: a pool for the driver that sends the messages of tasks by the clock."""
 
+import math
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence, Set
@@ -54,6 +55,8 @@ class SimulatedPool(InProcess):
         self.sent: Counter[TaskId] = Counter()  # events of progress, by task
         self.late = 0.0  # longest wait of a message of a block, seconds
         self.cpu = 0.0  # seconds used by the simulation itself
+        self.turn = 0.0  # most seconds of CPU between two looks for messages, while blocks run
+        self._looked = math.inf  # time.thread_time() of the last look at blocks
         self._rate, self._seconds = rate, seconds
         self._random = np.random.default_rng(0)
         self._running: dict[TaskId, _Running] = {}
@@ -87,6 +90,7 @@ class SimulatedPool(InProcess):
     def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
         """The tasks, but those in `but`, whose next message is due; waits at most `seconds` for one."""
         began = time.thread_time()
+        self.turn = max(self.turn, began - self._looked)
         first = min(
             (task.due for name, task in self._running.items() if name not in but), default=float("inf")
         )
@@ -95,7 +99,9 @@ class SimulatedPool(InProcess):
             time.sleep(min(seconds, first - now))
             now = time.monotonic()
         due = [name for name, task in self._running.items() if name not in but and task.due <= now]
-        self.cpu += time.thread_time() - began
+        now = time.thread_time()
+        self.cpu += now - began
+        self._looked = now if any(name.stage is Stage.BLOCK for name in self._running) else math.inf
         return due
 
     def take(self, name: TaskId) -> Message:

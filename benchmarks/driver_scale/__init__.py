@@ -1,1 +1,0 @@
-"""The driver with very many blocks and workers."""

@@ -1,0 +1,132 @@
+"""The formats of models as single files or folders: what is written of a model, in which frame."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from panolog.export.compressed_ply import write_compressed_ply
+from panolog.export.frame import Frame
+from panolog.export.georeference import Georeference
+from panolog.export.gltf.glb import write_glb
+from panolog.export.gltf.tiles import write_tiles
+from panolog.export.reading import sky_of
+from panolog.export.sky import render_sky, write_sky_image
+from panolog.export.sog.write import write_sog
+from panolog.export.splats import ModelSource, Part, Selection
+from panolog.export.spz import LARGEST, REACH, Version, write_spz
+from panolog.scene.errors import InputError
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.ply import ply_exact, read_sky, write_ply_parts
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenModel:
+    """A model, and what of it is written."""
+
+    ply: Path
+    place: Georeference
+    selection: Selection = field(default_factory=Selection)  # its part is that of each format
+    sky: bool = True  # whether files that can hold it have the sky
+    levels: int | None = None  # of detail of 3D Tiles; None = as many as it takes
+    spz: Version = 3
+
+
+def write_format(kind: str, model: ChosenModel, path: Path) -> list[Path]:
+    """Writes a model in one of `FILES`, atomically; returns the files and folders.
+
+    Raises InputError if the model is damaged, nothing is left of it, or it does not fit; OSError.
+    """
+    return _WRITERS[kind](model, path)
+
+
+def _source(model: ChosenModel, part: Part, frame: Frame | None = None, scale: float = 1.0) -> ModelSource:
+    """Raises InputError if nothing is left of the model."""
+    selection = replace(model.selection, part=part)
+    found = ModelSource(model.ply, selection, frame or model.place.frame, scale)
+    if not found.count:
+        raise InputError(f"{model.ply}: nothing is left of it; select more")
+    return found
+
+
+def _for_viewers(model: ChosenModel) -> ModelSource:
+    """As viewers show it: y down, and with the sky in the same file."""
+    upside_down = model.place.upside_down
+    if not model.sky:
+        return _source(model, "scene", upside_down)
+    return _source(model, "all", upside_down).with_near_sky()
+
+
+def _sog(model: ChosenModel, path: Path) -> list[Path]:
+    write_sog(path, _for_viewers(model))
+    return [path]
+
+
+def _spz(model: ChosenModel, path: Path) -> list[Path]:
+    """The sky, whose size SPZ may not hold, is a file of its own: pulled in, so that it looks the same."""
+    write_spz(path, _source(model, "scene"), model.spz)
+    if not model.sky or not len(read_sky(model.ply)):
+        return [path]
+    sky = sky_of(path)
+    write_spz(sky, _source(model, "sky").within(REACH, LARGEST), model.spz)
+    return [path, sky]
+
+
+def _compressed_ply(model: ChosenModel, path: Path) -> list[Path]:
+    write_compressed_ply(path, _for_viewers(model))
+    return [path]
+
+
+def _ply(model: ChosenModel, path: Path) -> list[Path]:
+    """As trainers write it, and y down: viewers turn it."""
+    if path.resolve() == model.ply.resolve():
+        raise InputError(f"{path}: is the model itself; give the upright one another name")
+    found, sky = _for_viewers(model), 0
+    if model.sky:
+        sky = found.part("sky").count
+    exact, first = ply_exact(model.ply), found.count - sky
+
+    def parts() -> Iterator[Gaussians]:
+        done = 0
+        for piece in found.pieces():
+            part = piece.gaussians(exact=exact)
+            done += len(part)
+            yield part.with_tensors(part.tensors(), sky=max(0, min(len(part), done - first)))
+
+    write_ply_parts(path, parts(), count=found.count, sky=sky, exact=exact, exported=found.degree)
+    return [path]
+
+
+def _glb(model: ChosenModel, path: Path) -> list[Path]:
+    write_glb(path, _in_metres(model))
+    return [path]
+
+
+def _tiles(model: ChosenModel, path: Path) -> list[Path]:
+    write_tiles(path, _in_metres(model), to_ecef=model.place.tiles_to_ecef(), levels=model.levels)
+    return [path]
+
+
+def _in_metres(model: ChosenModel) -> ModelSource:
+    """The scene in the unit of glTF and 3D Tiles, where it is known how large one of the model's is."""
+    return _source(model, "scene", scale=model.place.unit or 1.0)
+
+
+def _sky_image(model: ChosenModel, path: Path) -> list[Path]:
+    sky = read_sky(model.ply)
+    if not len(sky):
+        raise InputError(f"{model.ply}: has no sky; leave out --sky-image")
+    image, paths = render_sky(sky, model.place.frame), [path, path.with_suffix(".exr")]
+    for file in paths:
+        write_sky_image(file, image)
+    return paths
+
+
+_WRITERS: dict[str, Callable[[ChosenModel, Path], list[Path]]] = {
+    "sog": _sog,
+    "spz": _spz,
+    "compressed-ply": _compressed_ply,
+    "ply": _ply,
+    "glb": _glb,
+    "3dtiles": _tiles,
+    "sky-image": _sky_image,
+}

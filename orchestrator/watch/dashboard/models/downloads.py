@@ -1,0 +1,102 @@
+"""Files of a finished model to save: made by a process on request.
+
+This file is also the program that makes one:
+`python -m panolog.orchestrator.watch.dashboard.models.downloads ROOT RUN KIND OUTPUT`.
+"""
+
+import asyncio
+import sys
+from collections import OrderedDict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal
+
+from fastapi.responses import Response
+
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below
+from panolog.orchestrator.watch.dashboard.models.making import reading, run_program
+from panolog.orchestrator.watch.dashboard.responses import Download, file_name
+from panolog.scene.errors import InputError
+
+Kind = Literal["sog", "spz", "ply", "html"]
+# By kind: what the name of the file ends with.
+ENDINGS: dict[Kind, str] = {"sog": ".sog", "spz": ".spz", "ply": "-upright.ply", "html": ".html"}
+_CACHED = 4  # files
+_QUEUED = 4  # requests that may wait at a time
+
+_Made = tuple[str, Kind, int, int]  # the run, the kind, and which model of it
+
+
+class Downloads:
+    """The files that were made last, in a temporary folder."""
+
+    def __init__(self) -> None:
+        self._folder = TemporaryDirectory(prefix="panolog-downloads-")
+        self._files: OrderedDict[_Made, Path] = OrderedDict()
+        self._number = 0
+        self._lock = asyncio.Lock()
+        self._waiting = 0
+
+    async def make(self, entry: RunEntry, kind: Kind) -> None:
+        """Makes a file, unless it is there.
+
+        Raises InputError if there is no model, it cannot be read, or too many requests wait; OSError.
+        """
+        made = _of(entry, kind)
+        if made in self._files:
+            return
+        if self._waiting == _QUEUED:
+            raise InputError("other files are being made: try again in a minute")
+        self._waiting += 1
+        try:
+            async with self._lock:
+                if made not in self._files:
+                    self._number += 1
+                    path = Path(self._folder.name) / f"{self._number}{ENDINGS[kind]}"
+                    await run_program(__name__, [str(entry.root), entry.path, kind, str(path)], "the file")
+                    self._files[made] = path
+                    while len(self._files) > _CACHED:
+                        self._files.popitem(last=False)[1].unlink()  # who is receiving it has it open
+        finally:
+            self._waiting -= 1
+
+    def file(self, entry: RunEntry, kind: Kind) -> Response:
+        """A file that was made. Raises InputError if there is none of the present model; OSError."""
+        path = self._files.get(_of(entry, kind))
+        if path is None:
+            raise InputError("this file has not been made, or was removed: request it again")
+        handle = open_below(path, path.parent)
+        return Download(handle, "application/octet-stream", {}, f"{file_name(entry)}{ENDINGS[kind]}")
+
+    def close(self) -> None:
+        """Removes all files."""
+        self._folder.cleanup()
+
+
+def _of(entry: RunEntry, kind: Kind) -> _Made:
+    try:
+        known = entry.folder.point_cloud.stat()
+    except FileNotFoundError as error:
+        raise InputError(f"{entry.name}: has no model yet") from error
+    return entry.id, kind, known.st_mtime_ns, known.st_size
+
+
+def _main(root: str, run: str, kind: str, output: str) -> None:
+    """Makes one file, of files that are really below the run alone."""
+    from panolog.export.formats import ChosenModel, write_format  # noqa: PLC0415
+    from panolog.export.site.write import MOST_IN_ONE  # noqa: PLC0415
+    from panolog.orchestrator.watch.views.site import build  # noqa: PLC0415
+    from panolog.orchestrator.watch.views.site.viewpoints import read_viewpoints  # noqa: PLC0415
+
+    with reading(RunEntry(Path(root), run)) as (folder, locate):
+        if kind == "html":
+            build.write_file(build.site_of_run(folder, build.Wanted(most=MOST_IN_ONE), locate), Path(output))
+            return
+        place = build.place_of(folder, read_viewpoints(folder, None, None, locate), locate)
+        one_file = kind != "spz"  # whose sky would be a second one
+        model = ChosenModel(locate(folder.point_cloud), place, sky=one_file)
+        write_format(kind, model, Path(output))
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])
