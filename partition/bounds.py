@@ -74,7 +74,7 @@ def strays(centers: ArrayLike) -> NDArray[np.bool_]:
         return np.zeros(len(points), np.bool_)
     reach = np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.75)
     alone: NDArray[np.bool_] = cKDTree(points).query(points, k=2)[0][:, 1] > _STRAY * reach
-    return alone if alone.mean() <= _STRAYS else np.zeros_like(alone)
+    return alone if reach > 0 and alone.mean() <= _STRAYS else np.zeros_like(alone)
 
 
 def _nearest(points: NDArray[np.float64]) -> float:

@@ -29,7 +29,7 @@ _DARK, _BRIGHT = 20, 40  # of 255: what is outside of a circle, but for stray li
 _OUTSIDE = 95  # percent of what is outside of it that is dark
 _SIDE = 32  # pixels of the pictures of two eyes that are compared
 _COARSE = 9  # of these pixels: what is larger, such as light and dark sides, is left out
-_ALIKE = 0.8  # correlation of two eyes, at least; front and back: 0.27 in 83 photographs, 0.76 of equal houses
+_ALIKE = 0.8  # correlation of two eyes, at least; front and back: 0.27 in photographs, 0.76 of equal houses
 _PLAIN = 12.0  # standard deviation of details, at least: those photographs have 20 or more
 
 

@@ -17,7 +17,8 @@ def test_options_reach_the_job_and_its_report_is_printed(
     given: list[tuple[Any, ...]] = []
     report = faulty()
 
-    def make_scene(*arguments: Any) -> object:
+    def make_scene(*arguments: Any, memory: int) -> object:
+        assert memory > 0
         given.append(arguments[:3])
         return report
 
@@ -26,7 +27,7 @@ def test_options_reach_the_job_and_its_report_is_printed(
     result = call("scene", "sfm", "images", "-o", output, "--json", "--partial", "--pairs", "exhaustive")
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout) == {"scene": str(output), **report.as_json()}
-    wanted = pipeline.SfmSettings(partial=True, pairing="exhaustive")
+    wanted = pipeline.SfmSettings(partial=True, parts=True, pairing="exhaustive")
     assert given == [(Path("images"), output, wanted)]
     result = call("scene", "sfm", "images", "-o", output)
     assert result.exit_code == 0

@@ -56,7 +56,9 @@ class FakeSfm:
         settings: SfmSettings,
         progress: StageProgress,
         with_masks: WithMasks,
+        memory: int,
     ) -> Report:
+        assert memory > 0
         self.calls.append(settings)
         work = workspace_folder(output.resolve())
         layers = with_masks(*panoramas_in_folder(source))
