@@ -32,7 +32,7 @@ class ChosenModel:
 
 
 def write_format(kind: str, model: ChosenModel, path: Path) -> list[Path]:
-    """Writes a model in one of `FILES`, atomically; returns the files and folders.
+    """Writes a model in a format of `_WRITERS`, atomically; returns the files and folders.
 
     Raises InputError if the model is damaged, nothing is left of it, or it does not fit; OSError.
     """
@@ -49,7 +49,7 @@ def _source(model: ChosenModel, part: Part, frame: Frame | None = None, scale: f
 
 
 def _for_viewers(model: ChosenModel) -> ModelSource:
-    """As viewers show it: y down, and with the sky in the same file."""
+    """What viewers show of a model: turned y down, with its sky in the same file. Raises as `_source`."""
     upside_down = model.place.upside_down
     if not model.sky:
         return _source(model, "scene", upside_down)
@@ -77,7 +77,7 @@ def _compressed_ply(model: ChosenModel, path: Path) -> list[Path]:
 
 
 def _ply(model: ChosenModel, path: Path) -> list[Path]:
-    """As trainers write it, and y down: viewers turn it."""
+    """Writes a PLY with the columns of every trainer, turned y down: viewers turn such a file upright."""
     if path.resolve() == model.ply.resolve():
         raise InputError(f"{path}: is the model itself; give the upright one another name")
     found, sky = _for_viewers(model), 0

@@ -1,6 +1,6 @@
 """Gaussians to export, as columns of numbers: read in pieces, selected and turned, with bounded memory."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal, Protocol
@@ -206,22 +206,23 @@ class ModelSource:
         return replace(self, selection=replace(self.selection, part=part))
 
     def with_near_sky(self) -> "ModelSource":
-        """The same, for viewers: with a sky that is at most `_SKY` times as far as the scene.
+        """This model for viewers: its sky is at most `_SKY` times as far as its scene reaches.
 
-        From the middle it looks the same; as one walks, clouds move.
+        From the middle of the sky the model looks the same; as one walks, clouds move.
+        Raises PlyError if the file has changed meanwhile.
         """
-        sky, scene = (replace(self.part(part), sky=None)._means() for part in ("sky", "scene"))
-        if not len(sky) or not len(scene):
+        sky = [piece.means for piece in self.part("sky")._selected()]
+        if not sky:
             return self
-        center = sky.mean(axis=0)
-        radius, far = (np.linalg.norm(means - center, axis=1) for means in (sky, scene))
-        factor = _SKY * float(far.max()) / float(radius.max())
-        x, y, z = center.tolist()
-        return self if factor >= 1 else replace(self, sky=Ball((x, y, z), factor))
+        center = np.concatenate(sky).mean(axis=0)
 
-    def _means(self) -> Floats:
-        """(N, 3) positions in the coordinates of the model."""
-        return np.concatenate([np.zeros((0, 3), np.float32), *(it.means for it in self._selected())])
+        def farthest(parts: Iterable[Floats]) -> float:
+            return max((float(np.linalg.norm(part - center, axis=1).max()) for part in parts), default=0.0)
+
+        reach = farthest(piece.means for piece in self.part("scene")._selected())
+        factor = _SKY * reach / farthest(sky)
+        x, y, z = center.tolist()
+        return replace(self, sky=Ball((x, y, z), factor)) if 0 < factor < 1 else self
 
     def within(self, reach: float, size: float) -> "ModelSource":
         """The same, made smaller around the origin of its frame until it fits: from there it looks the same.

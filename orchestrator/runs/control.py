@@ -261,7 +261,7 @@ def _content(path: Path) -> bytes:
 
 
 def state_of(root: Path) -> RunState:
-    """That of a run now; that of no run, if it has none or cannot be read."""
+    """The state of the run in a folder; an empty one if there is no run, or its records cannot be read."""
     database = RunFolder(root).database
     with suppress(OSError, RunFolderError):
         return replay(read_milestones(database)) if database.exists() else RunState()

@@ -133,7 +133,7 @@ class RunFolder:
 
     @property
     def page(self) -> Path:
-        """The same as one file, which opens without a server."""
+        """The merged model for browsers as one HTML file, which opens without a server."""
         return self.root / "view.html"
 
     @property

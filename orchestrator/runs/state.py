@@ -206,7 +206,7 @@ def at_rest(state: RunState) -> RunState:
 
 
 def _apply(state: RunState, stored: Stored) -> RunState:
-    """The same but for `latest`, in place for tasks, notices and costs: copies would be most of a replay."""
+    """Applies one record but for `latest`. Tasks, notices and costs change in place: copies take too long."""
     match record := stored.record:
         case RunBegan():
             state = _take_over(state, record, stored.time)

@@ -16,9 +16,14 @@ Array = NDArray[np.float64]
 MEMORY = 400_000_000  # bytes of decoded panoramas
 MOST_VIEWS, FEWEST_VIEWS = 48, 8
 POINTS = 1500  # of each panorama
-COLORLESS = 2.0  # of 255: standard deviation below which a cloud is of one colour
+_COLORLESS = 2.0  # of 255: standard deviation below which a cloud is of one colour
 _GRID, _BEHIND = 48, 1.2  # columns of a grid of directions; farther than that times the nearest is hidden
 WIDEST = 4096  # pixels; wider panoramas are shrunk
+
+
+def is_colorless(colors: NDArray[np.uint8] | Array) -> bool:
+    """Whether colours (N, 3) of 0 to 255, one at least, are all about the same."""
+    return float(colors.std(axis=0).max()) < _COLORLESS
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +42,7 @@ class Evidence:
     @property
     def colorless(self) -> bool:
         """Whether the points have no colours, so that only patches and tracks can be checked."""
-        return float(self.colors.std(axis=0).max()) < COLORLESS
+        return is_colorless(self.colors)
 
     @property
     def centers(self) -> Array:

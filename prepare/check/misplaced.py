@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from panolog.partition.bounds import strays
 from panolog.prepare.check.conventions import FIT
 from panolog.prepare.check.evidence import (
-    COLORLESS,
     POINTS,
     Array,
     bilinear,
     correlation,
+    is_colorless,
     likely_seen,
     project,
 )
@@ -31,10 +31,7 @@ from panolog.scene.write import StageProgress, no_progress
 
 _FEWEST_PANORAMAS = 3
 _WIDTH = 512  # pixels of the panoramas as their colours are compared
-_OFF, _TIMES = (
-    3.0,
-    10.0,
-)  # pixels, and medians over the panoramas: what is more is no error of the measurement
+_OFF, _TIMES = 3.0, 10.0  # pixels, and medians over the panoramas: more is no error of the measurement
 _SHARE = 0.5  # of the median correlation over the panoramas, below which a picture may be elsewhere
 _TURNED, _BETTER = 24, 0.15  # random turns, and by how much a picture at its place fits better than in any
 _NAMED = 20  # panoramas that get a line each
@@ -89,7 +86,7 @@ def _fits_nowhere(fit: Array, every: Array) -> bool:
 def _color_fits(scene: Scene, progress: StageProgress) -> Array:
     """(K, 2) of `_color_fit`; NaN where it is not known."""
     every = np.full((len(scene.panoramas), 2), np.nan)
-    if len(scene.points) == 0 or scene.colors.std(axis=0).max() < COLORLESS:
+    if len(scene.points) == 0 or is_colorless(scene.colors):
         return every
     turns = Rotation.random(_TURNED, random_state=1).as_matrix()
     with ThreadPoolExecutor(initializer=cv2.setNumThreads, initargs=(1,)) as threads:

@@ -69,10 +69,10 @@ def make_scene(
     """
     require_new(output)
     known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
-    folder, notes, copies = workspace_folder(output.resolve()), list[str](), list[str]()
+    folder, notes = workspace_folder(output.resolve()), list[str]()
     if _image_folder(source).resolve() in output.resolve().parents:
         raise SceneError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
-    panoramas, layers = _panoramas_of(source, folder, settings, notes, copies, progress)
+    panoramas, layers, copies = _panoramas_of(source, folder, settings, notes.append, progress)
     layers = with_masks(panoramas, layers)
     places = None if known is None else _places(known, source, folder, panoramas)
     found = reconstruct(
@@ -103,25 +103,27 @@ def _panoramas_of(
     source: Path,
     folder: Path,
     settings: SfmSettings,
-    notes: list[str],
-    copies: list[str],
+    note: Callable[[str], None],
     progress: StageProgress,
-) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
-    """The panoramas of a source with their layers; adds to `notes` and `copies` what a user should read."""
+) -> tuple[tuple[PanoramaFile, ...], LayerFiles, list[str]]:
+    """The panoramas of a source, their layers, and a line for each copy among them.
+
+    Args: folder, for what is made of the source; note, called with a line about what a video lacks.
+    """
     if not source.is_file():
-        given, layers, found = without_copies(*panoramas_in_folder(source))
-        copies += found
-        return complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n)), layers
+        given, layers, copies = without_copies(*panoramas_in_folder(source))
+        whole = complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n))
+        return whole, layers, copies
     files = extract_frames(
         source,
         folder / "frames",
         parallax=settings.parallax,
         most=settings.frames,
         progress=lambda done, total: progress("frames", done, total),
-        note=notes.append,
+        note=note,
     )
     panoramas = tuple(PanoramaFile(folder / "frames", file.name, file) for file in files)
-    return panoramas, {MASKS: find_layer(folder / "frames", MASKS, [file.name for file in files])}
+    return panoramas, {MASKS: find_layer(folder / "frames", MASKS, [file.name for file in files])}, []
 
 
 def _report(

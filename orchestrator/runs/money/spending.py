@@ -170,9 +170,9 @@ def spend(spending: Spending, stored: Stored) -> Spending:
             return spending.with_lost([record])
         case BudgetSet():
             return replace(spending, budget=record, since=time, near=None, reached=None)
-        case BudgetNear() | BudgetReached():
-            if isinstance(record, BudgetNear):
-                return replace(spending, near=record)
+        case BudgetNear():
+            return replace(spending, near=record)
+        case BudgetReached():
             return replace(spending, reached=record)
         case RunEnded():
             machines |= {id: _closed(machine, time) for id, machine in machines.items()}

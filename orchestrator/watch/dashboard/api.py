@@ -249,7 +249,7 @@ async def get_view(request: Request, run: Run, number: _EventId) -> Response:
 
 @router.get("/api/runs/{id}/cover/{event}")
 async def get_cover(request: Request, run: Run, event: _EventId) -> Response:
-    """A small picture of it."""
+    """The small picture of a run in the list."""
     return await respond(request, 404, pictures.cover, run.entry, event)
 
 
@@ -285,7 +285,7 @@ async def get_model(request: Request, run: Run) -> Response:
 
 @router.get("/api/runs/{id}/view.html")
 async def get_view_page(request: Request, run: Run) -> Response:
-    """The model in 3D."""
+    """The model of a run in 3D, as one page."""
     return await respond(request, 404, page_download, run.entry)
 
 

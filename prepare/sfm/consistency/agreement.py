@@ -62,12 +62,18 @@ def deviations(found: Posed, evidence: Evidence, pair: Pair) -> Array:
     return larger
 
 
+def judged(pair: Pair, off: Array) -> NDArray[np.bool_]:
+    """(M,) which deviations of the matches of a pair are known and say where its panoramas stand."""
+    known = np.isfinite(off)
+    return known if pair.moved is None else known & pair.moved
+
+
 def agrees(evidence: Evidence, pair: Pair, off: Array, bound: float) -> bool | None:
     """Whether deviations (M,) of the matches of a pair, in degrees, are below a bound; None if few are known.
 
     Most of them, or those all around: copies of houses may be more, but are not everywhere.
     """
-    known = np.isfinite(off) if pair.moved is None else np.isfinite(off) & pair.moved
+    known = judged(pair, off)
     if known.sum() < FEW:
         return None
     fit, rays = known & (off <= bound), evidence.rays[pair.between[0]][pair.matches[:, 0]]

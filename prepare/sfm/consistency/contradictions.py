@@ -19,21 +19,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from panolog.prepare.sfm.consistency.agreement import Posed, agrees, deviations, has_moved
+from panolog.prepare.sfm.consistency.agreement import Posed, agrees, deviations, has_moved, judged
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
 from panolog.prepare.sfm.consistency.motion import Motion
-from panolog.prepare.sfm.consistency.skeleton import (
-    Edge,
-    Skeleton,
-    components,
-    tree_path,
-    widest_tree,
-)
+from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, components, tree_path, widest_tree
 
 _AS_NEIGHBOURS = 0.9  # of the median coverage of the pairs that carry the reconstruction
-_MARGIN = (
-    0.85  # of the least coverage on the way between two, without an order: below it they only look alike
-)
+_MARGIN = 0.85  # of the least coverage on the way between two without an order: with less they look alike
 _SHARED = 0.75  # of the median share of features of the pairs that carry: copies of houses stand apart
 _DRIFTED = 20.0  # degrees that a walk may be off where it returns
 _RIVALLED = 0.3  # of the edges of the tree that may have a rival
@@ -73,7 +65,7 @@ def find_contradictions(
         elif fits:
             agreeing.append(pair)
         else:
-            off = off[np.isfinite(off) if pair.moved is None else np.isfinite(off) & pair.moved]
+            off = off[judged(pair, off)]
             fit = Contradiction(pair.between, len(off), int((off <= bound).sum()))
             against.append((pair, fit, float(np.median(off))))
     sides = components(skeleton.tree - skeleton.guessed, len(evidence.rays))

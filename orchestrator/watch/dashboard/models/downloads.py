@@ -4,7 +4,6 @@ This file is also the program that makes one:
 `python -m panolog.orchestrator.watch.dashboard.models.downloads ROOT RUN KIND OUTPUT`.
 """
 
-import asyncio
 import sys
 from collections import OrderedDict
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Literal
 from fastapi.responses import Response
 
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below
-from panolog.orchestrator.watch.dashboard.models.making import reading, run_program
+from panolog.orchestrator.watch.dashboard.models.making import Turns, reading, run_program
 from panolog.orchestrator.watch.dashboard.responses import Download, file_name
 from panolog.scene.errors import InputError
 
@@ -22,7 +21,6 @@ Kind = Literal["sog", "spz", "ply", "html"]
 # By kind: what the name of the file ends with.
 ENDINGS: dict[Kind, str] = {"sog": ".sog", "spz": ".spz", "ply": "-upright.ply", "html": ".html"}
 _CACHED = 4  # files
-_QUEUED = 4  # requests that may wait at a time
 
 _Made = tuple[str, Kind, int, int]  # the run, the kind, and which model of it
 
@@ -34,8 +32,7 @@ class Downloads:
         self._folder = TemporaryDirectory(prefix="panolog-downloads-")
         self._files: OrderedDict[_Made, Path] = OrderedDict()
         self._number = 0
-        self._lock = asyncio.Lock()
-        self._waiting = 0
+        self._turns = Turns("files")
 
     async def make(self, entry: RunEntry, kind: Kind) -> None:
         """Makes a file, unless it is there.
@@ -45,20 +42,15 @@ class Downloads:
         made = _of(entry, kind)
         if made in self._files:
             return
-        if self._waiting == _QUEUED:
-            raise InputError("other files are being made: try again in a minute")
-        self._waiting += 1
-        try:
-            async with self._lock:
-                if made not in self._files:
-                    self._number += 1
-                    path = Path(self._folder.name) / f"{self._number}{ENDINGS[kind]}"
-                    await run_program(__name__, [str(entry.root), entry.path, kind, str(path)], "the file")
-                    self._files[made] = path
-                    while len(self._files) > _CACHED:
-                        self._files.popitem(last=False)[1].unlink()  # who is receiving it has it open
-        finally:
-            self._waiting -= 1
+        async with self._turns.take():
+            if made in self._files:
+                return
+            self._number += 1
+            path = Path(self._folder.name) / f"{self._number}{ENDINGS[kind]}"
+            await run_program(__name__, [str(entry.root), entry.path, kind, str(path)], "the file")
+            self._files[made] = path
+            while len(self._files) > _CACHED:
+                self._files.popitem(last=False)[1].unlink()  # who is receiving it has it open
 
     def file(self, entry: RunEntry, kind: Kind) -> Response:
         """A file that was made. Raises InputError if there is none of the present model; OSError."""

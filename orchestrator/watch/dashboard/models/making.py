@@ -3,8 +3,8 @@
 import asyncio
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 
 from panolog.orchestrator.runs.folder import RunFolder
@@ -13,6 +13,27 @@ from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import Locate
 
 _TIMEOUT_S = 300.0  # for a page or a file
+_QUEUED = 4  # requests that may wait at a time
+
+
+class Turns:
+    """Lets requests make something one after another, and only some of them wait."""
+
+    def __init__(self, what: str) -> None:
+        """Args: what is made, in the plural, for messages."""
+        self._what, self._lock, self._waiting = what, asyncio.Lock(), 0
+
+    @asynccontextmanager
+    async def take(self) -> AsyncIterator[None]:
+        """Waits until no other request makes something. Raises InputError if too many wait."""
+        if self._waiting == _QUEUED:
+            raise InputError(f"other {self._what} are being made: try again in a minute")
+        self._waiting += 1
+        try:
+            async with self._lock:
+                yield
+        finally:
+            self._waiting -= 1
 
 
 async def run_program(module: str, arguments: Sequence[str], what: str) -> None:

@@ -26,7 +26,7 @@ from panolog.export.site.write import media_type
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import model_of
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below, read_below
-from panolog.orchestrator.watch.dashboard.models.making import reading, run_program
+from panolog.orchestrator.watch.dashboard.models.making import Turns, reading, run_program
 from panolog.orchestrator.watch.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.watch.dashboard.responses import Download
 from panolog.orchestrator.watch.views.site.photographs import WIDE
@@ -35,7 +35,6 @@ from panolog.workers.tasks import TaskId
 
 _CACHED = 8  # pages
 _REFRESH_S = 10  # between two looks of a page for a newer model of a training
-_QUEUED = 4  # requests that may wait at a time
 _MOST = 1_000_000  # Gaussians of a page that is made on request
 _DESCRIPTION_BYTES = 32_000_000  # of a scene.json at most
 _PATH = re.compile(r"/models/([0-9a-f]{48})/.*", re.DOTALL)
@@ -90,8 +89,7 @@ class ModelPages:
         self._sites: OrderedDict[str, _Site] = OrderedDict()  # by key
         self._keys: dict[tuple[object, ...], str] = {}  # by what they show
         self._sources: dict[str, _Source] = {}  # by key: of those that were made for this server
-        self._lock = asyncio.Lock()
-        self._waiting = 0
+        self._turns = Turns("3D views")
 
     async def make(self, entry: RunEntry, task: str | None, scene: Path | None) -> str:
         """Makes the page of the current model of a run, or of one of its tasks, and returns its key.
@@ -103,16 +101,10 @@ class ModelPages:
         known = model.stat()
         shown = (entry.id, task, model.name, known.st_mtime_ns, known.st_size, scene)
         if self._key(shown) is None:
-            if self._waiting == _QUEUED:
-                raise InputError("other 3D views are being made: try again in a minute")
-            self._waiting += 1
-            try:
-                async with self._lock:
-                    if self._key(shown) is None:
-                        key = self._add(shown, await self._site(entry, task, scene, known.st_mtime))
-                        self._sources[key] = entry, task, scene
-            finally:
-                self._waiting -= 1
+            async with self._turns.take():
+                if self._key(shown) is None:
+                    key = self._add(shown, await self._site(entry, task, scene, known.st_mtime))
+                    self._sources[key] = entry, task, scene
         return self._keys[shown]
 
     async def renew(self, key: str) -> None:

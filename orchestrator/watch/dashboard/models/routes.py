@@ -1,5 +1,7 @@
 """The routes of what is made of models on request: pages in 3D, and files to save. See `api`."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import quote
 
@@ -13,6 +15,7 @@ from panolog.orchestrator.watch.dashboard.api import scene_of
 from panolog.orchestrator.watch.dashboard.dependencies import Registry, Run, body_of, fresh_watch, respond
 from panolog.orchestrator.watch.dashboard.models.downloads import Downloads, Kind
 from panolog.orchestrator.watch.dashboard.models.pages import ModelPages, page_policy
+from panolog.orchestrator.watch.dashboard.registry import RunRegistry
 from panolog.orchestrator.watch.dashboard.responses import json_response
 from panolog.orchestrator.watch.dashboard.watch import Watch, error_line
 from panolog.orchestrator.watch.views.pages.encoding import encode
@@ -44,12 +47,10 @@ async def post_viewer(request: Request, registry: Registry, id: str) -> Response
     body = await body_of(request, ViewerRequest)
     watch = await fresh_watch(registry, id)
     pages: ModelPages = request.app.state.pages
-    try:
+    with _refusals(registry):
         if body.camera is not None:
             await registry.call(maps.require_camera, watch.entry, body.camera)
         key = await pages.make(watch.entry, body.task, _scene_folder(watch))
-    except (InputError, OSError) as error:
-        raise HTTPException(409, error_line(error, registry.root)) from error
     start = "" if body.camera is None else f"#camera={quote(body.camera, safe='')}"
     return json_response(request, encode({"url": f"/models/{key}/{start}"}))
 
@@ -60,28 +61,35 @@ async def post_download(request: Request, registry: Registry, id: str) -> Respon
     body = await body_of(request, DownloadRequest)
     watch = await fresh_watch(registry, id)
     downloads: Downloads = request.app.state.downloads
-    try:
+    with _refusals(registry):
         await downloads.make(watch.entry, body.kind)
-    except (InputError, OSError) as error:
-        raise HTTPException(409, error_line(error, registry.root)) from error
     return json_response(request, encode({"url": f"/api/runs/{id}/downloads/{body.kind}"}))
 
 
 @router.get("/api/runs/{id}/downloads/{kind}")
 async def get_download(request: Request, run: Run, kind: Kind) -> Response:
-    """One of these files."""
+    """A file of the run's model that was made."""
     downloads: Downloads = request.app.state.downloads
     return await respond(request, 404, downloads.file, run.entry, kind)
 
 
 @router.get("/models/{key}/{path:path}")
 async def get_model_page(request: Request, key: str, path: str) -> Response:
-    """A file of one of these pages."""
+    """A file of a page with a model in 3D, or a photograph."""
     pages: ModelPages = request.app.state.pages
     if path == DESCRIPTION:
         await pages.renew(key)
     policy = page_policy(request.headers.get("host", ""), key)
     return await respond(request, 404, pages.file, key, path, policy, request.app.state.panoramas)
+
+
+@contextmanager
+def _refusals(registry: RunRegistry) -> Iterator[None]:
+    """Turns what cannot be made of a run into 409, with one line."""
+    try:
+        yield
+    except (InputError, OSError) as error:
+        raise HTTPException(409, error_line(error, registry.root)) from error
 
 
 def _scene_folder(run: Watch) -> Path | None:

@@ -3,7 +3,7 @@
 /** @import { ExposureCurve, RunPage } from "../shared/messages.js" */
 import { get } from "panolog/shared/api.js";
 import { byId, token } from "panolog/shared/dom.js";
-import { draw, themed } from "panolog/shared/plot.js";
+import { CURVES, draw, themed } from "panolog/shared/plot.js";
 
 /** @type {[keyof Omit<ExposureCurve, "name">, string, string][]} */
 const LINES = [
@@ -29,22 +29,9 @@ async function drawExposure(node, curve) {
     node,
     traces,
     themed({
-      margin: { l: 8, r: 10, t: 6, b: 8 },
-      paper_bgcolor: "rgba(0,0,0,0)",
-      plot_bgcolor: "rgba(0,0,0,0)",
+      ...CURVES,
       showlegend: true,
-      legend: {
-        orientation: "h",
-        x: 0,
-        y: 1,
-        yanchor: "bottom",
-        font: { size: 11 },
-        itemclick: false,
-        itemdoubleclick: false,
-      },
-      hovermode: "x unified",
       dragmode: false,
-      font: { family: "system-ui, sans-serif", size: 11.5 },
       xaxis: {
         automargin: true,
         zeroline: false,

@@ -2,6 +2,7 @@
 
 /** @import { Series } from "./messages.js" */
 /** @import { Layout } from "./plotly.js" */
+import { CURVES } from "panolog/shared/plot.js";
 
 /** The curves of a task by name. @typedef {Record<string, Series>} TaskSeries */
 /** A task with curves. @typedef {{label: string, color: string, series: TaskSeries}} Curve */
@@ -75,26 +76,16 @@ export function chartTraces({ key, size }, curves) {
 export function chartLayout({ key }) {
   const log = key === RATES;
   return {
-    margin: { l: 8, r: 10, t: 6, b: 8 },
-    paper_bgcolor: "rgba(0,0,0,0)",
-    plot_bgcolor: "rgba(0,0,0,0)",
+    ...CURVES,
     showlegend: log,
     legend: {
-      orientation: "h",
-      x: 0,
-      y: 1,
-      yanchor: "bottom",
-      font: { size: 11 },
-      itemclick: false,
-      itemdoubleclick: false,
+      ...CURVES.legend,
       itemwidth: 30,
       entrywidth: narrow.matches ? 0.5 : 0.33,
       entrywidthmode: "fraction",
     },
-    hovermode: "x unified",
     dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
     uirevision: "curves",
-    font: { family: "system-ui, sans-serif", size: 11.5 },
     xaxis: {
       automargin: true,
       rangemode: "tozero",

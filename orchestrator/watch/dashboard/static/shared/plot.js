@@ -23,6 +23,24 @@ export function plotly() {
   return loading;
 }
 
+/** What all curves have in common: no frame, one label for all lines, and a legend above them. */
+export const CURVES = {
+  margin: { l: 8, r: 10, t: 6, b: 8 },
+  paper_bgcolor: "rgba(0,0,0,0)",
+  plot_bgcolor: "rgba(0,0,0,0)",
+  hovermode: "x unified",
+  font: { family: "system-ui, sans-serif", size: 11.5 },
+  legend: {
+    orientation: "h",
+    x: 0,
+    y: 1,
+    yanchor: "bottom",
+    font: { size: 11 },
+    itemclick: false,
+    itemdoubleclick: false,
+  },
+};
+
 let drawings = 0;
 
 /**
