@@ -243,6 +243,7 @@ def test_the_log_is_filtered(town: Page) -> None:
     expect(events).to_have_count(1)
     town.get_by_label("Type").select_option(label="all")
     town.get_by_label("Search the log").fill("strange")
+    expect(events.filter(has_text="an image is strange")).to_have_count(1)  # not of the list before
     expect(events).to_have_count(1)
     expect(events).to_contain_text("an image is strange")
 
