@@ -140,7 +140,7 @@ def test_four_gpus_are_given_out_in_order(tmp_path: Path, monkeypatch: pytest.Mo
     assert first.startswith(f"1  running      {tmp_path}/a  (2 GPUs, ")
     assert third.endswith("/c  (waits for 2 GPUs: 1 of 4 free)")
     (tmp_path / "a" / "wait").unlink()
-    wait_until(lambda: queue.share("e") != {}, "the last one")
+    wait_until(lambda: all(map(queue.share, "abce")), "the start of all that have a turn")
     assert queue.states() == [State.DONE, State.RUNNING, State.RUNNING, State.FAILED, State.RUNNING]
     assert queue.entries()[3].reason == "needs 5 GPUs; this machine has 4"
     names = {name: queue.share(name)["CUDA_VISIBLE_DEVICES"] for name in "abce"}
