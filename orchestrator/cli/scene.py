@@ -1,4 +1,4 @@
-"""`panolog scene`: info, check, import, sfm, mask, depth. From the files of a camera to a scene to run."""
+"""`panolog scene`: info, check, import, stitch, sfm, mask, depth. From the files of a camera to a scene."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -26,7 +26,9 @@ from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import InputError
 
 app = typer.Typer(
-    cls=Group, no_args_is_help=True, help="Make scenes and check them: sfm, import, info, check, mask, depth."
+    cls=Group,
+    no_args_is_help=True,
+    help="Make scenes and check them: stitch, sfm, import, info, check, mask, depth.",
 )
 
 _NETWORK_HELP = "ONNX, with its manifest M.yaml next to it."
@@ -103,6 +105,35 @@ def import_(
     )
     print_result({"scene": str(output), **asdict(report)}, [line], as_json=as_json)
     _suggest_check(output, as_json=as_json)
+
+
+@app.command(cls=Command)
+def stitch(
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="IMAGES|IMAGE", help="Folder of pictures of two fisheye circles, or one."),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder of the panoramas.")
+    ],
+    width: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PIXELS", min=64, max=16384, help="Of the panoramas. Default: as of the lenses."
+        ),
+    ] = None,
+    up: Annotated[
+        Literal["up", "right", "down", "left"] | None,
+        typer.Option(metavar="up|right|down|left", help="Where up is in the first circle. Default: up."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make panoramas of pictures that show two fisheye circles."""
+    from panolog.prepare.stitching.source import stitch_source
+
+    with progress_bar("looking for the lenses", resumable=True) as show:
+        report = stitch_source(source, output, width=width, up=up, progress=show)
+    print_result(report.as_json(), report.lines(), as_json=as_json)
 
 
 @app.command(cls=Command)

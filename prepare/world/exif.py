@@ -164,6 +164,19 @@ def essential_exif(path: Path) -> bytes | None:
             return None
 
 
+def camera_of(path: Path) -> str:
+    """Make, model and serial number of the camera by EXIF; empty without. Raises as `read_exif` does."""
+    with Bounded(io.FileIO(path)) as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            tags = _tags(read_blocks(file)[0])
+            serial = tags.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.BodySerialNumber)
+            parts = (tags.get(ExifTags.Base.Make), tags.get(ExifTags.Base.Model), serial)
+        except _DAMAGE:
+            return ""
+    return " ".join(text for it in parts if (text := str(it or "").strip("\0 ")[:80]))
+
+
 def _tags(exif: Bounded | None) -> Image.Exif:
     """The EXIF of a TIFF stream; empty if there is none or its first directory is damaged."""
     tags = Image.Exif()

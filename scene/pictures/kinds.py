@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from panolog.scene.errors import SceneError
 
 EXPORT = "export it as equirectangular 2:1 (mono)"
-STITCH = (
+STITCH_THERE = (
     f"stitch it in the camera's program, such as Insta360 Studio, RICOH THETA or GoPro Player, and {EXPORT}"
 )
+STITCH = f"{STITCH_THERE}, or with `panolog scene stitch SOURCE -o FOLDER`"
 
 _MAGIC = {  # at the beginning of a file, or behind the length of its first box
     b"ftyphei": "HEIC",
