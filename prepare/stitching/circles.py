@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 Picture = NDArray[np.uint8]
+Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 _RAYS = 720  # from the middle of a picture
 _DARK = 24.0  # of 255: what is around a circle, with noise and stray light
@@ -34,7 +36,7 @@ class Circle:
     radius: float
 
 
-def halves(picture: Picture) -> tuple[Picture, Picture]:
+def halves(picture: NDArray[Pixel]) -> tuple[NDArray[Pixel], NDArray[Pixel]]:
     """The pictures (H, W, ...) of both lenses in one of both: next to each other, or one above the other."""
     height, width = picture.shape[:2]
     across = width > height

@@ -2,17 +2,15 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.stitching.calibrate import Lenses, ring, show
-from panolog.prepare.stitching.circles import Picture
+from panolog.prepare.stitching.circles import Picture, Pixel
 from panolog.prepare.stitching.lenses import Pair, Up
-
-Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 _BLEND = np.deg2rad(2.0)  # on either side of the seam: what is near is double there
 _ROWS = 128  # of a panorama that are computed together
@@ -42,7 +40,7 @@ class Stitcher:
 
     def panorama(self, both: Lenses) -> Picture:
         """(width / 2, width, 3) of the pictures of both lenses, brought to the same brightness."""
-        return self.joined((both[0], both[1]), gains(self.pair, both))
+        return self.joined(both, gains(self.pair, both))
 
     def joined(
         self, both: tuple[NDArray[Pixel], NDArray[Pixel]], gain: NDArray[np.float64] | None = None

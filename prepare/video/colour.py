@@ -2,6 +2,7 @@
 
 import re
 from functools import cache
+from typing import Protocol, TypeVar
 
 import av
 import av.filter
@@ -9,9 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.video.layout import Layout
-
 Picture = NDArray[np.uint8]
+Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 # Of FFmpeg's AVColorSpace, which is ITU-T H.273, to the names of its filter `scale`.
 _MATRICES = {1: "bt709", 4: "fcc", 5: "bt470", 6: "smpte170m", 7: "smpte240m", 9: "bt2020", 10: "bt2020"}
@@ -21,6 +21,13 @@ _HDR = {16: "PQ", 18: "HLG"}  # of AVColorTransferCharacteristic
 _HIGH = 576  # rows: untagged frames of more are BT.709, as in players, and others BT.601
 _FLAGS = "bicubic+accurate_rnd+full_chroma_int+bitexact"  # rounded correctly, the same on all processors
 _PLANAR = re.compile(r"yuvj?a?4\d\dp(?:(\d+)le)?")  # names of formats whose first plane is the luma
+
+
+class Placing(Protocol):
+    """A `Layout`, or another way from frames to panoramas."""
+
+    def panorama(self, picture: NDArray[Pixel]) -> NDArray[Pixel]:
+        """The panorama of a picture (H, W, ...)."""
 
 
 class ColourError(ValueError):
@@ -45,7 +52,7 @@ class Converter:
         self._graph.push(frame)
         return np.asarray(self._graph.vpull().to_ndarray(), np.uint8)
 
-    def grey(self, frame: av.VideoFrame, layout: Layout) -> Picture:
+    def grey(self, frame: av.VideoFrame, layout: Placing) -> Picture:
         """(H, W) the luma of the panorama, where possible without a conversion."""
         found = _PLANAR.fullmatch(frame.format.name)
         bits = int(found.group(1) or 8) if found else 0

@@ -1,44 +1,46 @@
 """360° videos, frame by frame in order, with their true times; numbers in headers are not trusted."""
 
 import hashlib
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Literal
 
 import av
 import av.container
 import numpy as np
 from av.sidedata.sidedata import SideData
-from av.stream import Disposition
 from numpy.typing import NDArray
 
 from panolog.prepare.file_kinds import describe_file
 from panolog.prepare.panorama_files import SUFFIXES
 from panolog.prepare.video.colour import ColourError, Converter, check_colours
 from panolog.prepare.video.layout import Layout, LayoutError, layout_of
+from panolog.prepare.video.lenses import (
+    SecondLens,
+    StitchedLayout,
+    VideoLenses,
+    open_second,
+    video_lenses,
+)
 from panolog.prepare.video.spherical import read_spherical, spherical_of
+from panolog.prepare.video.streams import (
+    WIDEST,
+    Effort,
+    largest_streams,
+    often,
+    open_container,
+    prepare_stream,
+)
 from panolog.scene.errors import SceneError
 from panolog.scene.pictures.kinds import STITCH
 
 MAX_FRAMES = 1_000_000  # nine hours at 30 frames per second
-_WIDTHS = (256, 12_288)  # pixels: enough to track anything, and more than any camera records
+_NARROWEST = 256  # pixels: enough to track anything
 _SAMPLED = 2**20  # bytes at the beginning, the middle and the end that identify a video
 _ENDS_EARLY = 0.95  # of the frames in the header, which is an estimate where there is no index
-FORMATS = "mov,matroska,avi,mpegts,mpeg,flv,ogg,asf"  # no playlists: they name other files and addresses
-_THREADS = 8  # of a video at most: each holds a frame
-_LARGE = 3000  # pixels: narrower frames are decoded fast enough
-_FAST, _ENOUGH = 20, 7.5  # frames per second, of which every second one will do; that are looked at, at least
-Effort = Literal["exact", "chosen", "draft"]
 _NO_CLOCK = 2000  # years up to this one are those of a clock that was never set
-_DECODING = {
-    "max_pixels": str(_WIDTHS[1] ** 2),  # two eyes above each other
-    "err_detect": "explode",  # rather than to patch frames up
-}
-_OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file", **_DECODING}
 
 
 class Video:
@@ -54,6 +56,8 @@ class Video:
         container: av.container.InputContainer,
         ahead: ThreadPoolExecutor,
         effort: Effort,
+        lenses: VideoLenses | None = None,
+        second: SecondLens | None = None,
     ) -> None:
         """Decodes the first frame and checks how it lies on the sphere.
 
@@ -61,6 +65,7 @@ class Video:
             path, container: the open file.
             ahead: a thread that decodes the next frame while the last one is used.
             effort: what decoding may leave out.
+            lenses: of a video that is to be stitched; second: the video of the second one, if there is one.
 
         Raises:
             SceneError: there is no frame, or it is no panorama of a usable size.
@@ -77,7 +82,8 @@ class Video:
         self._unlike = 0  # frames that cannot be converted
         self._ahead = ahead
         self._container = container
-        self._stream = _video_stream(path, container, effort)
+        self._lenses, self._second = lenses, second
+        self._stream = _video_stream(path, container, effort, lenses)
         self._converter = Converter()
         self._frames = self._decode()
         first = next(self._frames, None)
@@ -93,9 +99,9 @@ class Video:
         except (LayoutError, ColourError) as error:
             raise SceneError(f"{path}: {error}") from error
         self.width, self.height = self.layout.width, self.layout.width // 2
-        if not _WIDTHS[0] <= self.width <= _WIDTHS[1]:
+        if not _NARROWEST <= self.width <= WIDEST:
             raise SceneError(
-                f"{path}: its frames are {self.width} pixels wide, not {_WIDTHS[0]} to {_WIDTHS[1]}; "
+                f"{path}: its frames are {self.width} pixels wide, not {_NARROWEST} to {WIDEST}; "
                 "the file is damaged, or export it in another size"
             )
         self.promised = min(
@@ -105,9 +111,7 @@ class Video:
     @property
     def often(self) -> int:
         """Every how manieth frame is enough of a large video, for `_ENOUGH` a second; 1 of others."""
-        if self.width < _LARGE:
-            return 1
-        return max(1, int(float(self._stream.average_rate or 0) / _ENOUGH))
+        return often(self._stream, self.width)
 
     @property
     def started(self) -> datetime | None:
@@ -144,6 +148,8 @@ class Video:
             begin = max((key for key in keys if key <= wanted), default=0.0)
             if begin > self.time or wanted < self.time:
                 self._container.seek(round(begin / (self._stream.time_base or 1)), stream=self._stream)
+                if self._second is not None:
+                    self._second.seek(begin)
                 self._frames, self.time = self._decode(), -1.0
             while self.time < wanted and (frame := next(self._frames, None)) is not None:
                 self._frame = frame
@@ -156,7 +162,7 @@ class Video:
         """(height, width, 3) BGR; None if it is damaged or unlike the first one."""
         return self._converted(lambda frame: self.layout.panorama(self._converter.bgr(frame)))
 
-    def grey(self, width: int = _WIDTHS[1]) -> NDArray[np.uint8] | None:
+    def grey(self, width: int = WIDEST) -> NDArray[np.uint8] | None:
         """(H, W) luma, full range, at most `width` wide, for a fraction of the time of `picture`.
 
         None as there.
@@ -189,12 +195,22 @@ class Video:
         try:
             for packet in self._container.demux(self._stream):
                 try:
-                    yield from packet.decode()
+                    yield from self._joined(packet.decode())
                 except av.FFmpegError:
                     self._damaged += 1
                     self.is_plain = False
         except av.FFmpegError:  # the rest of the file cannot be read
             return
+
+    def _joined(self, frames: Sequence[av.VideoFrame]) -> Iterator[av.VideoFrame]:
+        """The frames, with those of the second lens next to them. Raises av.FFmpegError."""
+        for frame in frames:
+            both = frame if self._second is None else self._second.joined(frame)
+            if both is not None:
+                yield both
+            else:
+                self._damaged += 1
+                self.is_plain = False
 
     def _converted(self, convert: Callable[[av.VideoFrame], NDArray[np.uint8]]) -> NDArray[np.uint8] | None:
         """The panorama of the last frame."""
@@ -208,14 +224,17 @@ class Video:
         self.is_plain = False
         return None
 
-    def _layout(self, first: av.VideoFrame) -> Layout:
+    def _layout(self, first: av.VideoFrame) -> Layout | StitchedLayout:
         """Raises LayoutError and OSError."""
+        if self._lenses is not None:
+            self.spherical = None
+            return self._lenses.layout()
         matrix, mapping, stereo = (
             bytes(it) if isinstance(it, SideData) else None
             for it in map(first.side_data.get, ("DISPLAYMATRIX", "SPHERICAL", "STEREO3D"))
         )
         self.spherical = read_spherical(self.path) or spherical_of(mapping, stereo)
-        return layout_of(first.width, first.height, matrix, self.spherical, _WIDTHS[1])
+        return layout_of(first.width, first.height, matrix, self.spherical, WIDEST)
 
     def _show(self, frame: av.VideoFrame) -> None:
         """`frame` is the last one now."""
@@ -246,7 +265,7 @@ class Video:
 
 @contextmanager
 def open_video(path: Path, effort: Effort = "exact") -> Iterator[Video]:
-    """Opens a video in any container of `FORMATS` with any codec of FFmpeg.
+    """Opens a video in any container of `FORMATS` with any codec of FFmpeg; one of two lenses is stitched.
 
     Args: effort, "exact" decodes all frames in one thread, so that damaged ones are the same each time.
         "chosen" decodes in several threads, and of large videos no frames that no others refer to, most of
@@ -259,36 +278,26 @@ def open_video(path: Path, effort: Effort = "exact") -> Iterator[Video]:
     if path.suffix.lower() in SUFFIXES:
         raise SceneError(f"{path}: is one picture; give the folder of the panoramas")
     try:
-        container = av.open(str(path.resolve()), options=_OPTIONS, metadata_errors="replace")
+        container = open_container(path)
     except (av.FFmpegError, UnicodeError) as error:
         reason = describe_file(path) or "it is damaged, truncated before its index, or no video"
         raise SceneError(f"{path}: cannot be opened as a video; {reason}") from error
     with container, ThreadPoolExecutor(1) as ahead:
-        yield Video(path, container, ahead, effort)
+        lenses = video_lenses(path)
+        with open_second(None if lenses is None else lenses.second, effort) as second:
+            yield Video(path, container, ahead, effort, lenses, second)
 
 
-def _video_stream(path: Path, container: av.container.InputContainer, effort: Effort) -> av.VideoStream:
+def _video_stream(
+    path: Path, container: av.container.InputContainer, effort: Effort, lenses: VideoLenses | None
+) -> av.VideoStream:
     """The stream of the panoramas, the largest. Raises SceneError."""
-    streams = [
-        it
-        for it in container.streams.video
-        if it.codec_context is not None and not it.disposition & Disposition.attached_pic
-    ]
+    streams = largest_streams(container)
     if not streams:
         raise SceneError(f"{path}: there is no video in it that FFmpeg can decode")
-    stream = max(streams, key=lambda it: it.width * it.height)
-    if sum((it.width, it.height) == (stream.width, stream.height) for it in streams) > 1:
+    if len(streams) > 1 and lenses is None:
         raise SceneError(f"{path}: it has a video for each lens; {STITCH}")
-    options, large = dict(_DECODING), stream.width >= _LARGE
-    if effort != "exact":
-        stream.thread_type = "AUTO"
-    stream.thread_count = 1 if effort == "exact" else min(_THREADS, os.cpu_count() or 1)
-    if effort != "exact" and large and (stream.average_rate or 0) >= _FAST:
-        stream.codec_context.skip_frame = "NONREF"
-    if effort == "draft" and large:
-        options["skip_loop_filter"] = "all"
-    stream.codec_context.options = options
-    return stream
+    return prepare_stream(streams[0], effort)
 
 
 def video_digest(path: Path) -> str:

@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.video.decode import Effort, Video, open_video, video_digest
+from panolog.prepare.video.decode import Video, open_video, video_digest
 from panolog.prepare.video.motion import SHARP_WIDTH, MotionTracker, VideoMotion, load_motion
 from panolog.prepare.video.selection import choose_frames
 from panolog.prepare.video.stamp import stamped
+from panolog.prepare.video.streams import Effort
 from panolog.prepare.video.telemetry import Telemetry, read_telemetry
 from panolog.prepare.world.exif import Attitude
 from panolog.scene.errors import ConfigError, SceneError

@@ -13,7 +13,7 @@ from av.stream import Discard
 from numpy.typing import NDArray
 
 from panolog.prepare.video import camm, gpmf
-from panolog.prepare.video.decode import FORMATS
+from panolog.prepare.video.streams import FORMATS
 from panolog.prepare.world.exif import Attitude, GpsFix
 from panolog.scene.errors import SceneError
 

@@ -1,0 +1,56 @@
+"""How FFmpeg opens video files and decodes their streams; what files say is not trusted."""
+
+import os
+from pathlib import Path
+from typing import Literal
+
+import av
+import av.container
+from av.stream import Disposition
+
+WIDEST = 12_288  # pixels: more than any camera records
+FORMATS = "mov,matroska,avi,mpegts,mpeg,flv,ogg,asf"  # no playlists: they name other files and addresses
+Effort = Literal["exact", "chosen", "draft"]
+_THREADS = 8  # of a video at most: each holds a frame
+_LARGE = 3000  # pixels: narrower frames are decoded fast enough
+_FAST, _ENOUGH = 20, 7.5  # frames per second, of which every second one will do; that are looked at, at least
+_DECODING = {
+    "max_pixels": str(WIDEST**2),  # two eyes above each other
+    "err_detect": "explode",  # rather than to patch frames up
+}
+_OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file", **_DECODING}
+
+
+def open_container(path: Path) -> av.container.InputContainer:
+    """Opens a file. Raises av.FFmpegError and UnicodeError if it is no video."""
+    return av.open(str(path.resolve()), options=_OPTIONS, metadata_errors="replace")
+
+
+def largest_streams(container: av.container.InputContainer) -> list[av.VideoStream]:
+    """The streams of video that can be decoded, of the largest size."""
+    streams = [
+        it
+        for it in container.streams.video
+        if it.codec_context is not None and not it.disposition & Disposition.attached_pic
+    ]
+    largest = max(streams, key=lambda it: it.width * it.height, default=None)
+    return [it for it in streams if largest and (it.width, it.height) == (largest.width, largest.height)]
+
+
+def prepare_stream(stream: av.VideoStream, effort: Effort) -> av.VideoStream:
+    """The stream, which leaves out what `effort` allows."""
+    options, large = dict(_DECODING), stream.width >= _LARGE
+    if effort != "exact":
+        stream.thread_type = "AUTO"
+    stream.thread_count = 1 if effort == "exact" else min(_THREADS, os.cpu_count() or 1)
+    if effort != "exact" and large and (stream.average_rate or 0) >= _FAST:
+        stream.codec_context.skip_frame = "NONREF"
+    if effort == "draft" and large:
+        options["skip_loop_filter"] = "all"
+    stream.codec_context.options = options
+    return stream
+
+
+def often(stream: av.VideoStream, width: int) -> int:
+    """Every how manieth frame is enough of a large video, for `_ENOUGH` a second; 1 of others."""
+    return 1 if width < _LARGE else max(1, int(float(stream.average_rate or 0) / _ENOUGH))

@@ -1,0 +1,108 @@
+"""Raw videos of two lenses: both circles in each frame, two streams, two files."""
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from panolog.prepare.stitching.circles import halves
+from panolog.prepare.video.decode import open_video
+from panolog.prepare.video.frames import extract_frames
+from panolog.scene.errors import InputError
+from tests.prepare.stitching.cameras import camera
+from tests.prepare.video.videos import numbers, render, walk
+
+Image = NDArray[np.uint8]
+COUNT = 24
+
+
+@pytest.fixture(scope="module")
+def walked() -> list[tuple[Image, Image]]:
+    """(H, W, 3) panoramas of a walk, and their two circles side by side."""
+    known, views = camera(400), [render(it, 1024, bearer=False) for it in walk([0.12] * COUNT)]
+    return [(view, known.picture(view, seed)) for seed, view in enumerate(views)]
+
+
+def write(path: Path, *lenses: list[Image]) -> Path:
+    """A video with a stream for each of `lenses`, H.264 and nearly without loss, a key frame every eighth."""
+    height, width = lenses[0][0].shape[:2]
+    with av.open(str(path), "w", format="mp4") as container:
+        streams = []
+        for _ in lenses:
+            stream = container.add_stream("libx264", rate=30, options={"crf": "12", "g": "8"})
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            streams.append(stream)
+        for number, pictures in enumerate(zip(*lenses, strict=True)):
+            for stream, picture in zip(streams, pictures, strict=True):
+                frame = av.VideoFrame.from_ndarray(picture, "bgr24")
+                frame.pts, frame.time_base = number, Fraction(1, 30)
+                container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode(None))
+    return path
+
+
+def raw(kind: str, folder: Path, pictures: list[Image]) -> Path:
+    """The video as a camera of that kind writes it; the one to be given."""
+    one, other = ([halves(it)[side] for it in pictures] for side in range(2))
+    match kind:
+        case "both circles":
+            return write(folder / "clip.mp4", pictures)
+        case "two streams":
+            return write(folder / "clip.insv", one, other)
+        case "a dark rim below":
+            rim = np.zeros((50, 800, 3), np.uint8)
+            return write(folder / "clip.mp4", [np.vstack([it, rim]) for it in pictures])
+    write(folder / "VID_20260101_000000_10_001.insv", other)
+    return write(folder / "VID_20260101_000000_00_001.insv", one)
+
+
+@pytest.mark.parametrize("kind", ["both circles", "two streams", "two files", "a dark rim below"])
+def test_frames_are_those_of_the_panorama(
+    kind: str, walked: list[tuple[Image, Image]], tmp_path: Path
+) -> None:
+    path = raw(kind, tmp_path, [it for _, it in walked])
+    with open_video(path) as video:
+        assert 700 < video.width <= 800 and video.height * 2 == video.width
+        for number in video.frames():
+            picture = video.picture()
+            assert picture is not None and picture.shape == (video.height, video.width, 3)
+            truth = cv2.resize(walked[number][0], (video.width, video.height), interpolation=cv2.INTER_AREA)
+            assert np.abs(picture.astype(float) - truth).mean() < 12
+            grey = video.grey(400)
+            assert grey is not None and grey.shape == (200, 400)
+        assert video.decoded == COUNT and not video.notes()
+
+
+def test_frames_are_chosen_as_of_any_video(walked: list[tuple[Image, Image]], tmp_path: Path) -> None:
+    path = raw("two files", tmp_path, [it for _, it in walked])
+    files = extract_frames(path, tmp_path / "frames")
+    chosen = numbers(files)
+    assert len(chosen) >= 3 and (chosen[0], chosen[-1]) == (0, COUNT - 1)
+    picture = cv2.imread(str(files[1]))
+    assert picture is not None
+    truth = cv2.resize(walked[chosen[1]][0], picture.shape[1::-1], interpolation=cv2.INTER_AREA)
+    assert np.abs(picture.astype(float) - truth).mean() < 12
+
+
+def test_one_lens_of_two_files_is_refused(walked: list[tuple[Image, Image]], tmp_path: Path) -> None:
+    path = raw("two files", tmp_path, [it for _, it in walked[:4]])
+    path.with_name(path.name.replace("_00_", "_10_")).unlink()
+    with pytest.raises(InputError, match=r"400 x 400 pixels are not 2:1; stitch it"), open_video(path):
+        pass
+
+
+def test_circles_of_different_places_are_refused(walked: list[tuple[Image, Image]], tmp_path: Path) -> None:
+    known, noise = camera(400), np.random.default_rng(1)
+    views = [cv2.resize(noise.integers(40, 220, (24, 48, 3), np.uint8), (1024, 512)) for _ in range(4)]
+    others = [np.asarray(cv2.flip(it, 0), np.uint8) for it in views]
+    pictures = [
+        np.hstack([halves(known.picture(one))[0], halves(known.picture(other))[1]])
+        for one, other in zip(views, others, strict=True)
+    ]
+    with pytest.raises(InputError, match=r"clip\.mp4: its two fisheye circles cannot be stitched"):
+        open_video(write(tmp_path / "clip.mp4", pictures)).__enter__()
