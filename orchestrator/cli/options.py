@@ -194,6 +194,14 @@ FramesOption = Annotated[
     int | None,
     typer.Option(metavar="N", min=2, help="Video: take at most N frames.", rich_help_panel=_MADE),
 ]
+UpOption = Annotated[
+    Literal["up", "right", "down", "left"] | None,
+    typer.Option(
+        metavar="up|right|down|left",
+        help="Two lenses, not stitched: where up is in the first circle. Default: up.",
+        rich_help_panel=_MADE,
+    ),
+]
 DistanceOption = Annotated[
     tuple[str, str, float] | None,
     typer.Option(
@@ -285,6 +293,7 @@ def run_config(
 def preparation(
     parallax: ParallaxOption = None,
     frames: FramesOption = None,
+    up: UpOption = None,
     distance: DistanceOption = None,
     trajectory: TrajectoryOption = None,
     gps: GpsOption = True,
@@ -320,7 +329,7 @@ def preparation(
     """The options that make a scene of panoramas or a video, as far as they are not the defaults."""
     from panolog.orchestrator.runs.preparation.settings import Options
 
-    values = {"parallax": parallax, "frames": frames, "distance": distance}
+    values = {"parallax": parallax, "frames": frames, "up": up, "distance": distance}
     sfm: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     sfm |= {"trajectory": str(trajectory)} if trajectory is not None else {}
     sfm |= {"gps": False} if not gps else {}

@@ -21,6 +21,7 @@ from panolog.orchestrator.cli.options import (
     PartialOption,
     SceneArg,
     TrajectoryOption,
+    UpOption,
 )
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import InputError
@@ -111,7 +112,9 @@ def import_(
 def stitch(
     source: Annotated[
         Path,
-        typer.Argument(metavar="IMAGES|IMAGE", help="Folder of pictures of two fisheye circles, or one."),
+        typer.Argument(
+            metavar="IMAGES|VIDEO", help="Folder of pictures of two fisheye circles, or a video of them."
+        ),
     ],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder of the panoramas.")
@@ -122,17 +125,18 @@ def stitch(
             metavar="PIXELS", min=64, max=16384, help="Of the panoramas. Default: as of the lenses."
         ),
     ] = None,
-    up: Annotated[
-        Literal["up", "right", "down", "left"] | None,
-        typer.Option(metavar="up|right|down|left", help="Where up is in the first circle. Default: up."),
-    ] = None,
+    up: UpOption = None,
+    parallax: ParallaxOption = None,
+    frames: FramesOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Make panoramas of pictures that show two fisheye circles."""
-    from panolog.prepare.stitching.source import stitch_source
+    """Make panoramas of pictures or a video that show two fisheye circles."""
+    from panolog.prepare.stitching.source import FrameChoice, stitch_source
+    from panolog.prepare.video.frames import PARALLAX
 
+    chosen = FrameChoice(PARALLAX if parallax is None else parallax, frames)
     with progress_bar("looking for the lenses", resumable=True) as show:
-        report = stitch_source(source, output, width=width, up=up, progress=show)
+        report = stitch_source(source, output, width=width, up=up, frames=chosen, progress=show)
     print_result(report.as_json(), report.lines(), as_json=as_json)
 
 
@@ -146,6 +150,7 @@ def sfm(
     mapper: MapperOption = "incremental",
     parallax: ParallaxOption = None,
     frames: FramesOption = None,
+    up: UpOption = None,
     distance: DistanceOption = None,
     trajectory: TrajectoryOption = None,
     gps: GpsOption = True,
@@ -167,6 +172,7 @@ def sfm(
         distance=distance,
         parallax=PARALLAX if parallax is None else parallax,
         frames=frames,
+        up=up,
         link=link,
         trajectory=trajectory,
     )

@@ -17,6 +17,8 @@ from panolog.prepare.sfm.pairs import Pairing
 from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
 from panolog.prepare.sfm.report import SfmReport, write_report
 from panolog.prepare.sfm.trajectory import Trajectory, fit_world, places_of, read_trajectory
+from panolog.prepare.stitching.lenses import Up
+from panolog.prepare.stitching.pictures import raw_pictures, stitch_pictures
 from panolog.prepare.video.frames import PARALLAX, extract_frames, frame_times
 from panolog.prepare.world.cropped import complete_panoramas
 from panolog.prepare.world.exif import read_exif
@@ -42,6 +44,7 @@ class SfmSettings:
     distance: tuple[str, str, float] | None = None  # names of two panoramas, and metres between them
     parallax: float = PARALLAX  # degrees between two frames of a video
     frames: int | None = None  # of a video at most
+    up: Up | None = None  # of pictures or a video that are to be stitched: where up is in the first circle
     link: bool = False  # instead of copying
     trajectory: Path | None = None  # where the camera was, as TUM or CSV
 
@@ -72,6 +75,7 @@ def make_scene(
     folder, notes = workspace_folder(output.resolve()), list[str]()
     if _image_folder(source).resolve() in output.resolve().parents:
         raise SceneError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
+    source = _stitched(source, folder, settings, notes.append, progress)
     panoramas, layers, copies = _panoramas_of(source, folder, settings, notes.append, progress)
     layers = with_masks(panoramas, layers)
     places = None if known is None else _places(known, source, folder, panoramas)
@@ -99,6 +103,28 @@ def make_scene(
     return reports[0]
 
 
+def _stitched(
+    source: Path,
+    folder: Path,
+    settings: SfmSettings,
+    note: Callable[[str], None],
+    progress: StageProgress,
+) -> Path:
+    """The folder with the panoramas of pictures that are not stitched; any other source as it is."""
+    pictures = raw_pictures(_image_folder(source)) if source.is_dir() else []
+    if not pictures:
+        return source
+    stitch_pictures(
+        pictures,
+        _image_folder(source),
+        folder / "stitched",
+        up=settings.up,
+        progress=lambda done, total: progress("stitching", done, total),
+        note=note,
+    )
+    return folder / "stitched"
+
+
 def _panoramas_of(
     source: Path,
     folder: Path,
@@ -119,6 +145,7 @@ def _panoramas_of(
         folder / "frames",
         parallax=settings.parallax,
         most=settings.frames,
+        up=settings.up,
         progress=lambda done, total: progress("frames", done, total),
         note=note,
     )

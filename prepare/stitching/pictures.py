@@ -2,7 +2,7 @@
 
 import os
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from panolog.prepare.panorama_files import look_into, masks_among
 from panolog.prepare.provenance import MAX_BYTES
 from panolog.prepare.stitching.calibrate import AGREED, Lenses, OverlapError, calibrate, disagreement
 from panolog.prepare.stitching.circles import CircleError, Picture, halves
-from panolog.prepare.stitching.lenses import WIDEST, Pair, Up, pairs_as_json, read_pairs
+from panolog.prepare.stitching.lenses import Pair, Up, pairs_as_json, read_pairs
 from panolog.prepare.stitching.stitch import Stitcher
 from panolog.prepare.world.exif import camera_of, essential_exif
 from panolog.scene.errors import SceneError
@@ -86,6 +86,11 @@ def find_pairs(files: Sequence[Path], known: Sequence[Pair] = (), up: Up | None 
     return found
 
 
+def common_width(pairs: Iterable[Pair]) -> int:
+    """Pixels of the panoramas of several cameras, which all have the same size."""
+    return min(pair.width for pair in pairs)
+
+
 def lenses_in(source: Path, size: tuple[int, int], pictures: Sequence[Lenses]) -> Pair:
     """The lenses that made pictures, as `reduced` gives them, whose own width and height are `size`.
 
@@ -115,7 +120,7 @@ def stitch_pictures(
     What an earlier call has finished with the same lenses, which are in `output`/lenses.json, is left.
 
     Args:
-        width: pixels; by default all that the lenses resolve.
+        width: pixels; by default all that the lenses resolve, of several cameras those with the fewest.
         up: where up is in the first circle; by default as in lenses.json, or else up.
         note: called with a line about each picture in which both lenses do not agree.
 
@@ -133,7 +138,8 @@ def stitch_pictures(
     if distinct != known:
         output.mkdir(parents=True, exist_ok=True)
         write_bytes(output / LENSES, pairs_as_json(distinct))
-    stitchers = {pair: Stitcher(pair, min(width or pair.width, WIDEST)) for pair in distinct}
+    width = width or common_width(distinct)
+    stitchers = {pair: Stitcher(pair, width) for pair in distinct}
     for done, (file, target) in enumerate(targets.items(), 1):
         stitcher = stitchers[pairs[file]]
         changed = file.stat().st_mtime_ns

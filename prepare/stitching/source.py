@@ -1,14 +1,35 @@
-"""`panolog scene stitch`: panoramas of a folder, or of one picture of two fisheye circles."""
+"""`panolog scene stitch`: panoramas of pictures or a video of two fisheye circles."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from panolog.prepare.stitching.lenses import Pair, Up, read_pairs
-from panolog.prepare.stitching.pictures import INSP, LENSES, raw_pictures, shows_circles, stitch_pictures
-from panolog.scene.errors import SceneError
+from panolog.prepare.panorama_files import SUFFIXES
+from panolog.prepare.stitching.lenses import Pair, Up, pairs_as_json, read_pairs
+from panolog.prepare.stitching.pictures import (
+    INSP,
+    LENSES,
+    check_folder,
+    common_width,
+    find_pairs,
+    raw_pictures,
+    shows_circles,
+    stitch_pictures,
+)
+from panolog.prepare.video.frames import extract_frames
+from panolog.prepare.video.lenses import video_lenses
+from panolog.scene.errors import ConfigError, SceneError
+from panolog.scene.files import write_bytes
 from panolog.scene.write import StageProgress
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """Which frames of a video are stitched."""
+
+    parallax: float  # degrees between two of them
+    most: int | None
 
 
 @dataclass(frozen=True)
@@ -22,9 +43,7 @@ class StitchReport:
 
     def as_json(self) -> dict[str, Any]:
         """What `panolog scene stitch --json` prints."""
-        found = [
-            {"camera": it.camera, "size": list(it.size), "error_degrees": it.error} for it in self.lenses
-        ]
+        found = [{"camera": it.camera, "size": it.size, "error_degrees": it.error} for it in self.lenses]
         return {
             "output": str(self.output),
             "panoramas": self.panoramas,
@@ -42,23 +61,71 @@ class StitchReport:
 
 
 def stitch_source(
-    source: Path, output: Path, *, width: int | None, up: Up | None, progress: StageProgress
+    source: Path,
+    output: Path,
+    *,
+    width: int | None,
+    up: Up | None,
+    frames: FrameChoice,
+    progress: StageProgress,
 ) -> StitchReport:
-    """Stitches all pictures of two circles in a folder, or one; arguments and errors as `stitch_pictures`."""
-    notes = list[str]()
-    if source.is_dir():
-        files, root = raw_pictures(source), source
-    elif source.is_file():
-        raw = source.suffix.lower() == INSP or shows_circles(source)
-        files, root = [source] if raw else [], source.parent
-    else:
+    """Stitches the pictures of two circles in a folder, one picture, or a video.
+
+    Arguments and errors as of `stitch_pictures` and `extract_frames`.
+    """
+    if not source.exists():
         raise SceneError(f"{source}: there is no such file or folder")
-    if not files:
-        raise SceneError(
-            f"{source}: shows no two fisheye circles next to each other; panoramas need no stitching"
-        )
-    if root.resolve() in (output.resolve(), *output.resolve().parents) and source.is_dir():
+    if source.is_dir() and source.resolve() in (output.resolve(), *output.resolve().parents):
         raise SceneError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
-    show = partial(progress, "stitching")
-    made = stitch_pictures(files, root, output, width=width, up=up, progress=show, note=notes.append)
+    notes = list[str]()
+    if source.is_file() and source.suffix.lower() not in {INSP, *SUFFIXES}:
+        if width is not None:
+            raise ConfigError("--width is of pictures; frames of a video are as wide as the lenses resolve")
+        pair = _lenses_of(source)
+        check_folder(output)
+        output.mkdir(parents=True, exist_ok=True)
+        write_bytes(output / LENSES, pairs_as_json([pair if up is None else replace(pair, up=up)]))
+        made = extract_frames(
+            source,
+            output,
+            parallax=frames.parallax,
+            most=frames.most,
+            up=up,
+            progress=partial(progress, "frames"),
+            note=notes.append,
+        )
+    else:
+        if source.is_dir():
+            files, root = raw_pictures(source), source
+        else:
+            raw = source.suffix.lower() == INSP or shows_circles(source)
+            files, root = [source] if raw else [], source.parent
+        if not files:
+            raise _no_circles(source)
+        show = partial(progress, "stitching")
+        made = stitch_pictures(files, root, output, width=width, up=up, progress=show, note=notes.append)
     return StitchReport(output, len(made), read_pairs(output / LENSES), notes)
+
+
+def look_at_raw(source: Path) -> tuple[int, int] | None:
+    """How many pictures of a folder are to be stitched, and the width of their panoramas; None if none is.
+
+    Raises as `stitch_pictures` does.
+    """
+    inner = next((source / name for name in ("images", "imgs") if (source / name).is_dir()), source)
+    files = raw_pictures(inner) if inner.is_dir() else []
+    return (len(files), common_width(find_pairs(files).values())) if files else None
+
+
+def _lenses_of(video: Path) -> Pair:
+    """The lenses of a video. Raises SceneError if it shows no circles."""
+    found = video_lenses(video)
+    if found is None:
+        raise _no_circles(video)
+    return found.pair
+
+
+def _no_circles(source: Path) -> SceneError:
+    return SceneError(
+        f"{source}: shows no two fisheye circles next to each other; panoramas need no stitching"
+    )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.file_kinds import describe_file
 from panolog.prepare.panorama_files import SUFFIXES
+from panolog.prepare.stitching.lenses import Up
 from panolog.prepare.video.colour import ColourError, Converter, check_colours
 from panolog.prepare.video.layout import Layout, LayoutError, layout_of
 from panolog.prepare.video.lenses import (
@@ -264,12 +265,13 @@ class Video:
 
 
 @contextmanager
-def open_video(path: Path, effort: Effort = "exact") -> Iterator[Video]:
+def open_video(path: Path, effort: Effort = "exact", up: Up | None = None) -> Iterator[Video]:
     """Opens a video in any container of `FORMATS` with any codec of FFmpeg; one of two lenses is stitched.
 
     Args: effort, "exact" decodes all frames in one thread, so that damaged ones are the same each time.
         "chosen" decodes in several threads, and of large videos no frames that no others refer to, most of
         which are coded worst. "draft" also leaves out what smooths the borders of blocks in large ones.
+        up, of a video that is to be stitched, where up is in its first circle; None: up.
     Raises:
         SceneError: it is missing, cannot be opened, is no panorama, or its width is out of bounds.
     """
@@ -283,7 +285,7 @@ def open_video(path: Path, effort: Effort = "exact") -> Iterator[Video]:
         reason = describe_file(path) or "it is damaged, truncated before its index, or no video"
         raise SceneError(f"{path}: cannot be opened as a video; {reason}") from error
     with container, ThreadPoolExecutor(1) as ahead:
-        lenses = video_lenses(path)
+        lenses = video_lenses(path, up)
         with open_second(None if lenses is None else lenses.second, effort) as second:
             yield Video(path, container, ahead, effort, lenses, second)
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.prepare.stitching.lenses import Up
 from panolog.prepare.video.decode import Video, open_video, video_digest
 from panolog.prepare.video.motion import SHARP_WIDTH, MotionTracker, VideoMotion, load_motion
 from panolog.prepare.video.selection import choose_frames
@@ -33,17 +34,16 @@ def extract_frames(
     *,
     parallax: float = PARALLAX,
     most: int | None = None,
+    up: Up | None = None,
     progress: Progress = no_progress,
     note: Callable[[str], None] | None = None,
 ) -> list[Path]:
-    """Writes the chosen frames of an equirectangular video to `folder`, as STEM_NUMBER.jpg in full size.
+    """Writes the chosen frames of a 360° video to `folder`, as panoramas STEM_NUMBER.jpg in full size.
 
-    They carry what the video knows of them as EXIF and XMP. If they cover a part of
-    the sphere, `folder`/masks has a mask for each.
-
+    They carry what the video knows of them as EXIF and XMP. What they do not cover is in `folder`/masks.
     Neighbours are about `parallax` apart, the median angle between the directions in which both see the same
-    points, without the camera's rotation: where it stands or turns on the spot, there is one frame. Both ends
-    of the way are included. Where motion cannot be followed, as at a cut, a new piece begins.
+    points, without the camera's rotation: where it stands or turns, there is one frame. Both ends are
+    included. Where motion cannot be followed, as at a cut, a new piece begins.
 
     The motion is kept in STEM.motion.json: an interrupted call can be repeated, and another choice requires
     no new search. Frames of an earlier choice that are not in this one are removed.
@@ -52,7 +52,8 @@ def extract_frames(
         video: any format that FFmpeg reads, of any frame rate.
         folder: made if missing.
         parallax: degrees, above 0 and up to 45.
-        most: maximum number of frames, at least 2; if there would be more, they are further apart.
+        most: maximum number of frames, at least 2; if there were more, they are further apart.
+        up: of a video that is to be stitched, where up is in its first circle; None: up.
         progress: called after each frame of the first pass and each that is written; counts both passes.
         note: called with a line about each thing that was left out.
 
@@ -69,10 +70,10 @@ def extract_frames(
     if most is not None and most < 2:
         raise ConfigError(f"most {most}: give at least 2 frames; one panorama has no parallax")
     frames = _Frames(video, folder)
-    found = _video_motion(video, frames.motion, progress)
+    found = _video_motion(video, frames.motion, progress, up)
     telemetry, left_out = read_telemetry(video)
-    for line in (*found.notes, *left_out):
-        if note is not None:
+    if note is not None:
+        for line in (*found.notes, *left_out):
             note(line)
     numbers = choose_frames(found.pieces, parallax, most, found.keys)
     if len(numbers) < 2:
@@ -85,7 +86,7 @@ def extract_frames(
     if found.chosen != numbers:
         found.chosen = numbers
         found.save(frames.motion)
-    _write(video, frames, found, telemetry, progress)
+    _write(video, frames, found, telemetry, progress, up)
     return [frames.path(number) for number in numbers]
 
 
@@ -136,31 +137,31 @@ class _Frames:
                 file.unlink()
 
 
-def _video_motion(video: Path, file: Path, progress: Progress) -> VideoMotion:
+def _video_motion(video: Path, file: Path, progress: Progress, up: Up | None) -> VideoMotion:
     """The motion, from the file of an earlier call or from the video. Raises SceneError."""
-    key = video_digest(video)
+    key = video_digest(video) + ("" if up is None else f"-{up}")
     known = load_motion(file)
     if known is None:
-        return _search(video, key, progress)
+        return _search(video, key, progress, up)
     if known.digest != key:
         raise SceneError(
-            f"{file}: is about another video of the name {video.stem}; remove it and its frames, "
-            "or give another folder"
+            f"{file}: is about another video of the name {video.stem}, or of another --up; remove it and "
+            "its frames, or give another folder"
         )
     return known
 
 
-def _search(video: Path, key: str, progress: Progress) -> VideoMotion:
+def _search(video: Path, key: str, progress: Progress, up: Up | None) -> VideoMotion:
     """The first pass, again with care if the video turns out to be damaged. Raises SceneError."""
-    found = _followed(video, key, progress, "draft") or _followed(video, key, progress, "exact")
+    found = _followed(video, key, progress, "draft", up) or _followed(video, key, progress, "exact", up)
     if found is None or not found.pieces:
         raise SceneError(f"{video}: is damaged, or shows nothing that can be tracked; no frame can be used")
     return found
 
 
-def _followed(video: Path, key: str, progress: Progress, effort: Effort) -> VideoMotion | None:
+def _followed(video: Path, key: str, progress: Progress, effort: Effort, up: Up | None) -> VideoMotion | None:
     """The motion; None of a draft of a video that is not plain. Raises SceneError."""
-    with open_video(video, effort) as source:
+    with open_video(video, effort, up) as source:
         motion, coming = MotionTracker(source.width), 0
         for number in source.frames():
             if effort == "draft" and not source.is_plain:
@@ -179,14 +180,19 @@ def _followed(video: Path, key: str, progress: Progress, effort: Effort) -> Vide
 
 
 def _write(
-    video: Path, frames: _Frames, found: VideoMotion, telemetry: Telemetry | None, progress: Progress
+    video: Path,
+    frames: _Frames,
+    found: VideoMotion,
+    telemetry: Telemetry | None,
+    progress: Progress,
+    up: Up | None,
 ) -> None:
     """The second pass, for the missing frames: to each of them, or in order where that does not find one."""
     times, before = found.times(), found.decoded
     missing = [number for number in found.chosen if not frames.path(number).is_file()]
     if missing and found.keys:
         last = missing[-1]
-        with open_video(video, "chosen") as source:
+        with open_video(video, "chosen", up) as source:
             there = source.frames_at([times[number] for number in missing], found.keys)
             for number, _ in zip(tuple(missing), there, strict=False):
                 if not frames.save(number, source, telemetry):
@@ -197,7 +203,7 @@ def _write(
         return
     last = missing[-1]
     wanted = {times[number] if found.keys else number: number for number in missing}
-    with open_video(video) as source:
+    with open_video(video, up=up) as source:
         for number in source.frames():
             at = wanted.pop(source.time if found.keys else number, None)
             if at is not None and not frames.save(at, source, telemetry):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.stitching.calibrate import Lenses
 from panolog.prepare.stitching.circles import Pixel, halves
-from panolog.prepare.stitching.lenses import Pair
+from panolog.prepare.stitching.lenses import Pair, Up
 from panolog.prepare.stitching.pictures import circles_in, lenses_in, reduced
 from panolog.prepare.stitching.stitch import Stitcher
 from panolog.prepare.video.colour import ColourError, Converter, Picture, check_colours
@@ -189,14 +189,15 @@ def open_second(second: Second | None, effort: Effort) -> Iterator[SecondLens | 
         yield SecondLens(container, prepare_stream(largest_streams(container)[row], effort))
 
 
-def video_lenses(path: Path) -> VideoLenses | None:
+def video_lenses(path: Path, up: Up | None = None) -> VideoLenses | None:
     """The lenses of a video that has not been stitched; None of any other, and of one that cannot be read.
 
     Raises SceneError if it shows circles, but what both show does not determine the lenses.
     """
     try:
         state = path.stat()
-        return _found(path, state.st_size, state.st_mtime_ns)
+        found = _found(path, state.st_size, state.st_mtime_ns)
+        return found if found is None or up is None else replace(found, pair=replace(found.pair, up=up))
     except (OSError, av.FFmpegError, UnicodeError, ColourError):
         return None
 

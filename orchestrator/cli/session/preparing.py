@@ -162,12 +162,15 @@ def _look_at(source: Path) -> tuple[bool, int, int, bool]:
     """
     from panolog.prepare.panorama_files import load_resized
     from panolog.prepare.sfm.pipeline import panoramas_in_folder  # loading it is slow
+    from panolog.prepare.stitching.source import look_at_raw
     from panolog.prepare.video.decode import open_video
     from panolog.scene.image_files import check_images
 
     if source.is_file():
         with open_video(source) as video:
             return True, video.promised, video.width, False
+    if (raw := look_at_raw(source)) is not None:
+        return False, *raw, False
     panoramas, layers = panoramas_in_folder(source)
     width, _ = check_images([panorama.path for panorama in panoramas])
     load_resized(panoramas[0].path, 256)  # fisheye circles, of which all are, are refused at once

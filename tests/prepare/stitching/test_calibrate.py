@@ -10,6 +10,7 @@ from panolog.prepare.stitching.calibrate import OverlapError, calibrate, disagre
 from panolog.prepare.stitching.circles import CircleError, Picture, find_circle, halves
 from panolog.prepare.stitching.lenses import Array, Pair
 from panolog.prepare.stitching.stitch import Stitcher, gains
+from panolog.scene.image_files import decode_colors
 from tests.data import shared
 from tests.prepare.stitching.cameras import Camera, camera
 from tests.prepare.video.videos import Shot, render
@@ -54,8 +55,10 @@ def test_the_lenses_are_found(turned: float) -> None:
 def test_on_a_street_at_full_size() -> None:
     files = sorted((shared("street") / "images").iterdir())[::11]
     views = [
-        np.asarray(cv2.resize(cv2.imread(str(file)), (WIDTH, WIDTH // 2), interpolation=cv2.INTER_CUBIC))
-        for file in files
+        np.asarray(
+            cv2.resize(decode_colors(it), (WIDTH, WIDTH // 2), interpolation=cv2.INTER_CUBIC), np.uint8
+        )
+        for it in files
     ]
     known = camera(1024)
     pictures = taken(known, views)

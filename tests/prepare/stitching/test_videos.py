@@ -1,5 +1,6 @@
 """Raw videos of two lenses: both circles in each frame, two streams, two files."""
 
+import json
 from fractions import Fraction
 from pathlib import Path
 
@@ -9,10 +10,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from panolog.orchestrator.cli.session.preparing import settings_of
+from panolog.orchestrator.runs.preparation.settings import Options
+from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
 from panolog.prepare.stitching.circles import halves
 from panolog.prepare.video.decode import open_video
 from panolog.prepare.video.frames import extract_frames
 from panolog.scene.errors import InputError
+from panolog.scene.read import read_scene
+from panolog.scene.write import no_progress
+from tests.orchestrator.cli.program import call, one_line, shown
 from tests.prepare.stitching.cameras import camera
 from tests.prepare.video.videos import numbers, render, walk
 
@@ -89,6 +96,17 @@ def test_frames_are_chosen_as_of_any_video(walked: list[tuple[Image, Image]], tm
     assert np.abs(picture.astype(float) - truth).mean() < 12
 
 
+def test_the_command_takes_videos(walked: list[tuple[Image, Image]], tmp_path: Path) -> None:
+    path, out = raw("both circles", tmp_path, [it for _, it in walked]), tmp_path / "out"
+    printed = shown("scene", "stitch", path, "-o", out, "--frames", "3")
+    assert printed["panoramas"] == 3 == len(list(out.glob("clip_*.jpg")))
+    assert json.loads((out / "lenses.json").read_bytes())[0]["size"] == [400, 400]
+    again = one_line(call("scene", "stitch", path, "-o", out, "--frames", "3", "--up", "right"))
+    assert "is about another video of the name clip, or of another --up" in again
+    flat = write(tmp_path / "flat.mp4", [it for it, _ in walked[:3]])
+    assert "shows no two fisheye circles" in one_line(call("scene", "stitch", flat, "-o", tmp_path / "no"))
+
+
 def test_one_lens_of_two_files_is_refused(walked: list[tuple[Image, Image]], tmp_path: Path) -> None:
     path = raw("two files", tmp_path, [it for _, it in walked[:4]])
     path.with_name(path.name.replace("_00_", "_10_")).unlink()
@@ -98,7 +116,8 @@ def test_one_lens_of_two_files_is_refused(walked: list[tuple[Image, Image]], tmp
 
 def test_circles_of_different_places_are_refused(walked: list[tuple[Image, Image]], tmp_path: Path) -> None:
     known, noise = camera(400), np.random.default_rng(1)
-    views = [cv2.resize(noise.integers(40, 220, (24, 48, 3), np.uint8), (1024, 512)) for _ in range(4)]
+    small = noise.integers(40, 220, (4, 24, 48, 3), np.uint8)
+    views = [np.asarray(cv2.resize(it, (1024, 512)), np.uint8) for it in small]
     others = [np.asarray(cv2.flip(it, 0), np.uint8) for it in views]
     pictures = [
         np.hstack([halves(known.picture(one))[0], halves(known.picture(other))[1]])
@@ -106,3 +125,29 @@ def test_circles_of_different_places_are_refused(walked: list[tuple[Image, Image
     ]
     with pytest.raises(InputError, match=r"clip\.mp4: its two fisheye circles cannot be stitched"):
         open_video(write(tmp_path / "clip.mp4", pictures)).__enter__()
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("kind", ["video", "folder"])
+def test_raw_files_become_a_scene_in_one_command(
+    kind: str, walked: list[tuple[Image, Image]], tmp_path: Path
+) -> None:
+    source = tmp_path / "raw"
+    if kind == "video":
+        source = raw("both circles", tmp_path, [it for _, it in walked])
+    else:
+        source.mkdir()
+        for number, (_, picture) in enumerate(walked[::4]):
+            file = source / f"{number}.jpg"
+            cv2.imwrite(str(file), picture, [cv2.IMWRITE_JPEG_QUALITY, 95])
+            file.rename(file.with_suffix(".insp"))
+    settings = settings_of(source, Options())
+    assert settings is not None and settings.video == (kind == "video")
+    make_scene(source, tmp_path / "scene", SfmSettings(), no_progress)
+    scene = read_scene(tmp_path / "scene")
+    assert scene.width == settings.width and len(scene.panoramas) >= 3
+    centers = scene.centers
+    along = centers @ np.linalg.svd(centers - centers.mean(axis=0))[2][0]
+    steps = np.diff(along)
+    assert (np.sign(steps) == np.sign(steps[0])).all()  # in order along a line, as the camera has walked
+    assert json.loads((tmp_path / "scene" / "sfm.json").read_bytes())["left_out"] == []

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from panolog.prepare.video import decode
+from panolog.prepare.video import streams
 from panolog.prepare.video.decode import open_video
 from panolog.scene.errors import InputError
 from tests.prepare.video import containers
@@ -121,7 +121,7 @@ def test_seeking_finds_the_frames_of_reading_in_order(
 def test_frames_that_none_refer_to_are_left_out_of_large_videos(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(decode, "_LARGE", WIDTH)
+    monkeypatch.setattr(streams, "_LARGE", WIDTH)
     encoding = Encoding("libx264", "yuv420p", {"qp": "18", "x264-params": "b-adapt=0:bframes=2:b-pyramid=0"})
     path = write_clip(tmp_path / "clip.mp4", known_frames(40), encoding)
     with open_video(path) as video:

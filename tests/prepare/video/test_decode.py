@@ -89,7 +89,7 @@ def test_fisheyes_side_by_side(tmp_path: Path) -> None:
     for u in (WIDTH // 4, 3 * WIDTH // 4):
         cv2.circle(mask, (u, HEIGHT // 2), HEIGHT // 2, 1, -1)
     video = write_video(tmp_path / "raw.avi", [image * mask for image in tour_images(3)])
-    with pytest.raises(InputError, match=r"raw\.avi: its frames are two fisheye circles; stitch it"):
+    with pytest.raises(InputError, match=r"raw\.avi: its two fisheye circles cannot be stitched: "):
         extract_frames(video, tmp_path / "out")
 
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from panolog.prepare.video import decode as decode_module
 from panolog.prepare.video import frames as module
+from panolog.prepare.video import streams
 from panolog.prepare.video.decode import Video
 from panolog.prepare.video.frames import extract_frames
 from panolog.prepare.video.motion import load_motion
@@ -123,9 +123,9 @@ def test_of_a_large_video_that_moves_slowly_few_frames_are_looked_at(
     """And as many as before where the camera is faster."""
     slow = write_video(tmp_path / "slow.avi", [render(shot) for shot in walk([0.004] * 30)])
     for video in (short, slow):
-        monkeypatch.setattr(decode_module, "_LARGE", WIDTH + 1)
+        monkeypatch.setattr(streams, "_LARGE", WIDTH + 1)
         every = module._search(video, "", no_progress)
-        monkeypatch.setattr(decode_module, "_LARGE", WIDTH)
+        monkeypatch.setattr(streams, "_LARGE", WIDTH)
         some = module._search(video, "", no_progress)
         (all_, few) = (sum(len(piece.frames) for piece in it.pieces) for it in (every, some))
         assert few == all_ if video == short else few < 0.5 * all_

@@ -136,7 +136,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
         (tmp_path / "fisheye").mkdir(exist_ok=True)
         cv2.imwrite(str(tmp_path / "fisheye" / name), circles)
     wrong = {
-        "fisheye": "a.png: is no panorama, but shows two fisheye circles; stitch it in",
+        "fisheye": "a.png: its two fisheye circles cannot be stitched: .*; or stitch it in",
         "one": "1 panoramas .*; at least 2 are needed",
         "flat": "64 x 40 pixels are not 2:1",
         "sizes": "all panoramas must have one size",
