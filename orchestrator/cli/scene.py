@@ -131,7 +131,7 @@ def stitch(
     as_json: JsonOption = False,
 ) -> None:
     """Make panoramas of pictures or a video that show two fisheye circles."""
-    from panolog.prepare.stitching.source import FrameChoice, stitch_source
+    from panolog.prepare.raw_files import FrameChoice, stitch_source
     from panolog.prepare.video.frames import PARALLAX
 
     chosen = FrameChoice(PARALLAX if parallax is None else parallax, frames)

@@ -161,8 +161,8 @@ def _look_at(source: Path) -> tuple[bool, int, int, bool]:
     Raises SceneError if it is damaged, or none of both.
     """
     from panolog.prepare.panorama_files import load_resized
+    from panolog.prepare.raw_files import look_at_raw
     from panolog.prepare.sfm.pipeline import panoramas_in_folder  # loading it is slow
-    from panolog.prepare.stitching.source import look_at_raw
     from panolog.prepare.video.decode import open_video
     from panolog.scene.image_files import check_images
 
