@@ -151,7 +151,7 @@ def _video_motion(video: Path, file: Path, progress: Progress, up: Up | None) ->
     return known
 
 
-def _search(video: Path, key: str, progress: Progress, up: Up | None) -> VideoMotion:
+def _search(video: Path, key: str, progress: Progress, up: Up | None = None) -> VideoMotion:
     """The first pass, again with care if the video turns out to be damaged. Raises SceneError."""
     found = _followed(video, key, progress, "draft", up) or _followed(video, key, progress, "exact", up)
     if found is None or not found.pieces:
