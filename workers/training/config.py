@@ -175,7 +175,7 @@ class DensifyConfig(Group):
         default=0.0,
         ge=0,
         le=1,
-        description="exponent p: in a run of more than 1,500 iterations `growth` is multiplied by"
+        description="exponent p: in a Stage I of more than 1,500 iterations `growth` is multiplied by"
         " (iterations / 1,500)^p: what trains longer can teach more of them; 0 = as it is",
     )
     filled: float = Field(

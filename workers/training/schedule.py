@@ -125,8 +125,9 @@ class Schedule:
         Args: start, how many there were before the first iteration; pixels of one panorama.
         """
         densify = self.densify
-        growth = densify.growth * max(1.0, self.iterations / SHORT_RUN) ** densify.long_runs
-        factor = growth * (GROWTH_OFFSET + GROWTH_SLOPE * math.log(max(1.0, pixels / max(start, 1))))
+        longer = 1.0 if self.refine else max(1.0, self.iterations / SHORT_RUN) ** densify.long_runs
+        factor = GROWTH_OFFSET + GROWTH_SLOPE * math.log(max(1.0, pixels / max(start, 1)))
+        factor *= densify.growth * longer
         first, last = self.point(densify.start), min(self.point(densify.until), self.iterations)
         ends = first + densify.filled * (last - first)
         share = min(max((iteration - first) / max(ends - first, 1.0), 0.0), 1.0)
