@@ -196,7 +196,6 @@ def _no_release(state: RunState, node: str) -> str | None:
 
 
 def _in_quarantine(state: RunState, node: str) -> list[NodeState]:
-    """Those of a host, or the ids that begin so."""
     quarantined = state.quarantined()
     by_host = [known for known in quarantined if known.host == node]
     return by_host or [known for known in quarantined if known.id.startswith(node)]

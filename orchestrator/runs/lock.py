@@ -30,7 +30,6 @@ def hold(path: Path) -> Iterator[None]:
 
 
 def _take(path: Path) -> int:
-    """A descriptor that has the lock. Raises as `hold`."""
     while True:
         try:
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)

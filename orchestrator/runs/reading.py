@@ -138,7 +138,6 @@ def _roll_back(path: Path, timeout_s: float) -> bool:
 
 
 def _copied(path: Path) -> sqlite3.Connection:
-    """A connection to a copy, which ends with it."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / path.name
         for suffix in ("", "-journal"):

@@ -88,8 +88,6 @@ _SERIES = ("rate", "loss", "psnr", "gaussians", "memory")
 
 @dataclass(frozen=True)
 class _Stream:
-    """The progress of a task."""
-
     stored: int  # how many records
     time: float  # of the last one, seconds since the epoch
     latest: Stored | None = None  # if it was not stored
@@ -172,7 +170,6 @@ class Database:
                 self._connection.execute("ROLLBACK")
 
     def _read_last(self) -> int:
-        """The id of the last record, stored or not."""
         sql = "SELECT MAX((SELECT IFNULL(MAX(id), 0) FROM events), (SELECT IFNULL(MAX(id), 0) FROM latest))"
         return int(self._connection.execute(sql).fetchone()[0])
 

@@ -42,8 +42,6 @@ class Agent:
 
 @dataclass
 class _Known:
-    """An agent as the driver sees it."""
-
     actor: Any  # ray.actor.ActorHandle
     answer: Any  # ray.ObjectRef of the next notice
     notice: LeaveNotice | None = None

@@ -284,7 +284,6 @@ def received_bytes() -> int:
 
 
 def _here() -> str:
-    """Ray's id of this machine."""
     node: str = ray.get_runtime_context().get_node_id()
     return node
 
@@ -318,6 +317,5 @@ def _unused(folder: Path) -> list[Path]:
 
 
 def _remove(cache: str) -> None:
-    """Runs on each machine."""
     folder = Path(ray.get_runtime_context().get_temp_dir()) / _FOLDER / cache
     shutil.rmtree(folder, ignore_errors=True)

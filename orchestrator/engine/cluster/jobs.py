@@ -170,7 +170,6 @@ def on_head(path: str, what: str) -> str:
 
 
 def _job(details: Any) -> ClusterJob:
-    """What matters of a `JobDetails`."""
     status = _STATUS[details.status.value]
     lines = (details.message or "").strip().splitlines() if status == "failed" else []
     reason = lines[-1].removeprefix("panolog: ") if lines else None

@@ -158,7 +158,6 @@ def _limit_waits(pipe: Connection) -> None:
 
 
 def _death_of(task: _Task) -> Failed:
-    """The last message of a task whose process has ended without one."""
     if task.hello is not None and oom_kills() > task.hello.oom_kills:
         return Failed("out of memory: the system killed the worker", Failure.MEMORY)
     return Failed("the worker process died: killed or crashed", Failure.LOST)

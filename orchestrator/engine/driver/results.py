@@ -106,7 +106,6 @@ class Results:
         return [merge_run(folder, state, self._specs.plan, self._specs.repaired, early)]
 
     def _join(self, state: RunState) -> list[Record]:
-        """The evaluation from its shards."""
         job, faces = self._job, len(self._specs.faces)
         evaluation = new_evaluation(job, faces, detail=job.config.measured_detail)
         evaluation.join(job.folder, state.measures)

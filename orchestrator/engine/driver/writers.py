@@ -25,8 +25,6 @@ _UNMEASURED = 2**26  # bytes per second, expected of a disk before anything larg
 
 @dataclass
 class _Job:
-    """One message on its way to the disk."""
-
     event: Checkpoint | Trained
     size: int  # bytes, 0 = unknown
     future: Future[tuple[Record, float]]

@@ -77,7 +77,6 @@ class Estimator:
         return Parts(self.scene, self.config, self.width)
 
     def _coarse_stages(self, gaussians: int) -> list[StageEstimate]:
-        """Stage I: of the whole place, or of its districts and then their union."""
         sky, count, cameras = self._sky, self.config.districts, self.parts.district[0]
         largest = self._coarse[-1][1] + sky
 
@@ -124,7 +123,6 @@ class Estimator:
         return self._stage(stage, tasks, gaussians, need, training)
 
     def _refinement(self, coarse: int) -> list[StageEstimate]:
-        """Scoring, with the plan, and the blocks."""
         train, blocks, cameras = len(self.scene.train), self.config.grid.count, self.parts.block_cameras
         seen, need = self.scored(coarse)
 
@@ -158,7 +156,6 @@ class Estimator:
         return max(seen, around), (max(host, with_both), max(device, on_gpu))
 
     def _passes(self) -> list[StageEstimate]:
-        """What trains once more, each after a union of the blocks."""
         blocks, own, stages = self.config.grid.count, self._block[-1][1], list[StageEstimate]()
         whole = blocks * own + self._sky
         for stage in self.config.passes.stages:
@@ -185,7 +182,6 @@ class Estimator:
         return [merge, shards, self._stage(Stage.EVAL, 1, merged, (0, 0), lambda _: 0.0)]
 
     def _writing(self, gaussians: int) -> float:
-        """Seconds in which models are read and written as one."""
         return 2 * gaussians * _PLY / _DISK
 
     def _disk(self, coarse: int, block: int, merged: int) -> int:
@@ -239,12 +235,10 @@ class Estimator:
 
     @property
     def _frozen_sky(self) -> int:
-        """Sky Gaussians in the training of a block."""
         return 0 if self.bakes else self._sky
 
     @cached_property
     def _periods(self) -> Callable[[int], list[Period]]:
-        """How a block grows from so many scene Gaussians."""
         schedule = replace(self._schedule, refine=True)
         return cache(lambda start: population(start, self._added, self._pixels, schedule))
 
@@ -339,7 +333,6 @@ class Estimator:
 
     @property
     def _saved(self) -> int:
-        """Bytes of a Gaussian in a checkpoint."""
         return CHECKPOINT + (AVERAGE if self.config.optimizer.average else 0)
 
     @property
@@ -374,7 +367,6 @@ class Estimator:
 
     @property
     def _each(self) -> int:
-        """Peak bytes of one Gaussian in training."""
         return TRAINED + (2 * self._saved if self._saves else 0)
 
     def _fixed(self, cameras: int, baked: int = 0) -> int:

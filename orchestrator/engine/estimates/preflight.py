@@ -167,7 +167,6 @@ def _whole(scene: Scene, config: RunConfig, basis: Basis) -> Estimate:
 
 
 def _most_memory(estimate: Estimate) -> int:
-    """Bytes of the largest task."""
     return max(stage.device or stage.host for stage in estimate.stages)
 
 

@@ -160,7 +160,6 @@ def _after_failure(nodes: Nodes, record: TaskFailed) -> Nodes:
 
 
 def _after_success(nodes: Nodes, id: str) -> Nodes:
-    """After a checkpoint or a result of a task."""
     here = nodes.get(id) or NodeState(id)
     after = replace(here, failures=here.failures if here.until else (), sound=True, quarantines=0)
     return nodes if after == here else {**nodes, id: after}

@@ -93,16 +93,12 @@ def run_queue(queue: Queue, limits: Limits, say: Callable[[str], None]) -> int:
 
 @dataclass
 class _Live:
-    """A run that is at work."""
-
     entry: Entry
     child: subprocess.Popen[bytes] | None  # None: a runner before has started it
 
 
 @dataclass
 class _Runner:
-    """One at work."""
-
     queue: Queue
     limits: Limits
     say: Callable[[str], None]
@@ -229,7 +225,6 @@ class _Runner:
         )
 
     def _end_ended(self) -> None:
-        """Takes note of the runs that have ended, and of those that must be started anew."""
         for id, live in list(self.live.items()):
             code = live.child.poll() if live.child is not None else None
             ended = code is not None if live.child is not None else not self._alive(live.entry)

@@ -79,7 +79,6 @@ def _begun(plan: MirrorPlan) -> tuple[Store, Lease, Manifest | None]:
 def _follow(
     plan: MirrorPlan, mirror: Mirror, lease: Lease, ended: threading.Event, stop: threading.Event
 ) -> None:
-    """Mirrors the run, and says what is left."""
     folder = RunFolder(plan.root)
     mirror.follow(ended, stop, plan.period, plan.patience)
     with suppress(StoreError, StoreLostError):

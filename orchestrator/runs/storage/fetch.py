@@ -132,7 +132,6 @@ def _fetch_one(store: Store, path: Path, entry: StoredFile) -> None:
 
 
 def _set_aside(folder: RunFolder, say: Say) -> None:
-    """Renames a folder whose run another machine has continued."""
     moment = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
     aside = folder.root.with_name(f"{folder.root.name}.before-{moment}")
     folder.root.rename(aside)

@@ -82,8 +82,6 @@ def _machine() -> str:
 
 @dataclass(frozen=True)
 class _Owner:
-    """Who holds a lease."""
-
     folder: str  # stands for the run's folder on its machine
     machine: str = field(default_factory=_machine)
     token: str = field(default_factory=lambda: secrets.token_hex(8))

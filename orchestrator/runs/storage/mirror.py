@@ -184,7 +184,6 @@ class Mirror:
         return {name: self._stored[name][1] for name in present if name in self._stored}
 
     def _send_one(self, name: str, stamp: Stamp) -> None:
-        """Stores one file, unless the store has the same bytes."""
         held = self._folder.mirror.with_name(f"{secrets.token_hex(4)}.part")
         try:
             if not self._hold(self._folder.root / name, held):
@@ -221,7 +220,6 @@ class Mirror:
         return entry
 
     def _snapshot(self) -> Path:
-        """A copy of run.db as it is after some commit."""
         copy = self._folder.mirror.with_name(f"{secrets.token_hex(4)}.db.part")
         copy.parent.mkdir(exist_ok=True)
         with reading(self._folder.database) as source, closing(sqlite3.connect(copy)) as target:
@@ -229,7 +227,6 @@ class Mirror:
         return copy
 
     def _publish(self, files: dict[str, StoredFile], moment: float) -> None:
-        """Makes these files the run, for all who read the store."""
         if files == self._files:
             return
         self._lease.require()
