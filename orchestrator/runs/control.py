@@ -1,8 +1,7 @@
 """The control channel of a run: requests of the user to its driver, as small files in RUN/control.
 
-Any process that may write the run folder may send a request. The driver polls the folder, removes the files
-and carries out what is possible (`answer`). Only the file system is used, so the channel works wherever the
-run folder is mounted.
+Any process that may write the run folder may send one. The driver polls the folder, removes the files and
+carries out what is possible (`answer`).
 """
 
 import json

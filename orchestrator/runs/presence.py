@@ -2,8 +2,6 @@
 
 The file has a fixed size and is overwritten in place, which needs no free space on most file systems. It also
 has a token, by which a worker knows that it sees the same folder as the driver.
-
-`why_waiting` separates errors of such a disk from others.
 """
 
 import errno

@@ -1,11 +1,8 @@
 """RUN/run.db: every record in order, in SQLite. The driver writes it, any process reads it.
 
 The journal is a rollback journal, not a WAL: `run.db` alone is complete after every commit, so that a plain
-copy of it, also on read-only media or a network share, can be read. Readers take all rows of a query at once
-and so never hold the driver up for long.
-
-Of progress only a part is stored, by the rule of `thinning`; the latest of each task is kept in place, so
-that readers always see it.
+copy of it can be read, also on read-only media. Of progress only a part is stored, by the rule of `thinning`;
+the latest of each task is kept in place.
 """
 
 import json

@@ -2,8 +2,7 @@
 
 A worker that sees a file at its own path reads it there. Any other requests it from the file server, an actor
 on the driver's machine, once for each machine: the bytes travel through Ray's object store and are kept in
-Ray's temporary folder, where later tasks and attempts find them. Nothing is sent ahead, so each machine gets
-what its own cameras need, and no object has to outlive the call that moves it: a lost one is requested again.
+Ray's temporary folder. No object has to outlive the call that moves it: a lost one is requested again.
 """
 
 import errno

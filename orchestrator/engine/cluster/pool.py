@@ -1,8 +1,4 @@
-"""Workers on Ray: tasks go in, messages come out.
-
-Each task is a remote generator on a node that the driver names; what it yields arrives in order while it
-runs.
-"""
+"""Workers on Ray: each task is a remote generator on a node that the driver names."""
 
 import os
 import socket

@@ -1,8 +1,7 @@
-"""Workers without Ray: each task in a process of its own on this machine.
+"""Workers without Ray: each task in a process of its own on this machine. Results are the same bytes.
 
-Results are the same bytes as with Ray. A worker gets its spec when it has said Hello, and sends its messages
-through the same socket. No process that hangs holds the driver up. Workers are forked from a server process
-that has imported torch once and computes nothing, so a task starts in milliseconds.
+A worker gets its spec when it has said Hello, and sends its messages through the same socket. Workers are
+forked from a server process that has imported torch once and computes nothing.
 """
 
 import os

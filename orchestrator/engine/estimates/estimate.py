@@ -1,10 +1,8 @@
 """What every stage of a job needs, from its scene, its settings, a calibration and the machines there are.
 
-Memory. What a Gaussian takes is in `calibration`, on a GPU in `workers.device_memory`. A checkpoint is one
-copy of values and moments, and one more on its way to the driver, both in the host's memory. All else (the
-process, the images of a step, what decoding needs) is what the calibration's process had beyond its own
-Gaussians and panoramas. Decoded panoramas stay within `cache.memory`. On the CPU, scoring and evaluation have
-the model, what reading it took, and one set of gradients. A block with a baked exterior trains what its cell
+Memory. What a Gaussian takes is in `calibration`, on a GPU in `workers.device_memory`. All else (the process,
+the images of a step, what decoding needs) is what the calibration's process had beyond its own Gaussians and
+panoramas; decoded panoramas stay within `cache.memory`. A block with a baked exterior trains what its cell
 has; the fullest cell is expected to have as large a share of the Gaussians as of the sparse points.
 
 Time. An iteration takes a + b · Gaussians seconds: the calibration has tried two numbers of them, and

@@ -1,16 +1,11 @@
 """`panolog queue run`: starts the runs of a queue one after another, or side by side.
 
-Each run is the supervised command, a child of the runner, which the kernel stops when the runner ends,
-however that comes: as after Ctrl-C, with checkpoints. What was running then stays so in the database, and the
-next runner resumes it first. It begins a run only when nothing of an earlier start is left:
-
-- A child waits at a gate until its identity is in the database. If the runner is killed before, the child
-  ends at the gate, and nothing of the run has begun.
-- A process counts as that of an entry only with the same boot of the machine, number and moment of its start.
-- While a driver has the lock of the run folder, the run is alive, however it was started.
-
-Runs start strictly in order: one that waits for its share of the machine keeps those after it waiting, so
-that a large one gets its turn. One that needs more than the machine has fails, and keeps none waiting.
+Each run is the supervised command, a child of the runner, which the kernel stops when the runner ends: as
+after Ctrl-C, with checkpoints. What was running then stays so in the database, and the next runner resumes it
+first, but only when nothing of an earlier start is left. A child waits at a gate until its identity is in the
+database: boot of the machine, number, and moment of its start. While a driver has the lock of the run folder,
+the run is alive, however it was started. Runs start strictly in order: one that waits for its share of the
+machine keeps those after it waiting; one that needs more than the machine has fails.
 """
 
 import os

@@ -1,8 +1,7 @@
 """QUEUE/queue.db: the entries of a queue in SQLite, which several commands may use at once.
 
-The journal is a WAL, so that `list` and the dashboard never wait for a command that writes: the folder
-must be on a disk of this machine, since a WAL does not work on network file systems. Every change is one
-transaction that checks the state that it relies on.
+The journal is a WAL, so that `list` and the dashboard never wait for a command that writes: the folder must
+be on a disk of this machine. Every change is one transaction that checks the state that it relies on.
 """
 
 import json

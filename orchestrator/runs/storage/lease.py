@@ -1,8 +1,7 @@
 """Who writes a run in a store: one driver at a time, by a lease with an owner and a time.
 
-Leases are numbered; a new one is an object that must not exist yet, so of two that want the same number one
-gets it. That of the highest number counts. A lease is written again while its owner works, and expires when
-it has not been for `EXPIRES_S`, by the clocks of the machines: these must agree to some seconds.
+Leases are numbered; a new one is an object that must not exist yet. That of the highest number counts. It is
+written again while its owner works, and expires after `EXPIRES_S`, by clocks that must agree to some seconds.
 """
 
 import json

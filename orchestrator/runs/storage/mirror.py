@@ -1,9 +1,8 @@
 """The mirror of a run: copies what the driver makes into a store, so that the store is whole at any moment.
 
-A round first stores the files that have changed, then takes a snapshot of run.db, stores the files that have
-changed meanwhile, and the snapshot; then the manifest, and at last the pointer. The driver writes a file
-before the record that names it, so whatever the snapshot names is in the store before the snapshot counts.
-Nothing that a round replaces is removed: `panolog clean URL` does that.
+A round stores the files that have changed, takes a snapshot of run.db, stores what has changed meanwhile and
+the snapshot; then the manifest, and at last the pointer. The driver writes a file before the record that
+names it, so whatever the snapshot names is in the store before it counts. Nothing is removed.
 """
 
 import os

@@ -13,13 +13,14 @@ import pytest
 from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.engine.driver.local_pool import local_pool
 from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.control import state_of
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Noticed, Outcome, RunBegan, RunEnded, TaskYielded
 from panolog.orchestrator.runs.state import RunState, ignore
 from panolog.orchestrator.runs.store import read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
-from tests.orchestrator.whole_runs.test_whole_runs import SETS, state_of
+from tests.orchestrator.whole_runs.test_whole_runs import SETS
 from tests.ray_head import environment, wait_until
 
 pytestmark = pytest.mark.system
