@@ -1,4 +1,4 @@
-"""Clears up after a session of Ray whose driver has ended: `python -m … FOLDER`, a process of its own.
+"""Clears up after a session of Ray whose driver has ended. Separate: it is a process, `python -m … FOLDER`.
 
 It waits for the end of its standard input, which only the driver has open. A driver that ends by itself
 writes to it first. If the driver was killed, Ray's processes notice one by one, some after a minute: every

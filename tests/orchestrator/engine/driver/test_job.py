@@ -82,18 +82,3 @@ def test_a_block_also_gets_the_panoramas_that_it_is_compared_on(
     assert isinstance(spec, TrainSpec) and spec.initial == ModelFile(offer.coarse)
     assert (spec.cell, spec.views, spec.compared) == (CELL, BLOCK, compared)
     assert offer.scene == offer.images((*BLOCK, *compared))
-
-
-def test_an_evaluation_fits_poses_where_stage_one_has_refined_them(offer: Offer) -> None:
-    spec, test = offer.specs.of(EVAL), offer.job.scene.test
-    assert isinstance(spec, EvaluateSpec) and spec.pose_fit is None
-    assert not len(spec.scene.load().points)
-    offer.job.folder.root.mkdir(exist_ok=True)
-    offer.job.folder.poses.write_text("{}")
-    spec = offer.specs.of(EVAL)
-    assert isinstance(spec, EvaluateSpec) and spec.pose_fit == offer.job.config.loss.lambda_ssim
-    scene = spec.scene.load()
-    for row in test:
-        panorama, known = scene.panoramas[row], offer.job.scene.panoramas[row]
-        assert len(panorama.observed)
-        assert (scene.points[panorama.observed] == offer.job.scene.points[known.observed]).all()

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from rich.console import Console
 
 from panolog.orchestrator.engine.driver import driver as driver_module
 from panolog.orchestrator.engine.driver import saving, writers
@@ -26,17 +25,14 @@ from panolog.orchestrator.runs.records import (
     TaskFailed,
     TaskStarted,
 )
-from panolog.orchestrator.runs.state import Status
 from panolog.orchestrator.runs.store import Database, read_records
-from panolog.orchestrator.watch.views.terminal import table
 from panolog.scene.errors import ClusterLostError, InputError, RunError, RunLockedError
-from panolog.scene.ply import ply_header
 from panolog.workers.events import Calibration, Checkpoint, Event, Progress, Trained
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
 from panolog.workers.training.task_config import CacheConfig
-from tests.orchestrator.fakes import LOST_NODE, CrashError, Harness, Script, SetClock, begins, fails, well
+from tests.orchestrator.fakes import LOST_NODE, CrashError, Harness, Script, SetClock, begins, well
 from tests.orchestrator.history import AGAIN
 
 GIB = 2**30
@@ -114,24 +110,6 @@ def test_a_block_that_runs_out_of_memory_gets_less_cache_then_a_larger_gpu(tmp_p
     assert harness.state.task(TaskId.block(0)).reasons[0] == f"{NO_MEMORY.reason}; {why}"
 
 
-def test_a_block_for_which_no_gpu_is_large_enough_is_reported_and_the_rest_merged(tmp_path: Path) -> None:
-    harness = Harness(tmp_path, [with_gpu("a", 8), with_gpu("b", 24)], device="cuda", retries=9)
-    with pytest.raises(RunError, match="block 0 failed and keeps its Stage I Gaussians"):
-        harness.drive(fails(TaskId.block(0), NO_MEMORY, 99))
-    last = harness.attempts(TaskId.block(0))[-1][0]
-    assert (last.node, len(harness.attempts(TaskId.block(0))) <= 3) == ("b", True)
-    task = harness.state.task(TaskId.block(0))
-    assert "no device has more memory" in task.reasons[-1]
-    with (console := Console(width=200)).capture() as shown:
-        console.print(table(harness.state, root=harness.folder.root, running=False, wide=True))
-    assert f"block 0: {task.reasons[-1]}" in shown.get()
-    assert (task.status, harness.state.status(TaskId.block(1))) == (Status.FAILED, Status.DONE)
-    assert ply_header(harness.folder.point_cloud) == (202, 2)
-    assert [f.kind for f in harness.records(TaskFailed)] == [Failure.MEMORY] * len(
-        harness.attempts(TaskId.block(0))
-    )
-
-
 # Ctrl-C
 
 
@@ -201,17 +179,6 @@ def test_ctrl_c_where_nothing_trains_ends_at_once(harness: Harness) -> None:
         harness.drive(begins(EVAL, lambda: harness.stop.signal()))  # noqa: PLW0108  # drive makes a new one
     assert harness.records(StopRequested) == [StopRequested(0)]
     assert harness.pool.stopped == set()
-
-
-def test_a_merge_is_interrupted_at_once(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
-    merge = "panolog.orchestrator.engine.driver.results.merge_run"
-    monkeypatch.setattr(merge, lambda *_: harness.stop.signal())
-    with pytest.raises(KeyboardInterrupt):
-        harness.drive()
-    assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]
-    monkeypatch.undo()
-    assert harness.drive(resumed=True).outcome == "done"
-    assert harness.tasks == [EVAL]
 
 
 # However a driver ends, the run's history has its end and why

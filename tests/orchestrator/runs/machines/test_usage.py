@@ -1,19 +1,15 @@
 """What the machines of a run do: measured next to the tasks, kept once for each machine."""
 
 import json
-import secrets
 import shutil
 import socket
-import sys
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from subprocess import PIPE, Popen
 
 import pytest
 
 from panolog.orchestrator.runs.machines.gpus import GpuUsage
-from panolog.orchestrator.runs.machines.machine import memory_of
 from panolog.orchestrator.runs.machines.usage import Usage, measure, with_usage
 from panolog.orchestrator.runs.store import read_milestones
 from panolog.orchestrator.watch.views import queries
@@ -40,18 +36,6 @@ def test_this_machine_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert usage.gpus == (GPU, GpuUsage("NVIDIA H100 MIG", None, None, 9856 * MIB))
     listing.unlink()  # the program fails
     assert measure().gpus == ()
-
-
-def test_memory_of_processes_is_found_by_their_title() -> None:
-    title = f"ray::panolog-{secrets.token_hex(4)}"
-    program = "import sys; held = bytearray(2**28); print(flush=True); sys.stdin.read()"
-    command = [title, "-c", program]
-    with Popen(command, executable=sys.executable, stdin=PIPE, stdout=PIPE) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        assert 2**28 <= memory_of(title) < 2**29
-        process.kill()
-    assert memory_of(title) == 0
 
 
 def test_measurements_come_between_the_events_of_a_task() -> None:

@@ -94,8 +94,3 @@ def test_a_line_about_one_machine_without_a_price_would_say_nothing() -> None:
         lines.append(view.line())
     hours = "2.00 machine hours, 2.00 machine hours idle, 0.00 machine hours lost"
     assert lines[:2] == ["", hours] and lines[2].startswith("3,600.00 ")
-
-
-def test_runs_of_older_versions_have_no_account() -> None:
-    state = after((0, BEGAN), (1, started(COARSE)), (2, TaskFailed(COARSE, 1, "no", final=False)))
-    assert not state.money.machines
