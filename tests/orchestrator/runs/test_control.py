@@ -233,8 +233,6 @@ def test_a_machine_in_quarantine_is_released_by_its_host_or_the_begin_of_its_id(
 
 
 class Listening(Harness):
-    """A job whose drivers accept requests, and workers that yield on request."""
-
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         control.begin(self.folder)
@@ -245,7 +243,6 @@ class Listening(Harness):
             control.send(self.folder, action, block)
 
     def trains(self, spec: TaskSpec, iterations: int = 50) -> Iterator[Event]:
-        """All goes well, slowly."""
         for i in range(iterations if spec.task.stage is Stage.BLOCK else 0):
             yield Progress(spec.task, i, iterations, 1.0)
             if spec.task in self.pool.stopped:

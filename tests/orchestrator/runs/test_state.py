@@ -47,7 +47,6 @@ NAMES: dict[
 
 
 def values(kind: Any) -> st.SearchStrategy[Any]:
-    """Any values of a type that a record may have."""
     parts = get_args(kind)
     if kind is TaskId:
         return st.sampled_from(TASKS)
@@ -63,7 +62,6 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
 
 
 def made(kind: Any) -> st.SearchStrategy[Any]:
-    """Any object of a dataclass."""
     of_fields = {name: values(of) for name, of in get_type_hints(kind).items()}
     return st.builds(kind, **of_fields | NAMES.get(kind, {}))
 

@@ -193,8 +193,6 @@ def resumed(root: Path, *limit: object) -> str:
 
 
 class Interrupted(LocalPool):
-    """Ctrl-C when Stage I has ended."""
-
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         if spec.task.stage == Stage.BLOCK:
             raise KeyboardInterrupt

@@ -56,8 +56,6 @@ Share = Callable[[Path], NodeFiles]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Yields(Scripted):
-    """Yields events."""
-
     events: Callable[[], Iterator[Event]]
 
     def run(self) -> Iterator[Event]:

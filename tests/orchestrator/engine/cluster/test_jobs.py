@@ -35,8 +35,6 @@ SMALL = "--device cpu --blocks 2x1x1 --set sky.count=50 --set checkpoint.every=5
 
 
 class Ended(NamedTuple):
-    """How a command has ended in another process; the same names as in typer's `Result`."""
-
     exit_code: int
     stdout: str
     stderr: str
@@ -85,7 +83,6 @@ def over(head: Head, job: str) -> bool:
 
 
 def shown(ended: Any) -> Any:
-    """What it printed as JSON."""
     assert ended.exit_code == 0, ended.output
     return json.loads(ended.stdout)
 

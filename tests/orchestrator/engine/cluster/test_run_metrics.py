@@ -33,7 +33,6 @@ def after(*records: Record) -> tuple[RunState, list[Stored]]:
 
 
 def standing(*records: Record) -> dict[str, float]:
-    """The gauges after those records."""
     found = list(gauges(after(*records)[0]))
     assert {(sample.task, sample.node) for sample in found} <= {(str(BLOCK), "Nürnberg")}
     return {sample.metric: sample.value for sample in found}

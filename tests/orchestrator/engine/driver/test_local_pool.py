@@ -28,7 +28,6 @@ def pool() -> Iterator[LocalPool]:
 
 
 def messages(pool: LocalPool, spec: TaskSpec) -> Iterator[Message]:
-    """The messages of a task on this machine."""
     return scripted.messages(pool, spec, Placement(pool.nodes()[0].id, cpus=1.0, memory=2**30))
 
 

@@ -60,7 +60,6 @@ def run(*records: Record, nodes: tuple[Node, ...] = (A, B)) -> RunState:
 
 
 def review(state: RunState, now: float, nodes: tuple[Node, ...] = (A, B)) -> RunState:
-    """The state after it was decided which nodes are in quarantine."""
     for change in quarantine.changes(state, nodes, CONFIG, now):
         state = apply(state, [Stored(0, now, change)])
     return state
@@ -71,7 +70,6 @@ def fails(*tasks: int, node: Node = A, **rest: Any) -> list[Record]:
 
 
 def saves(node: Node, card: str = "") -> list[Record]:
-    """A success there."""
     return [replace(started(BLOCKS[8], node=node.id), card=card), CheckpointSaved(BLOCKS[8], 5, "c", 1)]
 
 
