@@ -62,8 +62,6 @@ class Status(StrEnum):
 
 @dataclass(frozen=True)
 class TaskState:
-    """One task."""
-
     id: TaskId
     status: Status = Status.WAITING
     attempts: int = 0  # by the present driver
@@ -100,8 +98,6 @@ class TaskState:
 
 @dataclass(frozen=True)
 class RunState:
-    """The whole run."""
-
     tasks: dict[TaskId, TaskState] = field(default_factory=dict)
     plan: tuple[BlockPlan, ...] | None = None
     blocks: tuple[TaskId, ...] = ()  # those to train, longest first
@@ -140,7 +136,6 @@ class RunState:
         return self.tasks.get(id) or TaskState(id)
 
     def status(self, id: TaskId) -> Status:
-        """How a task stands."""
         return known.status if (known := self.tasks.get(id)) else Status.WAITING
 
     def failed_blocks(self) -> tuple[int, ...]:
@@ -148,7 +143,6 @@ class RunState:
         return tuple(b.block for b in self.plan or () if self.status(TaskId.block(b.block)) == Status.FAILED)
 
     def quarantined(self) -> tuple[machines.NodeState, ...]:
-        """The nodes in quarantine, by host."""
         return machines.by_host(node for node in self.nodes.values() if node.until is not None)
 
     def leaving(self) -> tuple[machines.NodeState, ...]:

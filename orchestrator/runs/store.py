@@ -218,7 +218,6 @@ class Database:
         return _stored(self._connection.execute(f"{_STATE} UNION ALL {_PROGRESS} ORDER BY id"))
 
     def close(self) -> None:
-        """Lets go of the file."""
         self._connection.close()
 
 

@@ -102,7 +102,6 @@ class Agents:
                 del self._known[id]
 
     def close(self) -> None:
-        """Ends all of them."""
         self._watch.close()
         for known in self._known.values():
             ray.kill(known.actor)

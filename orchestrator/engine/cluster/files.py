@@ -64,7 +64,6 @@ class Stamp:
         return cls(stat.st_size, stat.st_mtime_ns if dated else None)
 
     def fits(self, path: Path) -> bool:
-        """Whether `path` is that file."""
         return path.is_file() and self == Stamp.of(path, dated=self.modified is not None)
 
 
@@ -95,7 +94,6 @@ class RayValue(Generic[T]):
     home: str  # Ray's id of the driver's machine
 
     def load(self) -> T:
-        """The value; the machine's store keeps it while it has room."""
         if _here() != self.home:
             copies = get_object_locations([self.ref]).get(self.ref, {})
             if _here() not in copies.get("node_ids", ()):
@@ -181,10 +179,6 @@ class FileSharing:
         )
 
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> NodeFiles:
-        """What finds files of the scene, and files that the run has made.
-
-        Raises OSError if one of them is gone.
-        """
         if self._server is None:
             self._process.unlink(missing_ok=True)
             here = NodeAffinitySchedulingStrategy(self._home, soft=False)

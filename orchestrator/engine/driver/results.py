@@ -28,8 +28,6 @@ Deliver = Callable[[Job], list[Record]]
 
 
 class Results:
-    """Makes those of one job."""
-
     def __init__(self, job: Job, later: Callable[[], Specs], on_plan: OnPlan, deliver: Deliver) -> None:
         """Args: later, the specs after Stage I; on_plan is called with the plan and (N, 3) means of Stage I
         before plan.json is written; deliver makes the files for viewers and returns their records.

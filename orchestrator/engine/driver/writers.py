@@ -49,7 +49,6 @@ class Writers:
 
     @property
     def busy(self) -> bool:
-        """Whether anything is on its way to the disk."""
         return bool(self._jobs)
 
     def announce(self, task: TaskId, size: int) -> None:
@@ -62,11 +61,9 @@ class Writers:
         return set(self._jobs).union(list(self._announced)[room:])
 
     def writes(self, task: TaskId) -> bool:
-        """Whether a message of a task is on its way to the disk."""
         return task in self._jobs
 
     def start(self, event: Checkpoint | Trained) -> None:
-        """Begins to write what an event carries."""
         size = self._announced.pop(event.task, 0)
         self._jobs[event.task] = _Job(event, size, self._threads.submit(self._write, event))
 
@@ -104,7 +101,6 @@ class Writers:
             raise failure
 
     def wait(self, seconds: float) -> None:
-        """Returns when something is written, at the latest after so many seconds."""
         if futures := [job.future for job in self._jobs.values() if job.again is None]:
             wait_for(futures, seconds, FIRST_COMPLETED)
         else:

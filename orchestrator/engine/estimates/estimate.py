@@ -56,7 +56,6 @@ class Estimator:
     nodes: Sequence[Node]
 
     def estimate(self) -> Estimate:
-        """All stages."""
         coarse, block = self._whole + self._sky, self._block[-1][1] + self._frozen_sky
         stages = self._coarse_stages(coarse)
         merged = coarse
@@ -71,7 +70,6 @@ class Estimator:
 
     @cached_property
     def parts(self) -> Parts:
-        """Of the place."""
         return Parts(self.scene, self.config, self.width)
 
     def _coarse_stages(self, gaussians: int) -> list[StageEstimate]:

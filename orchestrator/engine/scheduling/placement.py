@@ -144,7 +144,6 @@ def _for_one_alone(demand: Demand, devices: Sequence[_Device]) -> _Device:
 
 
 def _whole(device: _Device) -> Placement:
-    """All of a device."""
     if device.gpu is None:
         return Placement(device.node.id, device.node.cpus, device.memory)
     return _part(device, 1)

@@ -68,7 +68,6 @@ class StepResult(_Model):
 
 
 def progress_path(folder: RunFolder) -> Path:
-    """Where the progress is."""
     return folder.preparation / "progress.json"
 
 

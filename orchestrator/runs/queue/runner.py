@@ -44,8 +44,6 @@ _Answer = TypeVar("_Answer")
 
 @dataclass(frozen=True)
 class Limits:
-    """What a runner may do."""
-
     at_once: int = 1  # runs side by side
     forever: bool = False  # wait for new entries when none is left
     program: tuple[str, ...] = PROGRAM  # that takes the words of an entry
@@ -106,7 +104,6 @@ class _Runner:
     failed: bool = False  # a run has
 
     def run(self) -> int:
-        """As the function."""
         self._written(self.queue.forget_waits)  # of a runner before
         for entry in self._written(self.queue.running):
             self.live[entry.id] = _Live(entry, None)  # until it is seen that it is not

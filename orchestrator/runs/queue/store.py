@@ -102,7 +102,6 @@ class Queue:
         return int(self._connection.execute("PRAGMA user_version").fetchone()[0])
 
     def close(self) -> None:
-        """Lets go of the files."""
         self._connection.close()
 
     def add(self, command: Command) -> int:

@@ -56,8 +56,6 @@ class Removal:
 
 @dataclass(frozen=True)
 class Survey:
-    """What may be removed of one run."""
-
     root: Path | StoreUrl
     removals: tuple[Removal, ...] = ()
     skipped: str = ""  # why the run is left as it is

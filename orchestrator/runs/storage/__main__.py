@@ -32,7 +32,6 @@ _PATIENCE_S = 30.0  # of one request: the mirror itself tries again
 
 
 def main() -> None:
-    """Runs the process."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     line = sys.stdin.readline()

@@ -67,7 +67,6 @@ class Mirror:
 
     @property
     def state(self) -> MirrorState:
-        """How far it is."""
         return self._state
 
     def follow(self, ended: threading.Event, stop: threading.Event, period: float, patience: float) -> None:

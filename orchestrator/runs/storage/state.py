@@ -32,7 +32,6 @@ class MirrorState:
 
     @property
     def line(self) -> str:
-        """It in one line, for people."""
         if self.complete:
             return f"all of the run is in {self.url}"
         left = f"{self.pending_files:,} files ({gib(self.pending_bytes)}) to go" if self.pending_files else ""
