@@ -199,7 +199,7 @@ class Interrupted(LocalPool):
         super().start(placement, spec)
 
 
-def test_a_run_in_a_store_goes_on_in_an_empty_folder(
+def test_a_run_in_a_store_continues_in_an_empty_folder(
     runs: tuple[Path, Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PANOLOG_STORE_CACHE", str(tmp_path / "cache"))

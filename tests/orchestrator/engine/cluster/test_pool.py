@@ -92,7 +92,7 @@ def test_a_machine_with_another_version_does_not_train(
     assert failed.reason.endswith("not 0123456789ab): install the same version on all machines")
 
 
-def test_a_kill_for_want_of_memory_is_told_from_others(
+def test_a_kill_for_want_of_memory_is_known_among_others(
     pool: RayPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What others are is shown by a task that crashes on its GPU."""

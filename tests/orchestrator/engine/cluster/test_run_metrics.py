@@ -78,7 +78,7 @@ class Fake:
     inc = set
 
 
-def test_gauges_are_told_again_and_counters_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gauges_are_set_again_and_counters_once(monkeypatch: pytest.MonkeyPatch) -> None:
     made: dict[str, Fake] = {}
 
     def make(name: str, description: str, tag_keys: tuple[str, ...]) -> Fake:
