@@ -107,7 +107,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
     folder = tmp_path_factory.mktemp("recovery")
     scene = make_town(folder / "town", panoramas=9, width=64, points=300)
     calm, killed = folder / "calm", folder / "killed"
-    command = [sys.executable, "-c", SCRIPT, json.dumps(ACCIDENTS), "run", scene, "-o", killed, *SETTINGS]
+    command = [sys.executable, "-c", SCRIPT, json.dumps(ACCIDENTS), "run", str(scene), "-o", str(killed)]
+    command += SETTINGS
     with subprocess.Popen(command, stdout=PIPE, stderr=PIPE, text=True, start_new_session=True) as process:
         with local_pool() as pool:
             session.start(scene, calm, load_config(sets=SETS), None, ignore, pool)
