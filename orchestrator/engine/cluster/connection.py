@@ -58,7 +58,6 @@ def connect(address: str | None, root: Path, nice: int | None = None) -> Iterato
 
 @contextmanager
 def _joined(address: str) -> Iterator[None]:
-    """A cluster's Ray."""
     try:
         _join(address)
         yield

@@ -68,15 +68,19 @@ def test_nothing_is_left_and_workers_have_the_priority_that_is_wanted(
     assert not [path for path in shared if Path(path).exists()]
 
 
-def test_nice_is_refused_with_a_cluster(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--nice 5: only for runs on this machine"):
-        connect("auto", tmp_path, nice=5).__enter__()
-
-
-def test_a_priority_that_is_no_number_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("address", "nice", "why"),
+    [
+        ("auto", 5, "--nice 5: only for runs on this machine"),
+        (None, None, "^RAY_worker_niceness=low: give a number from 0 to 19"),
+    ],
+)
+def test_a_priority_that_cannot_be_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, address: str | None, nice: int | None, why: str
+) -> None:
     monkeypatch.setenv("RAY_worker_niceness", "low")
-    with pytest.raises(ConfigError, match=r"^RAY_worker_niceness=low: give a number from 0 to 19"):
-        connect(None, tmp_path).__enter__()
+    with pytest.raises(ConfigError, match=why):
+        connect(address, tmp_path, nice=nice).__enter__()
 
 
 @pytest.mark.parametrize("slow", [1, 3])
