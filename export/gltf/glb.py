@@ -41,14 +41,12 @@ def write_glb(path: StrPath, source: SplatSource, compression: Compression = "sp
     """Writes Gaussians as a GLB, atomically.
 
     Args:
-        path: the file to appear.
         source: what to write, y up.
         compression: "spz" is what CesiumJS needs, a tenth of the bytes, and keeps 65 bytes of each Gaussian
             in memory. None is 240 bytes of each, reads the source twice, and keeps nothing.
 
-    Raises:
-        FormatError: there is no Gaussian, the GLB would have 4 GiB, or the model is larger than SPZ can hold.
-        OSError: the file cannot be written.
+    Raises FormatError: there is no Gaussian, the GLB would have 4 GiB, or the model is larger than SPZ can
+    hold; OSError: the file cannot be written.
     """
     with atomic(Path(path)) as temporary, temporary.open("wb") as file:
         encode_glb(file, source, compression)

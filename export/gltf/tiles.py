@@ -57,9 +57,8 @@ def write_tiles(
             the source has its origin.
         side, most, levels: as of `Detail`.
 
-    Raises:
-        FormatError: the folder exists already, there is no Gaussian, or `to_ecef` is no rigid transform.
-        OSError: the files cannot be written.
+    Raises FormatError: the folder exists already, there is no Gaussian, or `to_ecef` is no rigid transform;
+    OSError: the files cannot be written.
     """
     folder = Path(folder)
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):

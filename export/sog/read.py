@@ -62,10 +62,8 @@ def read_sog(path: StrPath) -> Splats:
     """All Gaussians of a SOG, in its order.
 
     Args: path of a .sog, of a folder with meta.json, or of this meta.json.
-
-    Raises:
-        FormatError: it is missing, damaged, of an unknown version, or holds more than `MOST` Gaussians.
-        OSError: it cannot be read.
+    Raises FormatError: it is missing, damaged, of an unknown version, or holds more than `MOST` Gaussians;
+    OSError: it cannot be read.
     """
     path = Path(path)
     if not path.is_file() and not path.is_dir():

@@ -30,10 +30,8 @@ def read_streamed(path: StrPath, level: int = 0) -> Splats:
     """The Gaussians of one level, file after file; what is in `env/` is not among them: `read_sog` reads it.
 
     Args: path of a folder with lod-meta.json, or of this file; level, 0 is the finest one.
-
-    Raises:
-        FormatError: it is missing or damaged, has no Gaussians of this level, or more than `MOST`.
-        OSError: it cannot be read.
+    Raises FormatError: it is missing or damaged, has no Gaussians of this level, or more than `MOST`;
+    OSError: it cannot be read.
     """
     path = Path(path)
     index = path if path.suffix.lower() == ".json" else path / INDEX

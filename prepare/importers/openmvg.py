@@ -67,8 +67,7 @@ def assemble(
 ) -> ImportedScene:
     """The scene of two parts of an sfm_data without structure.
 
-    Raises:
-        SceneError: what is wrong with it, with file and field.
+    Raises SceneError: what is wrong with it, with file and field.
     """
     return _assemble(views, extrinsics, None, _Structure(views.path, 0), folders, cloud)
 

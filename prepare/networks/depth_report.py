@@ -99,9 +99,7 @@ def align_depth_maps(scene: Scene, progress: Progress) -> list[MapAlignment]:
     """Aligns each depth map of the scene at its own size, as training does with its default settings.
 
     Args: progress, called after each map.
-
-    Raises:
-        InputError: a layer cannot be decoded.
+    Raises InputError: a layer cannot be decoded.
     """
     found = []
     rows = [row for row, panorama in enumerate(scene.panoramas) if panorama.depth is not None]

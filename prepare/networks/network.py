@@ -161,8 +161,7 @@ def providers(device: str, available: Sequence[str], *, tensorrt: bool) -> list[
     Args: device, "auto" or one of DEVICES; available, what onnxruntime was built with; tensorrt, whether its
     library is installed: builds for GPUs name it in any case.
 
-    Raises:
-        DeviceError: there is no such device, or this onnxruntime does not know it.
+    Raises DeviceError: there is no such device, or this onnxruntime does not know it.
     """
     if device != "auto" and device not in DEVICES:
         raise DeviceError(f"--device {device}: choose auto, {', '.join(DEVICES)}")

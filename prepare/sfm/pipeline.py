@@ -159,8 +159,7 @@ def panoramas_in_folder(source: Path) -> tuple[tuple[PanoramaFile, ...], LayerFi
 
     A picture NAME_mask.png next to NAME.jpg is its mask.
 
-    Raises:
-        SceneError: there is no such folder, there are fewer than two panoramas, or their names collide.
+    Raises SceneError: there is no such folder, there are fewer than two panoramas, or their names collide.
     """
     if not source.is_dir():
         raise SceneError(f"{source}: there is no such folder or video")
