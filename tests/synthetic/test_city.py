@@ -124,17 +124,6 @@ def test_leaving_out_what_is_hidden_changes_no_ray(
     np.testing.assert_array_equal(culled.shape, every.shape)
 
 
-def test_leaving_out_what_is_small_changes_few_rays(scenery: Scenery, centers: NDArray[np.float64]) -> None:
-    """Those that met a shape of less than half a pixel, which are scattered: here 0.2 %."""
-    rays = PanoramaRays(np.eye(3), centers[130], 128, 3)
-    smallest = np.pi / 128
-    every, coarse = scenery.cast(rays), scenery.cast(rays, smallest)
-    other = np.flatnonzero(coarse.shape != every.shape)
-    assert 0 < len(other) < 0.004 * len(every.shape)
-    away = np.array([np.linalg.norm(scenery.shapes[i].center - centers[130]) for i in every.shape[other]])
-    assert (2 * np.array([scenery.shapes[i].radius for i in every.shape[other]]) < smallest * away).all()
-
-
 @pytest.mark.parametrize(("near", "far", "agree"), [(0, 40, 0.97), (100, 200, 0.9)])
 def test_shadows_are_where_the_sun_is_hidden(
     scenery: Scenery, centers: NDArray[np.float64], near: float, far: float, agree: float

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.export.sog.palette import MOST, Palette, make_palette, palette_size, step_of, units
+from panolog.export.sog.palette import Palette, make_palette, step_of, units
 from tests.export.sog.models import splats
 
 
@@ -17,11 +17,6 @@ def made(model: NDArray[np.float32], weights: NDArray[np.float32], size: int, th
     step = step_of(model)
     with ThreadPoolExecutor(threads) as pool:
         return make_palette(units(model, step), step, weights, size, pool)
-
-
-def test_size_grows_with_the_model() -> None:
-    sizes = {1: 1, 30: 30, 1000: 1000, 3000: 1024, 10**5: 3136, 10**8: MOST}
-    assert {count: palette_size(count) for count in sizes} == sizes
 
 
 def test_it_is_near_the_best_of_k_means() -> None:

@@ -15,7 +15,7 @@ from panolog.prepare.networks.depth_maps import DepthJob, make_depth, plan_depth
 from panolog.prepare.networks.inverse_depth import FULL, NEAREST, match_scale
 from panolog.prepare.networks.manifest import Input
 from panolog.prepare.networks.seam import blend
-from panolog.prepare.panorama_files import PanoramaFile, list_posed_panoramas
+from panolog.prepare.panorama_files import list_posed_panoramas
 from panolog.prepare.provenance import Provenance, is_user_file, read_provenance
 from panolog.scene.errors import InputError, PanologError
 from panolog.scene.read import read_scene
@@ -300,12 +300,6 @@ def test_pictures_that_cannot_be_are_named(scene: Path) -> None:
     path.unlink()
     with pytest.raises(InputError, match=r"1\.png: the model names this image"):
         list_posed_panoramas(scene)
-
-
-def test_a_picture_is_its_file() -> None:
-    picture = PanoramaFile(Path("/s"), "a/b.jpg", Path("/s/images/a/b.jpg"))
-    assert picture.layer("masks") == Path("/s/masks/a/b.png")
-    assert picture.colmap_layer("masks") == Path("/s/masks/a/b.jpg.png")
 
 
 def test_half_precision(scene: Path) -> None:
