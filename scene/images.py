@@ -262,12 +262,12 @@ def load_view(
     return replace(found, image=torch.from_numpy(image))
 
 
-def load_layers(panorama: Panorama, row: int, width: int, locate: Locate = here) -> View:
+def load_layers(panorama: Panorama, row: int, width: int) -> View:
     """As `load_view`, but without the picture: `image` has no pixels."""
-    opaque = decode_used(locate(panorama.image)) if panorama.transparent else None
+    opaque = decode_used(panorama.image) if panorama.transparent else None
     if opaque is not None:
         opaque = resize_used(opaque, (width, width // 2))
-    return _load_layers(panorama, row, width, DecodedLayers(locate=locate), opaque)
+    return _load_layers(panorama, row, width, DecodedLayers(), opaque)
 
 
 def _load_layers(

@@ -69,7 +69,7 @@ def read_sog(path: StrPath) -> Splats:
     if not path.is_file() and not path.is_dir():
         raise FormatError(f"{path}: there is no SOG; give a .sog file, or a folder with meta.json")
     if path.name == INDEX or ((path / INDEX).is_file() and not (path / META).is_file()):
-        raise FormatError(f"{path}: a SOG that streams has many files; read_streamed reads one level of them")
+        raise FormatError(f"{path}: a SOG that streams has many files; give the folder of one of them")
     if path.is_dir():
         files: Folder | Archive = Folder(path)
     else:

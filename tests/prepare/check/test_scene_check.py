@@ -233,5 +233,6 @@ def test_shared_scenes_are_sound(name: str, tracks: bool) -> None:
     few = replace(scene, panoramas=some, train=tuple(range(len(some))), test=())
     found = check_scene(few if tracks else without_tracks(few))
     assert found.problems == ()
+    assert (found.reprojection_px is not None) == tracks
     assert found.color_correlation is not None
-    assert found.color_correlation > 0.8
+    assert found.color_correlation > (0.8 if tracks else 0.6)
