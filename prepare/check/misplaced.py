@@ -49,7 +49,7 @@ def find_misplaced(scene: Scene) -> dict[str, str]:
     stray = strays(scene.centers)
     found = {}
     for row, panorama in enumerate(scene.panoramas):
-        if _is_off(apart[row], apart):
+        if np.isfinite(apart[row]) and apart[row] > max(_OFF, _TIMES * float(np.nanmedian(apart))):
             found[panorama.name] = f"its points are {apart[row]:.0f} px from where it has observed them"
         elif _fits_nowhere(fits[row], fits[:, 0]):
             others = np.nanmedian(fits[:, 0])
@@ -67,10 +67,6 @@ def misplaced_lines(found: dict[str, str]) -> list[str]:
     if len(lines) <= _NAMED:
         return lines
     return [*lines[:_NAMED], f"pose: {len(lines) - _NAMED} more are not: {', '.join(list(found)[_NAMED:])}"]
-
-
-def _is_off(apart: float, every: Array) -> bool:
-    return bool(np.isfinite(apart) and apart > max(_OFF, _TIMES * float(np.nanmedian(every))))
 
 
 def _fits_nowhere(fit: Array, every: Array) -> bool:

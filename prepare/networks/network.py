@@ -88,7 +88,8 @@ class Network:
         options = runtime.SessionOptions()
         options.log_severity_level = _FATAL
         runtime.set_default_logger_severity(_FATAL)
-        wanted = providers(device, runtime.get_available_providers(), tensorrt=_has_tensorrt())
+        tensorrt = any(map(importlib.util.find_spec, ("tensorrt", "tensorrt_libs")))
+        wanted = providers(device, runtime.get_available_providers(), tensorrt=tensorrt)
         if len(wanted) > 1:  # the CUDA libraries that came with torch, or with packages of their own
             with contextlib.redirect_stdout(sys.stderr):  # it prints which libraries are missing
                 runtime.preload_dlls()
@@ -211,7 +212,3 @@ def _errors(runtime: Any) -> tuple[type[Exception], ...]:
     members = [getattr(state, name) for name in dir(state)]
     found = [it for it in members if isinstance(it, type) and issubclass(it, Exception)]
     return (*found, ValueError, RuntimeError, MemoryError)
-
-
-def _has_tensorrt() -> bool:
-    return any(importlib.util.find_spec(name) for name in ("tensorrt", "tensorrt_libs"))

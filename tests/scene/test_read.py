@@ -186,14 +186,6 @@ def test_an_image_name_that_is_not_utf8_is_one_clear_line(root: Path, binary: bo
         check_names(root, ["a.jpg", os.fsdecode(b"pan\xf6_3.jpg")])
 
 
-def test_a_comment_that_is_not_utf8_does_no_harm(root: Path) -> None:
-    as_pano360(root)
-    for name in ("cameras", "images", "points3D"):
-        path = root / "sparse" / "0" / f"{name}.txt"
-        path.write_bytes(b"# by J\xfcrgen\n" + path.read_bytes())
-    assert len(read_scene(root).panoramas) == 9
-
-
 def test_the_fingerprint_knows_what_training_depends_on_and_nothing_else(root: Path) -> None:
     seen = {read_scene(root).fingerprint}
     write_image(root / "images" / "stray.jpg", np.random.default_rng(0), (40, 30))

@@ -1,6 +1,5 @@
 """How views get to a GPU: which threads, in which order, how many of them. The GPU is CPU tensors."""
 
-import os
 import threading
 import weakref
 from collections import Counter
@@ -142,16 +141,6 @@ def test_layers_are_decoded_once_although_views_have_no_room(
     none, some, every = found
     assert every == [len(ROWS)] * 3
     assert sum(every) < sum(some) < sum(none)
-
-
-def test_cores_decide_how_many_threads_decode_for_a_gpu(scene: Scene) -> None:
-    for threads, expected in ((0, 1), (3, 3), (64, images.MOST_THREADS)):
-        with PanoramaCache(
-            scene, ROWS, WIDTH, VIEW, device="cuda", threads=threads, upload=Recorder()
-        ) as cache:
-            assert (cache.threads, cache.ahead(1)) == (expected, expected)
-    with PanoramaCache(scene, ROWS, WIDTH, VIEW, room=100 * VIEW, threads=64) as cache:
-        assert (cache.threads, cache.ahead(3)) == (min(4, os.cpu_count() or 1), 3)
 
 
 def test_a_damaged_image_is_named_by_get_although_it_never_gets_to_the_device(scene: Scene) -> None:

@@ -112,8 +112,7 @@ def test_a_river_lies_below_its_banks_and_is_bridged(scenery: Scenery) -> None:
     assert min(away) > middle  # the bridges' parapets are low
 
 
-@pytest.mark.parametrize("index", [0, 61, 130, 244])
-@pytest.mark.parametrize("width", [64, 100])
+@pytest.mark.parametrize(("index", "width"), [(0, 64), (61, 100), (130, 64), (244, 100)])
 def test_leaving_out_what_is_hidden_changes_no_ray(
     scenery: Scenery, centers: NDArray[np.float64], index: int, width: int
 ) -> None:

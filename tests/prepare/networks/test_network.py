@@ -1,6 +1,5 @@
 """Where a network runs, and what is said of files that are none. Nothing here needs a GPU."""
 
-import hashlib
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ import onnxruntime
 import pytest
 
 from panolog.prepare.networks.manifest import DepthManifest, read_manifest
-from panolog.prepare.networks.network import Network, digest, providers
+from panolog.prepare.networks.network import Network, providers
 from panolog.scene.errors import InputError
 from tests.prepare.networks.networks import given, red_depth
 
@@ -89,17 +88,6 @@ def test_without_onnxruntime_it_says_what_to_install(model: Path, monkeypatch: p
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(InputError, match="pip install onnxruntime"):
         opened(model)
-
-
-def test_the_key_is_of_all_bytes(tmp_path: Path) -> None:
-    first, second = tmp_path / "a", tmp_path / "b"
-    first.write_bytes(b"ab")
-    second.write_bytes(b"c")
-    before = digest(first, second)
-    first.write_bytes(b"a")
-    second.write_bytes(b"bc")
-    assert len(before) == 64 and digest(first, second) != before
-    assert digest(first) == hashlib.sha256(hashlib.sha256(b"a").digest()).hexdigest()
 
 
 MUTATE = """
