@@ -17,7 +17,7 @@ from panolog.export.sog.write import write_sog
 from panolog.export.splats import InMemory
 from panolog.export.spz import write_spz
 from panolog.scene.errors import FormatError
-from tests.damage import mutated
+from tests.data import mutated
 from tests.export.gaussians import line_of, scattered
 from tests.export.sog.models import write_unpacked
 

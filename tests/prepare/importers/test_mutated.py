@@ -11,7 +11,7 @@ from panolog.prepare.importers.import_scene import FORMATS
 from panolog.prepare.importers.interface import ImportedScene
 from panolog.scene.colmap import read_colmap
 from panolog.scene.errors import InputError
-from tests.damage import mutated
+from tests.data import mutated
 from tests.prepare.importers.writers import WRITERS
 from tests.scenes import write_scene
 

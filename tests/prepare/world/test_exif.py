@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from panolog.prepare.world.exif import Attitude, Crop, Exif, GpsFix, read_exif
 from panolog.scene.errors import InputError
-from tests.damage import mutated
+from tests.data import mutated
 from tests.prepare.world.stills import BASE, CAMERA, GPS, PLACE, SUFFIXES, crop, gpano, write_still
 
 FIX = GpsFix(47 + 22 / 60 + 39.12 / 3600, 8 + 32.5 / 60, 408.5)
