@@ -68,16 +68,13 @@ class _Moved:
 
     @property
     def count(self) -> int:
-        """How many there are."""
         return self.source.count
 
     @property
     def degree(self) -> int:
-        """Of their spherical harmonics."""
         return self.source.degree
 
     def pieces(self) -> Iterator[Splats]:
-        """All of them."""
         for piece in self.source.pieces():
             yield replace(piece, means=(piece.means - self.origin).astype(np.float32))
 
