@@ -11,7 +11,7 @@ import pytest
 from PIL import Image, ImageCms
 
 from panolog.orchestrator.watch.views.site.photographs import small_copy
-from panolog.scene.image_files import decode_colors, decode_panorama, decode_with_alpha
+from panolog.scene.image_files import decode_colors, decode_panorama
 from panolog.scene.pictures.profiles import embedded_profile, to_srgb
 
 ADOBE = ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06))  # chromaticities of Adobe RGB (1998), whose gamma is 2.2
@@ -97,16 +97,6 @@ def test_grey_with_a_gamma_of_its_own(tmp_path: Path) -> None:
     Image.new("L", (64, 32), 64).save(tmp_path / "a.png", icc_profile=grey)
     expected = 255 * (1.055 * (64 / 255) ** (1 / 2.4) - 0.055)
     assert np.abs(decode_panorama(tmp_path / "a.png")[3, 5] - expected).max() <= 2
-
-
-def test_what_is_transparent_and_what_is_mixed(tmp_path: Path) -> None:
-    pixels = np.zeros((32, 64, 4), np.uint8)
-    pixels[:, :, :3] = in_adobe(SHOWN, 255)
-    pixels[:, 32:, 3] = 255
-    Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=profile())
-    found, used = decode_with_alpha(tmp_path / "a.png")
-    assert used is not None and used[:, 32:].all() and not used[:, :32].any()
-    assert np.abs(found[3, 50].astype(int) - SHOWN).max() <= 2
 
 
 def test_profiles_that_change_nothing_or_are_damaged() -> None:
