@@ -139,7 +139,7 @@ def test_frames_that_none_refer_to_are_left_out_of_large_videos(
 @pytest.mark.parametrize("colours", ["bt709", "bt601", "bt2020"])
 @pytest.mark.parametrize("encoding", [H264, H265_10], ids=["8", "10"])
 def test_colours_are_those_of_the_tags(colours: str, range_: str, encoding: Encoding, tmp_path: Path) -> None:
-    frames = known_frames(2, encoding.bits)
+    frames = known_frames(6, encoding.bits)
     path = write_clip(tmp_path / "clip.mp4", frames, encoding, colours=colours, range_=range_)
     others = [(it, kind) for it in _LUMA for kind in ("limited", "full") if (it, kind) != (colours, range_)]
     with open_video(path) as video:
