@@ -58,13 +58,11 @@ class Video:
         """Decodes the first frame and checks how it lies on the sphere.
 
         Args:
-            path, container: the open file.
             ahead: a thread that decodes the next frame while the last one is used.
             effort: what decoding may leave out.
 
-        Raises:
-            SceneError: there is no frame, or it is no panorama of a usable size.
-            OSError: the file cannot be read.
+        Raises SceneError: there is no frame, or it is no panorama of a usable size; OSError: the file cannot
+        be read.
         """
         self.path = path
         self.decoded = 0  # frames so far
@@ -251,8 +249,7 @@ def open_video(path: Path, effort: Effort = "exact") -> Iterator[Video]:
     Args: effort, "exact" decodes all frames in one thread, so that damaged ones are the same each time.
         "chosen" decodes in several threads, and of large videos no frames that no others refer to, most of
         which are coded worst. "draft" also leaves out what smooths the borders of blocks in large ones.
-    Raises:
-        SceneError: it is missing, cannot be opened, is no panorama, or its width is out of bounds.
+    Raises SceneError: it is missing, cannot be opened, is no panorama, or its width is out of bounds.
     """
     if not path.is_file():
         raise SceneError(f"{path}: there is no such video")
@@ -294,8 +291,7 @@ def _video_stream(path: Path, container: av.container.InputContainer, effort: Ef
 def video_digest(path: Path) -> str:
     """Identifies a video by its size and three samples, also after it is moved or copied.
 
-    Raises:
-        SceneError: it cannot be read.
+    Raises SceneError: it cannot be read.
     """
     try:
         size = path.stat().st_size
