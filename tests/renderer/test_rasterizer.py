@@ -9,14 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from panolog.renderer import _core
+from panolog.renderer import _core, ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.motion import MOTION_SUMS
 from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians
 from tests.on_device import needs_a_card, on_all_devices
 from tests.renderer.agreement import IMAGES, NEAR, Truth, certain, check_definition, random_weights, truth_of
-from tests.renderer.hard_scenes import as_leaves, camera, cloud, placed, scenes, wide
+from tests.renderer.cuda.machine import arguments
+from tests.renderer.hard_scenes import as_leaves, camera, cloud, directions, placed, scenes, wide
 from tests.renderer.reference import render_reference, rows_of
 from tests.renderer.reference_rays import pixel_rays
 
@@ -241,12 +242,20 @@ def test_a_broken_gaussian_is_reported_and_harms_no_other(parameter: str, value:
         assert not leaf.grad[7].any(), name
 
 
-def test_the_near_cut_hides_what_is_closer() -> None:
-    at = Camera(torch.eye(3), torch.zeros(3), 64, 32)
-    scene = cloud(1)
-    at_distance_two = scene.with_tensors(scene.tensors() | {"means": torch.tensor([[0.0, 0.0, 2.0]])})
-    assert render(at_distance_two, at, near=1.9).visible.all()
-    assert not render(at_distance_two, at, near=2.1).visible.any()
+def test_an_exact_gaussian_that_reaches_a_pole_is_tested_in_few_rows() -> None:
+    at, count = camera(256), 400
+    rng = torch.Generator().manual_seed(3)
+    below, sign = (
+        0.01 * torch.rand(count, generator=rng),
+        torch.where(torch.arange(count) % 2 == 0, 1.0, -1.0),
+    )
+    where = directions(torch.rand(count, generator=rng) * 6.28, sign * (math.pi / 2 - below))
+    scene = replace(placed(count, where, at, -4.5), exact=True)
+    splats = ops.rasterize(**arguments(scene, at))[4].view(-1, 16)
+    rows, columns = splats[:, 12], splats[:, 15]  # half of each: SplatOf in csrc/formulas.h
+    around = columns >= at.width
+    assert around.sum() > count / 4
+    assert float(rows[around].max()) < at.height / 8
 
 
 @pytest.mark.system
