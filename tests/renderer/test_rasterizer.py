@@ -222,7 +222,7 @@ def test_gradients_of_many_are_those_of_the_few_that_are_seen(exact: bool, instr
 
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-BROKEN = [(name, value) for name in PARAMETERS for value in (math.nan, math.inf, -math.inf)]
+BROKEN = [(name, value) for name in PARAMETERS for value in (math.nan, math.inf)]
 
 
 @both

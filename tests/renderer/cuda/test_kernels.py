@@ -35,6 +35,7 @@ from tests.renderer.hard_scenes import camera, cloud, directions, placed, scenes
 
 pytestmark = pytest.mark.system
 
+NIGHTLY = pytest.mark.nightly
 SCENES = [(name, exact) for exact in (False, True) for name in scenes(camera(), exact)]
 NAMES = [f"{name}, exact" if exact else name for name, exact in SCENES]
 both = pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
@@ -42,7 +43,7 @@ both = pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
 
 MACHINES = (
     "emulation",
-    *(pytest.param(name, marks=pytest.mark.nightly) for name in PROGRAMS),  # each takes a minute
+    *(pytest.param(name, marks=NIGHTLY) for name in PROGRAMS),  # each takes a minute
     pytest.param("card", marks=ON_A_CARD),
 )
 
@@ -96,7 +97,8 @@ OWN = {  # rows of those that train, of all rows by their distance
 
 
 @pytest.mark.parametrize(
-    ("width", "own"), [(64, "in the cell"), (64, "any"), (202, "in front of the cell"), (202, "any")]
+    ("width", "own"),
+    [(64, "in the cell"), (202, "in front of the cell"), pytest.param(202, "any", marks=NIGHTLY)],
 )
 @pytest.mark.parametrize(("name", "exact"), SCENES, ids=NAMES)
 def test_an_exterior(name: str, exact: bool, width: int, own: str, machine: Machine) -> None:
@@ -217,8 +219,7 @@ def test_rays_meet_the_tiles_that_they_meet_on_the_cpu(name: str, width: int, ma
     check_tiles(machine, scenes(at, True)[name], at)
 
 
-@both
-@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize(("exact", "value"), [(False, math.nan), (True, math.inf)])
 @pytest.mark.parametrize("parameter", ["means", "quats", "scales", "opacities", "sh0", "shN"])
 def test_a_broken_gaussian_harms_no_other(
     parameter: str, value: float, exact: bool, machine: Machine
