@@ -157,15 +157,6 @@ def test_many_batches_in_many_tiles(exact: bool, machine: Machine) -> None:
 
 
 @both
-def test_more_tiles_than_int16_counts(exact: bool, machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = arguments(replace(cloud(60), exact=exact), camera())
-    before = machine.run(launches.rasterize, **given)
-    monkeypatch.setattr(parts, "NARROW_TILES", 0)
-    for one, two in zip(before, machine.run(launches.rasterize, **given), strict=True):
-        assert torch.equal(one, two)
-
-
-@both
 def test_int16_counts_the_tiles_of_4096_by_2048_pixels(
     exact: bool, machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
