@@ -1,5 +1,6 @@
-"""Processes to measure: fresh ones for a function, and their peak memory."""
+"""Processes to measure: fresh ones for a function, their peak memory, files out of the page cache."""
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -28,3 +29,15 @@ def peak_memory() -> int:
     """
     status = Path("/proc/self/status").read_text()
     return int(status.partition("VmHWM:")[2].split()[0]) * 1024
+
+
+def resident_memory() -> int:
+    """Resident set of this process at present, in bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def drop_from_page_cache(path: Path) -> None:
+    """Writes a file's changes to the disk and removes the file from the page cache."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)

@@ -32,6 +32,7 @@ from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
 _BEFORE = (Stage.CALIBRATE, Part.PREFLIGHT)  # of the records of a preflight
+BIN = Path(sys.executable).parent  # the programs of this environment
 
 
 class OneAtATime:

@@ -1,32 +1,23 @@
-"""Cities of more and more panoramas, in districts and blocks of one size: what their largest tasks take.
-
-    python -m benchmarks.cities -o FOLDER [--cities SCENES]
-
-An hour with one core, 25 minutes of it to make the scenes. FOLDER has the pictures of docs/scale.md in the
-end; the tables are printed.
-"""
+"""Cities of more and more panoramas, in districts and blocks of one size: what their largest tasks take."""
 
 import itertools
 import os
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
-from tempfile import TemporaryDirectory
+from typing import Any
 
 from matplotlib.axes import Axes
 
-from benchmarks import report
-from benchmarks.paper.curves import standalone, svg
+from benchmarks.paper.curves import svg
 from benchmarks.runs import history, panolog
 from panolog.orchestrator.engine.estimates.parts import districts_of
 from panolog.orchestrator.engine.estimates.suggestions import DETAIL
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.records import Merged, Progressed, Stored
 from panolog.orchestrator.watch.views.palette import BLOCK_COLORS
-from panolog.scene.files import write_bytes
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_city
@@ -70,6 +61,12 @@ class City:
     panoramas: int
     gaussians: int  # of the merged model
     stages: dict[str, Tasks]
+
+    @staticmethod
+    def parse(found: dict[str, Any]) -> "City":
+        """The inverse of `asdict`."""
+        stages = {name: Tasks(**tasks) for name, tasks in found["stages"].items()}
+        return City(found["panoramas"], found["gaussians"], stages)
 
 
 def cities(disk: Path, scenes: Path, sizes: Sequence[int], size: Size) -> Iterator[City]:
@@ -177,41 +174,3 @@ def pictures(found: Sequence[City]) -> dict[str, str]:
         "city-memory": curve("Peak memory of the largest task", "GiB", "memory", 2**-30),
         "city-iteration": curve("An iteration of the slowest task", "ms", "seconds", 1e3),
     }
-
-
-def tables(found: Sequence[City]) -> str:
-    """Of the largest tasks, and how they grow."""
-    head = ("panoramas", "task", "number", "Gaussians", "peak MiB", "ms of an iteration")
-    cells = [
-        (city.panoramas, NAMES[stage], task.count, task.gaussians, task.memory / 2**20, 1e3 * task.seconds)
-        for city in found
-        for stage, task in city.stages.items()
-    ]
-    ratios = [(NAMES[stage], *growth(found, stage)) for stage in found[0].stages]
-    grown = report.markdown(("the largest city to the smallest", "memory, ×", "time, ×"), ratios)
-    return f"{report.markdown(head, cells)}\n\n{grown}"
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The program; returns its exit code."""
-    parser = report.parser("cities", __doc__)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the pictures")
-    parser.add_argument("--cities", type=Path, help="folder of scenes city-75, ...; missing ones are made")
-    options = parser.parse_args(arguments)
-
-    def work() -> report.Report:
-        size, sizes = Size(512, 150), [75, 300, 1200]
-        if options.quick:
-            size, sizes = Size(64, 6, 12, 6), [12, 24]
-        options.output.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=options.output) as disk:
-            found = list(cities(Path(disk), options.cities or options.output / "scenes", sizes, size))
-        for name, drawn in pictures(found).items():
-            write_bytes(options.output / f"{name}.svg", standalone(drawn).encode())
-        return report.Report({"cities": [asdict(city) for city in found]}, tables(found))
-
-    return report.run("cities", options, work)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

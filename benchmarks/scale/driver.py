@@ -1,0 +1,211 @@
+"""The driver with very many blocks and workers, killed in the middle and resumed."""
+
+import os
+import socket
+import subprocess
+import time
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from benchmarks.processes import in_fresh_process, peak_memory
+from benchmarks.runs import BIN, history
+from benchmarks.scale.simulated_pool import SimulatedPool, grid
+from panolog.orchestrator.engine.driver.driver import Driver
+from panolog.orchestrator.engine.driver.job import Job
+from panolog.orchestrator.engine.driver.journal import Journal
+from panolog.orchestrator.engine.estimates.costs import CostModel, predictor
+from panolog.orchestrator.engine.scheduling.placement import Demand, Running, place
+from panolog.orchestrator.engine.stages.scenes import scene_of
+from panolog.orchestrator.runs import folder as run_folder
+from panolog.orchestrator.runs import info as run_info
+from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.config import PassesConfig, RunConfig
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import SceneRef, read_info
+from panolog.orchestrator.runs.machines.nodes import Gpu, Node, Placement
+from panolog.orchestrator.runs.records import ModelSaved, Progressed, RunBegan, Stored, TaskStarted
+from panolog.orchestrator.runs.state import RunState
+from panolog.orchestrator.runs.store import Database
+from panolog.orchestrator.runs.thinning import DENSE
+from panolog.scene.read import read_scene
+from panolog.synthetic.make import make_town
+from panolog.workers.tasks import Stage, TaskId
+
+_STATUS = 3  # commands, of which the median counts
+_GPUS = 8  # of a node
+_CARD = 80 * 2**30  # bytes
+_WIDTH = 64  # pixels of the town, which is not trained on
+
+
+class _HaltedError(RuntimeError):
+    """Ends a driver in the middle of its run."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """What is simulated."""
+
+    blocks: int
+    workers: int
+    rate: float  # events per second of each worker
+    seconds: float  # of a block's training, on average
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One driver, from the opening of its database to its end."""
+
+    seconds: float
+    full: float  # seconds until as many blocks as there are workers had started; 0 if they never had
+    cpu: float  # seconds, without those of the simulation
+    messages: int  # of progress
+    lost: int  # of them that no observer of the run has seen, or that are not stored though they are kept
+    late: float  # longest wait of a message, seconds
+    turn: float  # most CPU seconds of the driver between two looks for messages
+    memory: float  # peak, 1e6 bytes
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What to start on GPUs when one of them has become free."""
+
+    seconds: float  # of CPU
+    memory: float  # peak of the process, 1e6 bytes
+
+
+@dataclass(frozen=True)
+class DriverScale:
+    """A whole run, by two drivers."""
+
+    load: Load
+    first: Phase  # until half of the blocks were done
+    resumed: Phase
+    status: float  # seconds of the command, the run being halted
+    database: float  # 1e6 bytes at the end
+    decision: Decision
+
+
+class _Watch:
+    """Observes all records, as a display does; ends the driver when so many blocks are done."""
+
+    def __init__(self, workers: int, halt: int | None) -> None:
+        self._workers, self._halt = workers, halt
+        self._begun = time.perf_counter()
+        self._started = self._done = 0
+        self.full = 0.0  # seconds until all workers had work
+        self.seen: Counter[TaskId] = Counter()  # events of progress that came once each and in order
+
+    def show(self, _: RunState, news: Sequence[Stored]) -> None:
+        """Called with what is new. Raises once."""
+        for stored in news:
+            record = stored.record
+            if isinstance(record, Progressed) and record.iteration == self.seen[record.task] + 1:
+                self.seen[record.task] += 1
+            if isinstance(record, TaskStarted | ModelSaved) and record.task.stage is Stage.BLOCK:
+                self._started += isinstance(record, TaskStarted)
+                self._done += isinstance(record, ModelSaved)
+        if self._started >= self._workers and not self.full:
+            self.full = time.perf_counter() - self._begun
+        if self._halt is not None and self._done >= self._halt:
+            self._halt = None
+            raise _HaltedError("half of the blocks are done")
+
+
+def measure(folder: Path, load: Load) -> DriverScale:
+    """Runs `load` in a folder. Raises what the driver raises."""
+    first = in_fresh_process(_drive, folder, load, halt=True)
+    root = folder / "run"
+    command = [str(BIN / "panolog"), "status", str(root), "--json"]
+    status = median(_seconds(command) for _ in range(_STATUS))
+    resumed = in_fresh_process(_drive, folder, load, halt=False)
+    decision = in_fresh_process(decide, load.blocks - load.workers, load.workers)
+    database = RunFolder(root).database.stat().st_size / 1e6
+    return DriverScale(load, first, resumed, status, database, decision)
+
+
+def _seconds(command: Sequence[str]) -> float:
+    began = time.perf_counter()
+    subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
+    return time.perf_counter() - began
+
+
+def _drive(folder: Path, load: Load, *, halt: bool) -> Phase:
+    """One driver, in this process. Raises what it raises, but for the end that it is to have."""
+    root = RunFolder(folder / "run")
+    if halt:
+        prepare(folder, load)
+    pool = SimulatedPool(load.workers, load.rate, load.seconds)
+    watch = _Watch(min(load.workers, load.blocks), load.blocks // 2 if halt else None)
+    began, cpu = time.perf_counter(), time.process_time()
+    info = read_info(root)
+    with lock.hold(root.lock), closing(Database(root.database)) as database:
+        journal = Journal(database, watch.show)
+        journal.record([RunBegan(socket.gethostname(), os.getpid(), resumed=not halt)])
+        try:
+            Driver(Job(root, scene_of(info, root), info.config), journal, pool).run()
+        except _HaltedError:
+            if not halt:
+                raise
+    return Phase(
+        seconds=time.perf_counter() - began,
+        full=watch.full,
+        cpu=time.process_time() - cpu - pool.cpu,
+        messages=sum(pool.sent.values()),
+        lost=0 if halt else sum((pool.sent - watch.seen).values()) + lost(pool.sent, history(root.root)),
+        late=pool.late,
+        turn=pool.turn,
+        memory=peak_memory() / 1e6,
+    )
+
+
+def prepare(folder: Path, load: Load) -> Job:
+    """A run that has not begun, of a town whose panoramas are never read."""
+    scene = read_scene(make_town(folder / "town", panoramas=9, width=_WIDTH, points=300))
+    blocks, passes = str(grid(load.blocks)), PassesConfig()
+    config = RunConfig(width=_WIDTH, device="cpu", blocks=blocks, passes=passes)
+    root = RunFolder(folder / "run")
+    run_folder.make(root.root)
+    reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
+    run_info.write_info(root, run_info.make_info(reference, config))
+    return Job(root, scene, config)
+
+
+def lost(sent: Mapping[TaskId, int], records: Sequence[Stored]) -> int:
+    """How many events of each task, numbered from 1, the history must have, once and in order, and has not.
+
+    These are the first `thinning.DENSE` and the last; of the others it may have any.
+    """
+    seen = defaultdict[TaskId, list[int]](list)
+    for stored in records:
+        record = stored.record
+        if isinstance(record, Progressed) and record.iteration > max(seen[record.task], default=0):
+            seen[record.task].append(record.iteration)
+    return sum(
+        len({*range(1, min(count, DENSE) + 1), count} - {0, *seen[task]}) for task, count in sent.items()
+    )
+
+
+def decide(waiting: int, gpus: int) -> Decision:
+    """Places blocks of different length that wait, where one GPU has become free and the others are busy."""
+    random = np.random.default_rng(0)
+    model = CostModel(scale=7.0)
+    cards = tuple(Gpu("card", _CARD) for _ in range(_GPUS))
+    nodes = [Node(str(i), str(i), 64, 2**39, cards) for i in range(-(-gpus // _GPUS))]
+    demands = [
+        Demand(TaskId.block(block), _CARD // 2 + 1, predictor(model, *random.integers(20, 10**6, 2).tolist()))
+        for block in range(waiting)
+    ]
+    busy = [
+        Running(Placement(node.id, 8.0, _CARD, 1.0, gpu, kind="card"), float(random.uniform(1, 3600)))
+        for node in nodes
+        for gpu in range(_GPUS)
+    ]
+    began = time.process_time()
+    place(demands, nodes, busy[1:], cuda=True)
+    return Decision(time.process_time() - began, peak_memory() / 1e6)
