@@ -22,7 +22,7 @@ from panolog.orchestrator.cli.options import (
     with_preparation,
     with_run_config,
 )
-from panolog.orchestrator.cli.usage import Command, Group
+from panolog.orchestrator.cli.usage import Command, Group, argument, option
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,32 +37,22 @@ app = typer.Typer(
 )
 
 HeadSourceArg = Annotated[
-    str,
-    typer.Argument(
-        metavar="SCENE|IMAGES|VIDEO", help="The scene, a folder of panoramas or a video, on the head node."
-    ),
+    str, argument("SCENE|IMAGES|VIDEO", "The scene, a folder of panoramas or a video, on the head node.")
 ]
-HeadRunArg = Annotated[str, typer.Argument(metavar="RUN", help="Folder of the run on the head node.")]
-HeadRunOption = Annotated[
-    str, typer.Option("--output", "-o", metavar="RUN", help="Folder of the new run on the head node.")
-]
+HeadRunArg = Annotated[str, argument("RUN", "Folder of the run on the head node.")]
+HeadRunOption = Annotated[str, option("RUN", "Folder of the new run on the head node.", "--output", "-o")]
 ServerOption = Annotated[
     str,
-    typer.Option(
+    option(
+        "http://HOST:8265",
+        "URL of the cluster's Ray dashboard, which is its job server.",
         "--address",
-        metavar="http://HOST:8265",
         envvar="RAY_API_SERVER_ADDRESS",
-        help="URL of the cluster's Ray dashboard, which is its job server.",
     ),
 ]
-SecondsArg = Annotated[
-    int, typer.Argument(min=0, max=86_400, metavar="SECONDS", help="Seconds until the machine ends.")
-]
+SecondsArg = Annotated[int, argument("SECONDS", "Seconds until the machine ends.", min=0, max=86_400)]
 NodeOption = Annotated[
-    str,
-    typer.Option(
-        "--node", metavar="ID", help="How the id of the node begins, if this machine has several of Ray's."
-    ),
+    str, option("ID", "How the id of the node begins, if this machine has several of Ray's.", "--node")
 ]
 _LOCAL = "http://127.0.0.1:8265"
 

@@ -1,13 +1,13 @@
 """`panolog export`."""
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Annotated
 
 from panolog.orchestrator.cli.console import print_result, progress_bar, say
 from panolog.orchestrator.cli.options import AnyModelArg, JsonOption
 from panolog.orchestrator.cli.stores import opened
+from panolog.orchestrator.cli.usage import flag, option
 from panolog.scene.errors import InputError
 from panolog.scene.stores.url import is_url
 
@@ -15,38 +15,26 @@ _CHOICE = "What of the model"
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
-def _format(name: str, text: str) -> Any:
-    return typer.Option(f"--{name}", help=text, rich_help_panel="Formats")
-
-
-def _choice(metavar: str, text: str, **limits: Any) -> Any:
-    return typer.Option(metavar=metavar, help=text, rich_help_panel=_CHOICE, **limits)
-
-
-def _place(metavar: str, text: str, **limits: Any) -> Any:
-    return typer.Option(metavar=metavar, help=text, rich_help_panel="Where it is", **limits)
-
+_format = partial(flag, panel="Formats")
+_choice = partial(option, panel=_CHOICE)
+_place = partial(option, panel="Where it is")
 
 Output = Annotated[
-    Path,
-    typer.Option(
-        "--output", "-o", metavar="FILE|FOLDER", help="One file, whose ending says the format; or a folder."
-    ),
+    Path, option("FILE|FOLDER", "One file, whose ending says the format; or a folder.", "--output", "-o")
 ]
-Sog = Annotated[bool, _format("sog", "SOG of PlayCanvas.")]
-Web = Annotated[bool, _format("web", "Streamed SOG with a page that shows it, for any web server.")]
-Spz = Annotated[bool, _format("spz", "SPZ of Niantic.")]
-CompressedPly = Annotated[bool, _format("compressed-ply", "PLY of SuperSplat.")]
-Ply = Annotated[bool, _format("ply", "PLY of all trainers, turned upright for viewers.")]
-Glb = Annotated[bool, _format("glb", "glTF with KHR_gaussian_splatting.")]
-Tiles = Annotated[bool, _format("3dtiles", "3D Tiles for globes such as Cesium.")]
-SkyImage = Annotated[bool, _format("sky-image", "The sky as a panorama: sky.jpg and sky.exr.")]
-WithoutSky = Annotated[bool, typer.Option("--without-sky", help="The scene alone.", rich_help_panel=_CHOICE)]
+Sog = Annotated[bool, _format("SOG of PlayCanvas.", "--sog")]
+Web = Annotated[bool, _format("Streamed SOG with a page that shows it, for any web server.", "--web")]
+Spz = Annotated[bool, _format("SPZ of Niantic.", "--spz")]
+CompressedPly = Annotated[bool, _format("PLY of SuperSplat.", "--compressed-ply")]
+Ply = Annotated[bool, _format("PLY of all trainers, turned upright for viewers.", "--ply")]
+Glb = Annotated[bool, _format("glTF with KHR_gaussian_splatting.", "--glb")]
+Tiles = Annotated[bool, _format("3D Tiles for globes such as Cesium.", "--3dtiles")]
+SkyImage = Annotated[bool, _format("The sky as a panorama: sky.jpg and sky.exr.", "--sky-image")]
+WithoutSky = Annotated[bool, flag("The scene alone.", "--without-sky", panel=_CHOICE)]
 Degree = Annotated[int, _choice("0..3", "Degree of spherical harmonics.", min=0, max=3)]
 MinOpacity = Annotated[float, _choice("0..1", "Leave out what is fainter.", min=0, max=0.999)]
 Crop = Annotated[
-    str | None,
-    _choice("X,Y,Z,X,Y,Z", "Lower and upper corner of what is kept, in the model's coordinates."),
+    str | None, _choice("X,Y,Z,X,Y,Z", "Lower and upper corner of what is kept, in the model's coordinates.")
 ]
 Levels = Annotated[
     int | None,

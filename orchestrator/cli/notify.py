@@ -8,7 +8,7 @@ import typer
 
 from panolog.orchestrator.cli.console import say
 from panolog.orchestrator.cli.options import NotifyOption
-from panolog.orchestrator.cli.usage import Command, Group
+from panolog.orchestrator.cli.usage import Command, Group, argument
 from panolog.scene.errors import ConfigError
 
 app = typer.Typer(cls=Group, no_args_is_help=True, help="Notifications of runs: test.")
@@ -21,7 +21,7 @@ def _notify() -> None:
 
 @app.command(cls=Command)
 def test(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that the message names.")] = Path(),
+    run: Annotated[Path, argument("RUN", "Folder that the message names.")] = Path(),
     notify: NotifyOption = None,
 ) -> None:
     """Send a test message to the targets of --notify and of PANOLOG_NOTIFY."""
