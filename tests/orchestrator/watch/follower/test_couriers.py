@@ -122,12 +122,6 @@ def test_what_was_before_is_no_news_to_a_new_target(tmp_path: Path) -> None:
     assert post.taken == ["r-preempted-5"]
 
 
-def test_another_run_in_the_same_folder_begins_anew(tmp_path: Path) -> None:
-    deliver(tmp_path, Post(), notice(1))
-    deliver(tmp_path, post := Post(), notice(1), run="other")
-    assert post.taken == ["r-preempted-1"]
-
-
 def test_of_many_notifications_the_end_still_arrives(tmp_path: Path) -> None:
     post = Post()
     deliver(tmp_path, post, *(notice(number) for number in range(1, 301)), notice(999, Kind.FAILED))
@@ -136,9 +130,13 @@ def test_of_many_notifications_the_end_still_arrives(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"{", b"[]", b'{"run": "run", "delivered": 3, "since": "x"}', b"[" * 9999]
+    "content",
+    [
+        *(b"", b"{", b"[]", b'{"run": "run", "delivered": 3, "since": "x"}', b"[" * 9999),
+        b'{"run": "other", "delivered": ["r-preempted-1"]}',
+    ],
 )
-def test_a_damaged_ledger_counts_as_none(tmp_path: Path, content: bytes) -> None:
+def test_a_ledger_that_is_damaged_or_of_another_run_counts_as_none(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "ledger.json").write_bytes(content)
     deliver(tmp_path, post := Post(), notice(1))
     assert post.taken == ["r-preempted-1"]

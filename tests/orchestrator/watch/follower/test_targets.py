@@ -89,27 +89,44 @@ def test_what_is_no_target_is_refused_without_its_secret(given: str, expected: s
         ("", 0o600, "is empty"),
         ("x" * 70_000, 0o600, "more than 65536 bytes"),
         (f"slack:{SLACK} nonsense:{SECRET}", 0o600, "with one of the kinds"),
+        (" ".join(f"webhook:https://h{number}.example/" for number in range(21)), 0o600, "give at most 20"),
     ],
 )
-def test_wrong_files_of_secrets(tmp_path: Path, text: str, mode: int, expected: str) -> None:
+def test_wrong_files_of_targets(tmp_path: Path, text: str, mode: int, expected: str) -> None:
     file = private(tmp_path / "file", text, mode)
     with pytest.raises(ConfigError, match=expected) as caught:
         targets(f"@{file}")
     assert SECRET not in str(caught.value)
 
 
-def test_a_damaged_netrc_is_named_and_not_quoted(tmp_path: Path) -> None:
+WRONG: dict[str, tuple[list[str], list[str], dict[str, str]]] = {  # targets, sinks and variables
+    "line 1 is not of netrc's format": (["mail:smtp://mail.example/a@b.c"], [], {}),
+    "is given twice; give it once": (["webhook:https://h.example/a", "webhook:https://h.example/b"], [], {}),
+    "choose one of mlflow, tensorboard, wandb": ([], ["excel"], {}),
+    "a sink is given twice": ([], ["tensorboard", "tensorboard:x"], {}),
+    "MLFLOW_TRACKING_URI": ([], ["mlflow"], {}),
+    "MLFLOW_TRACKING_USERNAME": ([], [f"mlflow:http://me:{SECRET}@h/"], {}),
+    "pip install wandb": ([], ["wandb"], {}),
+    **{
+        f"{minutes}.*write minutes": ([], [], {"PANOLOG_NOTIFY_STALLED": minutes})
+        for minutes in ("soon", "0", "-1", "nan", "inf")
+    },
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_what_a_plan_cannot_have_is_one_line_without_a_secret(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str
+) -> None:
     netrc = private(tmp_path / "netrc", f"machine mail.example login me passwort {SECRET}\n")
-    with pytest.raises(ConfigError, match="line 1 is not of netrc's format") as caught:
-        targets("mail:smtp://mail.example/a@b.c", NETRC=str(netrc))
+    missing = {"wandb": None}
+    monkeypatch.setattr(
+        "panolog.orchestrator.watch.follower.plan.find_spec", lambda name: missing.get(name, "there")
+    )
+    notify, log, variables = WRONG[line]
+    with pytest.raises(ConfigError, match=line) as caught:
+        read_plan(notify, log, {"NETRC": str(netrc), **variables})
     assert SECRET not in str(caught.value)
-
-
-def test_too_many_targets_and_twice_the_same() -> None:
-    with pytest.raises(ConfigError, match="give at most 20"):
-        targets(*(f"webhook:https://h{number}.example/" for number in range(21)))
-    with pytest.raises(ConfigError, match="is given twice"):
-        targets("webhook:https://h.example/a", "webhook:https://h.example/b")
 
 
 def test_variables_with_secrets_are_named_so_that_no_other_process_gets_them() -> None:
@@ -122,31 +139,3 @@ def test_a_plan_reaches_the_follower_whole(tmp_path: Path) -> None:
     root, _, there = from_json(to_json(plan, tmp_path))
     assert (root, there) == (tmp_path, plan)
     assert plan.stalled == 30
-
-
-@pytest.mark.parametrize(
-    ("log", "expected"),
-    [
-        (["excel"], "choose one of mlflow, tensorboard, wandb"),
-        (["tensorboard", "tensorboard:x"], "given twice"),
-        (["mlflow"], "MLFLOW_TRACKING_URI"),
-        (["mlflow:http://me:T0PSECRET@h/"], "MLFLOW_TRACKING_USERNAME"),
-    ],
-)
-def test_wrong_sinks(log: list[str], expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("panolog.orchestrator.watch.follower.plan.find_spec", lambda _: "there")
-    with pytest.raises(ConfigError, match=expected) as caught:
-        read_plan((), log, {})
-    assert SECRET not in str(caught.value)
-
-
-def test_a_sink_without_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("panolog.orchestrator.watch.follower.plan.find_spec", lambda _: None)
-    with pytest.raises(ConfigError, match="pip install mlflow-skinny"):
-        read_plan((), ["mlflow:http://h/"], {})
-
-
-@pytest.mark.parametrize("text", ["soon", "0", "-1", "nan", "inf"])
-def test_wrong_minutes(text: str) -> None:
-    with pytest.raises(ConfigError, match="write minutes"):
-        read_plan((), (), {"PANOLOG_NOTIFY_STALLED": text})
