@@ -22,7 +22,6 @@ from panolog.workers.tasks import COARSE
 from tests.orchestrator.watch.dashboard.browser import PHONE, opened
 from tests.orchestrator.watch.dashboard.served import Served, append, serving, write_whole_run
 from tests.scenes import write_scene
-from tests.visual import legible
 
 NAMES = [f"{number}.jpg" for number in range(4)]  # as in the plan of `write_whole_run`
 
@@ -170,4 +169,3 @@ def test_a_camera_shows_its_picture_and_a_block_its_cameras(browser: Browser, se
         expect(panel.get_by_role("button", name="Stage I, iteration 100")).to_be_visible()
         assert panel.locator("img").first.evaluate(loaded) == 1024
         expect(panel.get_by_role("button", name="Open in 3D from here")).to_be_enabled()
-        assert legible.hard_to_read(page, PHONE) == []

@@ -35,13 +35,10 @@ from panolog.orchestrator.watch.dashboard.messages import (
 )
 from panolog.orchestrator.watch.views.pages.report import report_or_notice, write_report
 from panolog.scene.errors import InputError, RunError
-from panolog.scene.ply import write_ply
 from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.fakes import Harness, fails
-from tests.orchestrator.watch.dashboard.served import write_whole_run
 from tests.orchestrator.watch.views.pages.snapshots import self_contained, snapshot_of
-from tests.scene.test_ply import gaussians
 from tests.workers.seams.test_schema import seam
 
 SCRIPT = "</script><script>alert(1)</script>"
@@ -130,16 +127,6 @@ def test_a_failed_run_has_a_report_with_its_reason(tmp_path: Path) -> None:
     report = Report(harness.folder.report)
     assert (report.run.summary.status, report.run.summary.label) == ("failed", "failed")
     assert "CUDA error: <misaligned>" in str(report.run.summary.reason)
-
-
-def test_a_report_of_a_live_run_and_of_one_that_was_killed(tmp_path: Path) -> None:
-    folder = write_whole_run(tmp_path / "run")
-    write_ply(folder.model(COARSE), gaussians(50))
-    with lock.hold(folder.lock):
-        live = Report(write_report(folder)).run
-    assert (live.summary.status, live.summary.training_gaussians) == ("running", 500)
-    assert live.eta is not None
-    assert Report(write_report(folder)).run.summary.label == "driver lost"
 
 
 def test_other_peoples_words_stay_words(tmp_path: Path) -> None:
@@ -265,15 +252,10 @@ def test_the_report_has_movers_and_only_the_runs_own_pictures(done: RunFolder, t
         cv2.imwrite(str(path), np.zeros((32, 64, 3), np.uint8))
     report = Report(write_report(done, tmp_path / "page.html"))
     found = report["findings"]
-    assert [mover["name"] for mover in found["movers"]] == [
-        "../../secret.jpg",
-        "walk/a.jpg",
-        "c.jpg",
-        "b.jpg",
-    ]
-    assert found["pictures"] == ["mover-1.jpg"] and report["findings/mover-1.jpg"].startswith(
-        "data:image/jpeg"
-    )
+    order = ["../../secret.jpg", "walk/a.jpg", "c.jpg", "b.jpg"]
+    assert [mover["name"] for mover in found["movers"]] == order
+    assert found["pictures"] == ["mover-1.jpg"]
+    assert report["findings/mover-1.jpg"].startswith("data:image/jpeg")
     done.mover_shares.write_bytes(b'{"panoramas": [1]}')
     with pytest.raises(InputError, match=r"movers\.json: is damaged"):
         write_report(done, tmp_path / "page.html")
@@ -284,10 +266,8 @@ def test_the_report_has_movers_and_only_the_runs_own_pictures(done: RunFolder, t
 
 
 def test_refined_poses_are_there_the_farthest_first(done: RunFolder, tmp_path: Path) -> None:
-    moves = [
-        {"name": name, "moved": 0.01, "turned": 0.1, "pixels": pixels, "at_bound": False}
-        for name, pixels in (("a.jpg", 1.5), ("b.jpg", 2.5))
-    ]
+    one = {"name": "a.jpg", "moved": 0.01, "turned": 0.1, "pixels": 1.5, "at_bound": False}
+    moves = [one, one | {"name": "b.jpg", "pixels": 2.5}]
     write_json(done.poses, {"panoramas": moves})
     metrics = json.loads(done.metrics.read_bytes())
     there = {"psnr": 27.25, "ws_psnr": 26.5, "lpips": None, "cc_psnr": 28.0, "pixels": 0.75}
