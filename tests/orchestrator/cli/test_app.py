@@ -111,18 +111,9 @@ def test_usage_errors_exit_with_two() -> None:
 
 
 def test_the_help_of_run_begins_with_the_basic_options() -> None:
-    text = call("run", "--help").stdout
-    basics, *groups = text.split("─ Options ─")[1].split("\n╭─ ")
+    basics, *_ = call("run", "--help").stdout.split("─ Options ─")[1].split("\n╭─ ")
     names = ("output", "blocks", "iterations", "width", "device", "help")
     assert re.findall(r" --[a-z]+", basics) == [f" --{name}" for name in names]
-    assert [re.split(" ─", group)[0] for group in groups] == [
-        "Settings",
-        "Panoramas or a video instead of a scene",
-        "Machines and the driver",
-        "Notifications and logs",
-        "Cost and time (docs/money.md)",
-    ]
-    assert len(text.splitlines()) < 92
     result = call("--version")
     assert (result.exit_code, result.stdout) == (0, f"panolog {version('panolog')}\n")
 

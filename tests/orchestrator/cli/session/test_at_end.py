@@ -53,6 +53,11 @@ def end(tmp_path: Path) -> End:
     return End(tmp_path)
 
 
+def drive(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
+    """Lets a supervisor run drivers that are these lines of Python."""
+    monkeypatch.setattr(supervise, "_PROGRAM", (sys.executable, "-c", program))
+
+
 @pytest.mark.parametrize(("records", "outcome"), [(DONE, "done|"), (LIMITED, "limited|the limit of 5 USD")])
 def test_it_follows_the_end_of_a_run(
     tmp_path: Path, end: End, records: tuple[Record, ...], outcome: str
@@ -85,30 +90,21 @@ def test_a_supervisor_carries_it_out_once_when_it_gives_up(
 ) -> None:
     folder = run_of(tmp_path / "run", BEGAN)
     monkeypatch.setattr(supervise, "_FIRST_S", 0.0)
-    killed = "import os; os.kill(os.getpid(), 9)"
-    monkeypatch.setattr(supervise, "_PROGRAM", (sys.executable, "-c", killed))
-    options = ("--supervise", "--max-resumes", 2, *end.option)
-    assert call("resume", folder.root, *options).exit_code == 1
+    drive(monkeypatch, "import os; os.kill(os.getpid(), 9)")
+    assert call("resume", folder.root, "--supervise", "--max-resumes", 2, *end.option).exit_code == 1
     assert end.said == [["failed", "exit code 1", str(folder.root)]]
 
 
-@pytest.mark.parametrize("code", [0, 1, 2])
-def test_a_supervisor_carries_it_out_when_its_driver_has_ended(
-    tmp_path: Path, end: End, monkeypatch: pytest.MonkeyPatch, code: int
+@pytest.mark.parametrize(
+    ("code", "said"), [(0, ["done"]), (1, ["failed"]), (2, ["refused"]), (130, [])], ids=str
+)
+def test_a_supervisor_carries_it_out_unless_its_driver_was_stopped(
+    tmp_path: Path, end: End, monkeypatch: pytest.MonkeyPatch, code: int, said: list[str]
 ) -> None:
     folder = run_of(tmp_path / "run", BEGAN)
-    monkeypatch.setattr(supervise, "_PROGRAM", (sys.executable, "-c", f"import sys; sys.exit({code})"))
+    drive(monkeypatch, f"import sys; sys.exit({code})")
     assert call("resume", folder.root, "--supervise", *end.option).exit_code == code
-    assert [said[0] for said in end.said] == [("done", "failed", "refused")[code]]
-
-
-def test_a_run_that_is_stopped_keeps_its_machine(
-    tmp_path: Path, end: End, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = run_of(tmp_path / "run", BEGAN)
-    monkeypatch.setattr(supervise, "_PROGRAM", (sys.executable, "-c", "import sys; sys.exit(130)"))
-    assert call("resume", folder.root, "--supervise", *end.option).exit_code == 130
-    assert end.said == []
+    assert [outcome for outcome, *_ in end.said] == said
 
 
 def test_another_driver_keeps_its_machine(tmp_path: Path, end: End) -> None:

@@ -41,9 +41,9 @@ def test_another_name_for_this_machine_is_refused(served: Served, host: str) -> 
     assert b"run" not in answer.partition(b"\r\n\r\n")[2].replace(b"runs", b"")
 
 
-@pytest.mark.parametrize("host", ["localhost", "LOCALHOST:99", "127.0.0.1:8360", "[::1]:8360", "[::1]"])
-def test_this_machine_may_be_called(served: Served, host: str) -> None:
-    assert served.client.get("/api/runs", headers={"Host": host}).status_code == 200
+def test_this_machine_may_be_called(served: Served) -> None:
+    for host in ("localhost", "LOCALHOST:99", "127.0.0.1:8360", "[::1]:8360", "[::1]"):
+        assert served.client.get("/api/runs", headers={"Host": host}).status_code == 200
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,9 @@ CENTERS = np.array([[i, 5.0, 0.3 * (i % 2)] for i in range(COUNT)])
 
 
 @contextmanager
-def serving(folder: Path) -> Iterator[str]:
-    """The address of a written page."""
-    server = SiteServer(Site(folder))
+def serving(page: Path | Site) -> Iterator[str]:
+    """The address of a page, or of its folder."""
+    server = SiteServer(page if isinstance(page, Site) else Site(page))
     thread = Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
