@@ -1,14 +1,19 @@
-"""What each page shows, in each state of a run; and that faults which were there once would be found."""
+"""What each page shows, in each state of a run, and that axe finds no fault with it."""
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, Page
 
-from tests.visual import legible, references
+from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
+from tests.export.peers import peer
+from tests.orchestrator.watch.dashboard.browser import opened
+from tests.orchestrator.watch.views.sites import ready, run_with, serving
+from tests.visual import legible
 from tests.visual.browser import fixed_browser, fixed_page, screenshot, wait_until_quiet
-from tests.visual.compare import TILE, Picture, compare, expand, reduce
+from tests.visual.compare import TILE, Picture, compare, difference, expand, reduce
 from tests.visual.pages import SHOTS, Shot, Site, show, site
 
 pytestmark = pytest.mark.system
@@ -67,7 +72,7 @@ def test_a_page_looks_right_and_can_be_read(page: Page, here: Site, shot: Shot, 
             wait_until_quiet(page, quiet)
             shown = screenshot(page, whole=shot.whole)
             wrong[view] = [
-                *filter(None, [references.difference(f"{shot.name}-{view}", shown, tmp_path)]),
+                *filter(None, [difference(f"{shot.name}-{view}", shown, tmp_path)]),
                 *legible.low_contrast(page, shown, whole=shot.whole),
                 *legible.sideways(page),
                 *legible.overlapping(page),
@@ -104,3 +109,31 @@ def styled(page: Page, rules: str) -> Picture:
     page.evaluate(_STYLE, rules)
     wait_until_quiet(page)
     return expand(reduce(screenshot(page)))
+
+
+_LOCK = Path(__file__).parent / "axe" / "package-lock.json"
+_RUN = "axe.run(document, {resultTypes: ['violations']}).then(({violations}) => violations)"
+
+
+def findings(page: Page) -> list[str]:
+    """What axe finds: the rule, and the elements."""
+    page.evaluate((peer("axe-core", _LOCK) / "axe.min.js").read_text() + "; undefined")
+    found: list[dict[str, Any]] = page.evaluate(_RUN)
+    return [f"{rule['id']}: {node['html'][:160]}" for rule in found for node in rule["nodes"][:3]]
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("shot", SHOTS, ids=lambda shot: shot.name)
+def test_axe_finds_nothing(here: Site, page: Page, shot: Shot) -> None:
+    shot.open(here, page)
+    wait_until_quiet(page, 400)
+    assert findings(page) == []
+
+
+@pytest.mark.nightly
+def test_axe_finds_nothing_in_the_3d_page(browser: Browser, tmp_path: Path) -> None:
+    write_folder(site_of_run(run_with(tmp_path), Wanted()), tmp_path / "web")
+    with serving(tmp_path / "web") as url, opened(browser, url) as page:
+        ready(page)
+        page.click("#list")
+        assert findings(page) == []

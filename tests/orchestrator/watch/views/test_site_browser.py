@@ -14,8 +14,20 @@ from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.watch.dashboard.browser import DESK, KEYBOARD, PHONE, SMALL, opened
 from tests.orchestrator.watch.views.models import make_run, save_plan
-from tests.orchestrator.watch.views.pictures import layers, psnr, ready, rendered, shown, until
-from tests.orchestrator.watch.views.sites import COUNT, SIZE, cloud, run_with, serving, viewpoints_of
+from tests.orchestrator.watch.views.sites import (
+    COUNT,
+    SIZE,
+    cloud,
+    layers,
+    psnr,
+    ready,
+    rendered,
+    run_with,
+    serving,
+    shown,
+    until,
+    viewpoints_of,
+)
 from tests.visual import legible
 from tests.visual.browser import wait_until_quiet
 

@@ -16,8 +16,19 @@ from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.watch.dashboard.browser import opened
 from tests.orchestrator.watch.views.models import make_run, save_plan, some
-from tests.orchestrator.watch.views.pictures import balls, psnr, ready, rendered, shown, until
-from tests.orchestrator.watch.views.sites import SIZE, cloud, run_with, serving, viewpoints_of
+from tests.orchestrator.watch.views.sites import (
+    SIZE,
+    balls,
+    cloud,
+    psnr,
+    ready,
+    rendered,
+    run_with,
+    serving,
+    shown,
+    until,
+    viewpoints_of,
+)
 
 pytestmark = pytest.mark.system
 
