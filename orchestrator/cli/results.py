@@ -198,8 +198,15 @@ def view(
 
 
 def _open_served(url: str, port: int) -> None:
-    """Opens a page that is served, or says how to reach it, and how to stop it."""
-    if not _open(url):
+    """Opens a page that is served, or says how to reach it, and how to stop it.
+
+    A browser for terminals could not show it, so on Linux there have to be windows.
+    """
+    import os
+    import webbrowser
+
+    windows = sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")))
+    if not (windows and webbrowser.open(url)):
         forward = f"ssh -L {port}:127.0.0.1:{port}"
         say(f"there is no browser here: open the address elsewhere after {forward}, or give -o FOLDER")
     say("Ctrl-C stops it")
@@ -211,15 +218,6 @@ def _say_count(page: "Page") -> None:
     part = f" of {page.total:,}" if shown < page.total else ""
     if page.total:
         say(f"{shown:,}{part} Gaussians")
-
-
-def _open(url: str) -> bool:
-    """Opens a page in a browser with windows; one for terminals could not show it. False if there is none."""
-    import os
-    import webbrowser
-
-    windows = sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")))
-    return windows and webbrowser.open(url)
 
 
 def report(

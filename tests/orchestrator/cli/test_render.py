@@ -88,8 +88,6 @@ def test_a_video_that_is_cut_off_leaves_nothing(
         (("--fov", "90", "--width", "64"), "give --size"),
         (("--fps", "30"), "give --mp4 too"),
         (("--size", "8x8"), "give --fov too"),
-        (("--yaw", "0"), "give --fov too"),
-        (("--pitch", "3"), "give --fov too"),
     ],
 )
 def test_wrong_options(

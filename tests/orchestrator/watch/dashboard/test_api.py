@@ -37,6 +37,7 @@ from tests.orchestrator.watch.dashboard.served import (
     write_whole_run,
 )
 from tests.orchestrator.watch.views.comparison.runs import metrics, write, write_picture
+from tests.visual.compare import expand
 from tests.workers.small import small_scene
 
 
@@ -220,11 +221,8 @@ def test_pictures(served: Served) -> None:
         assert answer.headers["content-type"] == "image/jpeg"
         assert answer.content.startswith(b"\xff\xd8")
     assert served.errors(f"{path}/previews/{view['number']}", 404)
-    whole, render = (
-        cv2.imdecode(np.frombuffer(served.client.get(f"{path}/{name}").content, np.uint8), cv2.IMREAD_COLOR)
-        for name in (f"views/{view['number']}", covers[1])
-    )
-    assert whole is not None and render is not None
+    names = f"views/{view['number']}", covers[1]
+    whole, render = (expand(served.client.get(f"{path}/{name}").content) for name in names)
     assert render.shape[:2] == (whole.shape[0] // 2, whole.shape[1])
 
 

@@ -25,6 +25,7 @@ from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.watch.views.models import make_run, save_plan, some
 from tests.scenes import write_scene
+from tests.visual.compare import expand
 
 SIZE = (480, 320)
 COUNT = 12
@@ -106,16 +107,11 @@ def shown(page: Page) -> NDArray[np.uint8]:
     """(H, W, 3) BGR: what the page draws once it is at rest, without the panels over it."""
     ready(page)
     page.evaluate(_BARE)
-    pictures = [_picture(page)]
+    pictures = [expand(page.screenshot())]
     while len(pictures) < 3 or not all(np.array_equal(picture, pictures[-1]) for picture in pictures[-3:]):
         page.wait_for_timeout(150)
-        pictures.append(_picture(page))
+        pictures.append(expand(page.screenshot()))
     return pictures[-1]
-
-
-def _picture(page: Page) -> NDArray[np.uint8]:
-    png = np.frombuffer(page.screenshot(), np.uint8)
-    return np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR), np.uint8)
 
 
 def rendered(

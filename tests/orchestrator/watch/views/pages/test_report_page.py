@@ -38,6 +38,7 @@ from tests.orchestrator.watch.dashboard.served import (
 )
 from tests.orchestrator.watch.views.models import save_model
 from tests.visual import legible
+from tests.visual.compare import expand
 from tests.workers.seams.test_schema import seam
 
 pytestmark = pytest.mark.system
@@ -95,9 +96,7 @@ def _unfold(page: Page) -> None:
 
 def _colors(page: Page, selector: str) -> tuple[int, int, int]:
     """The mean colour that the page shows there, as blue, green and red."""
-    data = page.locator(selector).first.screenshot()
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert picture is not None
+    picture = expand(page.locator(selector).first.screenshot())
     blue, green, red = picture.reshape(-1, 3).mean(axis=0).round().astype(int).tolist()
     return blue, green, red
 
