@@ -36,11 +36,7 @@ app = typer.Typer(
     " `leave` is for the machines of the cluster themselves.",
 )
 
-HeadSourceArg = Annotated[
-    str, argument("SCENE|IMAGES|VIDEO", "The scene, a folder of panoramas or a video, on the head node.")
-]
 HeadRunArg = Annotated[str, argument("RUN", "Folder of the run on the head node.")]
-HeadRunOption = Annotated[str, option("RUN", "Folder of the new run on the head node.", "--output", "-o")]
 ServerOption = Annotated[
     str,
     option(
@@ -50,10 +46,6 @@ ServerOption = Annotated[
         envvar="RAY_API_SERVER_ADDRESS",
     ),
 ]
-SecondsArg = Annotated[int, argument("SECONDS", "Seconds until the machine ends.", min=0, max=86_400)]
-NodeOption = Annotated[
-    str, option("ID", "How the id of the node begins, if this machine has several of Ray's.", "--node")
-]
 _LOCAL = "http://127.0.0.1:8265"
 
 
@@ -61,8 +53,10 @@ _LOCAL = "http://127.0.0.1:8265"
 @with_run_config
 @with_preparation
 def submit(
-    source: HeadSourceArg,
-    output: HeadRunOption,
+    source: Annotated[
+        str, argument("SCENE|IMAGES|VIDEO", "The scene, a folder of panoramas or a video, on the head node.")
+    ],
+    output: Annotated[str, option("RUN", "Folder of the new run on the head node.", "--output", "-o")],
     config: "RunConfig",
     options: "Options",
     address: ServerOption = _LOCAL,
@@ -166,7 +160,12 @@ def stop(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption = 
 
 
 @app.command(cls=Command)
-def leave(seconds: SecondsArg = 120, node: NodeOption = "") -> None:
+def leave(
+    seconds: Annotated[int, argument("SECONDS", "Seconds until the machine ends.", min=0, max=86_400)] = 120,
+    node: Annotated[
+        str, option("ID", "How the id of the node begins, if this machine has several of Ray's.", "--node")
+    ] = "",
+) -> None:
     """Announce that this machine leaves its cluster: tasks here save a checkpoint and move.
 
     Returns once they have, at the latest after so many seconds: for the preStop hook of a pod, and for the

@@ -24,26 +24,16 @@ _setting, _machine, _note, _limit, _making = (
 
 SceneArg = Annotated[Path, argument("SCENE", "Folder of a COLMAP or Pano360 scene.")]
 AnySceneArg = Annotated[str, argument("SCENE", "Folder or URL of a COLMAP or Pano360 scene.")]
-SourceArg = Annotated[
-    str,
-    argument(
-        "SCENE|IMAGES|VIDEO", "Scene (folder, s3://, gs://, az://), folder of panoramas, or 360° video."
-    ),
-]
 AnyRunArg = Annotated[str, argument("RUN", "Folder or URL of a run.")]
 RunArg = Annotated[Path, argument("RUN", "Folder of a run.")]
-RunsArg = Annotated[list[Path], argument("RUN", "Folders of two runs or more.")]
 ModelArg = Annotated[Path, argument("RUN|PLY", "Folder of a run, or a PLY file.")]
-AnyModelArg = Annotated[str, argument("RUN|PLY", "Folder or URL of a run, or a PLY file.")]
 BlockArg = Annotated[int, argument("BLOCK", "Number of a block.", min=0)]
-NewRunOption = Annotated[str, option("RUN", "Folder or URL of the new run.", "--output", "-o")]
 LocalOption = Annotated[
     Path | None,
     _machine("DIR", "Folder on this machine of a run with a URL. Default: in the cache.", "--local"),
 ]
 NewSceneOption = Annotated[Path, option("SCENE", "Folder of the new scene.", "--output", "-o")]
 PageOption = Annotated[Path | None, option("FILE.html", "Write the page to this file.", "--output", "-o")]
-PortOption = Annotated[int, option("PORT", "Port to serve on; 0 = any free port.", min=0, max=65535)]
 JsonOption = Annotated[bool, flag("Print one JSON object on stdout.", "--json")]
 LinkOption = Annotated[bool, flag("Link the panoramas instead of copying them.", "--link")]
 AddressOption = Annotated[
@@ -100,13 +90,7 @@ FrameOption = Annotated[
         "Axes of FILE if it is no plain PLY: as `panolog export` writes it, or as the run's model.",
     ),
 ]
-WidthOption = Annotated[int | None, option("W", "Of the panoramas in pixels. Default: as they are.")]
 
-PairsOption = Annotated[
-    Literal["auto", "exhaustive", "sequential"],
-    option("HOW", "Pairs to match: auto, exhaustive or sequential.", "--pairs"),
-]
-MapperOption = Annotated[Literal["incremental", "global"], option("HOW", "Mapper: incremental or global.")]
 ParallaxOption = Annotated[
     float | None, _making("DEGREES", "Video: parallax between two frames. Default: 4.")
 ]
@@ -144,7 +128,7 @@ def run_config(
     settings: Annotated[list[str] | None, _setting("KEY=VALUE", "One setting; repeatable.", "--set")] = None,
     blocks: BlocksOption = None,
     iterations: Annotated[int | None, option("N", "Of Stage I and of each block. Default: 30,000.")] = None,
-    width: WidthOption = None,
+    width: Annotated[int | None, option("W", "Of the panoramas in pixels. Default: as they are.")] = None,
     device: DeviceOption = None,
     memory: Annotated[
         str | None, _setting("GIB", "Memory that a task may take; Gaussians grow to what fits.")

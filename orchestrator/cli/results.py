@@ -15,9 +15,7 @@ from panolog.orchestrator.cli.options import (
     JsonOption,
     ModelArg,
     PageOption,
-    PortOption,
     RunArg,
-    RunsArg,
     axes_of,
 )
 from panolog.orchestrator.cli.stores import opened
@@ -163,7 +161,7 @@ def view(
         ),
     ] = None,
     most: Annotated[int | None, typer.Option("--most", min=1, hidden=True)] = None,  # its former name
-    port: PortOption = 0,
+    port: Annotated[int, option("PORT", "Port to serve on; 0 = any free port.", min=0, max=65535)] = 0,
 ) -> None:
     """Show the model of a run, a block or a file in 3D, in the browser, until Ctrl-C."""
     _require(source)
@@ -243,7 +241,11 @@ def report(
     print(page)
 
 
-def compare(runs: RunsArg, as_json: JsonOption = False, output: PageOption = None) -> None:
+def compare(
+    runs: Annotated[list[Path], argument("RUN", "Folders of two runs or more.")],
+    as_json: JsonOption = False,
+    output: PageOption = None,
+) -> None:
     """Compare runs: settings that differ, sizes, times and metrics; with -o as one page to share."""
     from panolog.orchestrator.watch.views.comparison.compare import compare as compare_runs
     from panolog.orchestrator.watch.views.comparison.reading import picture_of, read_runs

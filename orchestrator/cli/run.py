@@ -30,12 +30,10 @@ from panolog.orchestrator.cli.options import (
     LocalOption,
     LogOption,
     MaxCostOption,
-    NewRunOption,
     NiceOption,
     NotifyOption,
     PricesOption,
     ResumesOption,
-    SourceArg,
     SuperviseOption,
     wanted,
     with_preparation,
@@ -55,8 +53,13 @@ _RESUMES = 10  # of a supervisor in a row without progress
 @with_run_config
 @with_preparation
 def run(
-    source: SourceArg,
-    output: NewRunOption,
+    source: Annotated[
+        str,
+        argument(
+            "SCENE|IMAGES|VIDEO", "Scene (folder, s3://, gs://, az://), folder of panoramas, or 360° video."
+        ),
+    ],
+    output: Annotated[str, option("RUN", "Folder or URL of the new run.", "--output", "-o")],
     config: "RunConfig",
     options: "Options",
     address: AddressOption = None,

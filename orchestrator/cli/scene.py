@@ -14,9 +14,7 @@ from panolog.orchestrator.cli.options import (
     GpsOption,
     JsonOption,
     LinkOption,
-    MapperOption,
     NewSceneOption,
-    PairsOption,
     ParallaxOption,
     PartialOption,
     SceneArg,
@@ -100,8 +98,13 @@ def import_(
 def sfm(
     source: Annotated[Path, argument("IMAGES|VIDEO", "Folder of panoramas, or a 360° video.")],
     output: NewSceneOption,
-    pairs: PairsOption = "auto",
-    mapper: MapperOption = "incremental",
+    pairs: Annotated[
+        Literal["auto", "exhaustive", "sequential"],
+        option("HOW", "Pairs to match: auto, exhaustive or sequential.", "--pairs"),
+    ] = "auto",
+    mapper: Annotated[
+        Literal["incremental", "global"], option("HOW", "Mapper: incremental or global.")
+    ] = "incremental",
     parallax: ParallaxOption = None,
     frames: FramesOption = None,
     distance: DistanceOption = None,
