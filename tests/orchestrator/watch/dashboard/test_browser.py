@@ -4,7 +4,6 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -122,25 +121,6 @@ def test_the_map_fills_its_card_and_all_is_reached_by_keyboard(browser: Browser,
             page.set_viewport_size({"width": other, "height": 850})
             fills_its_card(page)
         assert unreachable(page) == []
-
-
-# How many rows the entries of the legends have.
-ROWS = """() => new Set([...document.querySelectorAll("#charts .legendtext")].map((node) =>
-  node.getBoundingClientRect().bottom)).size"""
-
-
-def test_the_legend_has_room_in_a_window_that_was_made_narrow(browser: Browser, tmp_path: Path) -> None:
-    rates = dict.fromkeys(("means", "scales", "quats", "opacities", "sh0", "shN"), 1e-3)
-    made = (replace(progressed(COARSE, iteration), rates=rates) for iteration in (10, 20))
-    write_run(tmp_path / "run", [started(COARSE), *made])
-    with (
-        serving(tmp_path) as served,
-        opened(browser, f"{served.url}/runs/{served.id('run')}", width=DESK) as page,
-    ):
-        expect(page.locator("#charts .legendtext")).to_have_count(len(rates))
-        assert page.evaluate(ROWS) == 2
-        page.set_viewport_size({"width": PHONE, "height": 850})
-        page.wait_for_function(f"() => ({ROWS})() === 3", timeout=PATIENCE_MS)
 
 
 def test_runs_are_found_and_sorted_in_a_theme_that_stays(browser: Browser, shown: Served) -> None:

@@ -3,7 +3,6 @@
 import base64
 import json
 import os
-import re
 import sqlite3
 import struct
 from collections.abc import Callable
@@ -289,14 +288,6 @@ def test_it_is_one_page_with_all_of_it(tmp_path: Path) -> None:
     assert grey(view["truth"]) == (64, 32, 200)
 
 
-def test_the_same_runs_make_the_same_page(tmp_path: Path) -> None:
-    folders = [write(tmp_path / name, measured=metrics()) for name in "ab"]
-    for folder in folders:
-        write_picture(folder, "a.jpg", 20, 200)
-    pages = [re.sub(r"written .* UTC", "", page_of(tmp_path, *folders)) for _ in range(2)]
-    assert pages[0] == pages[1]
-
-
 @pytest.mark.parametrize(("count", "most"), [(2, 12), (8, 6)])
 def test_pictures_are_few_and_small(tmp_path: Path, count: int, most: int) -> None:
     values = {f"{number:02d}.jpg": float(number) for number in range(20)}
@@ -332,12 +323,3 @@ def test_pictures_that_are_none_are_left_out(tmp_path: Path) -> None:
     found = snapshot_of(page_of(tmp_path, first, write(tmp_path / "b")))["answers"]["compare?"]["views"]
     assert {view["name"] for view in found if any(view["pictures"]) or view["truth"]} == {"good.jpg"}
     assert len(found) == len(views)
-
-
-def test_a_page_that_cannot_be_made_leaves_the_last_one(tmp_path: Path) -> None:
-    first, second = write(tmp_path / "a"), write(tmp_path / "b")
-    before = page_of(tmp_path, first, second)
-    second.database.write_bytes(b"no database" * 1_000)
-    with pytest.raises(InputError, match=r"run\.db"):
-        page_of(tmp_path, first, second)
-    assert (tmp_path / "page.html").read_text() == before

@@ -2,7 +2,6 @@
 
 import shutil
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -20,12 +19,10 @@ from panolog.orchestrator.runs.records import (
     TaskFailed,
     ViewEvaluated,
 )
-from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import write_report
 from panolog.orchestrator.watch.views.palette import SEAM_GRADES
 from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE, EVAL, TaskId
-from tests.orchestrator.history import AGAIN, BEGAN, model
 from tests.orchestrator.watch.dashboard.browser import PHONE, SMALL, opened, unreachable
 from tests.orchestrator.watch.dashboard.served import (
     EVIL,
@@ -33,7 +30,6 @@ from tests.orchestrator.watch.dashboard.served import (
     progressed,
     serving,
     started,
-    write_run,
     write_whole_run,
 )
 from tests.orchestrator.watch.views.models import save_model
@@ -99,18 +95,6 @@ def _colors(page: Page, selector: str) -> tuple[int, int, int]:
     picture = expand(page.locator(selector).first.screenshot())
     blue, green, red = picture.reshape(-1, 3).mean(axis=0).round().astype(int).tolist()
     return blue, green, red
-
-
-def test_no_time_counts_in_which_no_driver_was_at_work(browser: Browser, tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run")
-    with closing(Database(folder.database)) as database:
-        database.store([(0.0, BEGAN), (0.0, started(COARSE)), (10.0, RunEnded(Outcome.INTERRUPTED))])
-        database.store([(7000.0, AGAIN), (7000.0, started(COARSE)), (7015.0, model(COARSE))])
-        database.store([(7015.0, RunEnded(Outcome.FAILED, "no"))])
-    report = write_report(folder, tmp_path / "page.html", running=False)
-    with opened(browser, report.as_uri()) as page:
-        expect(page.locator("#facts")).to_contain_text("Elapsed25 s")
-        expect(page.locator("#stages li[data-key='coarse']")).to_contain_text("done · 25 s")
 
 
 def test_all_is_there_without_network(browser: Browser, report: Path) -> None:
