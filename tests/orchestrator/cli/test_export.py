@@ -132,7 +132,10 @@ def test_choices(run: RunFolder, tmp_path: Path, kind: str) -> None:
         export(run.point_cloud, "-o", file, "--without-sky", *options)
         assert not (tmp_path / "model-sky.spz").exists()
         assert len(read_model(file) if kind == "spz" else read_ply(file)) == count
-    assert panolog("export", run.point_cloud, "-o", file, "--min-opacity", 0.95).exit_code == 2
+    export(run.point_cloud, "-o", file, "--without-sky", "--sh", 0)
+    assert kind == "ply" or read_model(file).degree == 0
+    nothing = ("--without-sky", "--min-opacity", 0.95)
+    assert panolog("export", run.point_cloud, "-o", file, *nothing).exit_code == 2
 
 
 def test_choices_of_a_plain_ply(run: RunFolder, tmp_path: Path) -> None:
