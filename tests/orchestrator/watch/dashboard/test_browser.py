@@ -301,7 +301,7 @@ def test_machines_and_the_store_are_shown_and_a_machine_is_released(browser: Bro
     gpu = {"name": "A", "utilization": None, "memory_used": 22 * GIB, "memory_total": 24 * GIB}
     used = {"cpu": 0.63, "memory_used": 5 * GIB, "memory_total": 8 * GIB, "disk_used": 0, "disk_total": GIB}
     with closing(Database(folder.database)) as database:
-        database.put_usage(socket.gethostname(), used | {"gpus": [gpu]})
+        database.put_usage(socket.gethostname(), used | {"gpus": [gpu, gpu]})
     place, since = "s3://reconstructions-of-the-city/2026/street/run", time.time() - 1500
     why = f"{place}/.panolog/objects/blocks/000/checkpoint.safetensors/18b2: the store fails (Slow down.)"
     behind = MirrorState(place, "m", since=since, pending_files=12, pending_bytes=8 * GIB, problem=why)
@@ -313,7 +313,8 @@ def test_machines_and_the_store_are_shown_and_a_machine_is_released(browser: Bro
         opened(browser, f"{server.url}/runs/{server.id('run')}") as page,
     ):
         settled(page)
-        expect(page.locator(".meters [data-full='true']")).to_have_text(["GPU 0 memory22 GiB of 24 GiB"])
+        full = [f"GPU {number} memory22 GiB of 24 GiB" for number in (0, 1)]
+        expect(page.locator(".meters [data-full='true']")).to_have_text(full)
         fact = page.locator("#facts div", has_text="Object store")
         expect(fact).to_contain_text("12 files (8.0 GiB) to go")
         expect(fact).to_contain_text("Slow down.")
