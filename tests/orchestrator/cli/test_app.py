@@ -5,7 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,12 +13,12 @@ import pytest
 
 from panolog.orchestrator.runs.machines.nodes import Node
 from panolog.orchestrator.runs.records import Noticed, Progressed, RunBegan, TaskStarted
-from panolog.orchestrator.runs.store import Database
 from panolog.scene.errors import RunError
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.calibrated import says
-from tests.orchestrator.cli.program import begun, call, finished, one_line, shown
+from tests.orchestrator.cli.program import call, finished, one_line, shown
 from tests.orchestrator.fakes import FakePool
+from tests.orchestrator.history import begun
 from tests.orchestrator.watch.views.comparison.runs import metrics, write
 from tests.scenes import write_scene
 
@@ -30,11 +30,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    folder = begun(tmp_path / "run")
-    with closing(Database(folder.database)) as database:
-        database.append([RunBegan("host", 1, resumed=False), TaskStarted(COARSE, 1, 0, "node", 2, "cpu", 2)])
-        database.append([Progressed(COARSE, 5, 10, 2.0, loss=0.25), Noticed(COARSE, "a.jpg is left out")])
-    return folder.root
+    records = RunBegan("host", 1, resumed=False), TaskStarted(COARSE, 1, 0, "node", 2, "cpu", 2)
+    more = Progressed(COARSE, 5, 10, 2.0, loss=0.25), Noticed(COARSE, "a.jpg is left out")
+    return begun(tmp_path / "run", *records, *more).root
 
 
 def calibrated(monkeypatch: pytest.MonkeyPatch, memory: int) -> None:

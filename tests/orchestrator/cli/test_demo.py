@@ -8,9 +8,9 @@ import pytest
 
 from panolog.orchestrator.cli.commands.demo import SETTINGS
 from panolog.orchestrator.runs.config import load_config
-from panolog.orchestrator.runs.info import SceneRef
 from panolog.workers.training.schedule import Schedule
-from tests.orchestrator.cli.program import begun, call, one_line
+from tests.orchestrator.cli.program import call, one_line
+from tests.orchestrator.history import begun
 
 
 class Demo(NamedTuple):
@@ -42,7 +42,7 @@ def test_where_a_demo_cannot_go(demo: Demo, tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").touch()
     assert "is not empty" in one_line(call("demo", "-o", "."))
     assert "cannot be written next to it" in one_line(call("demo", "-o", "/"))
-    begun(tmp_path / "run", SceneRef(path=str(tmp_path / "run-town"), fingerprint="f"))
+    begun(tmp_path / "run", scene=tmp_path / "run-town")
     for options in (("--flight",), ("--city", "9")):
         assert "a run of another scene" in one_line(call("demo", *options, "-o", tmp_path / "run"))
     assert call("demo", "--city", "1").exit_code == 2

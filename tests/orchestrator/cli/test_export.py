@@ -13,14 +13,14 @@ from typer.testing import Result
 
 from panolog.export.reading import read_model
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.info import SceneRef
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import read_ply, write_ply
 from panolog.scene.read import read_scene
 from panolog.scene.write import Offset, Origin, write_offset
 from panolog.workers.training.initialise import scene_gaussians
-from tests.orchestrator.cli.program import begun, one_line, shown
 from tests.orchestrator.cli.program import call as panolog
+from tests.orchestrator.cli.program import one_line, shown
+from tests.orchestrator.history import begun
 from tests.scenes import write_scene
 
 MODELS = ("sog", "spz", "compressed-ply", "ply")
@@ -59,7 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     folder = tmp_path_factory.mktemp("place")
     root = write_scene(folder / "scene", points=300)
     write_offset(root, Offset(offset=(1, 2, 3), frame="ENU", origin=PLACE))
-    found = begun(folder / "place", SceneRef(path=str(root), fingerprint=read_scene(root).fingerprint))
+    found = begun(folder / "place", scene=root, fingerprint=read_scene(root).fingerprint)
     write_ply(found.point_cloud, model(root))
     return found
 

@@ -17,8 +17,9 @@ from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.cli.program import call
+from tests.orchestrator.history import begun
 from tests.orchestrator.watch.dashboard.served import raw
-from tests.orchestrator.watch.views.models import make_run, save_model, save_plan
+from tests.orchestrator.watch.views.models import save_model, save_plan
 from tests.orchestrator.watch.views.sites import serving
 from tests.scenes import write_scene
 
@@ -28,7 +29,7 @@ def folder(tmp_path: Path) -> RunFolder:
     """A run with a model and a scene whose panoramas are those of its plan."""
     names = [f"pano_{i}.jpg" for i in range(6)]
     write_scene(tmp_path / "scene", names=names)
-    folder = make_run(tmp_path / "a <run>", tmp_path / "scene")
+    folder = begun(tmp_path / "a <run>", scene=tmp_path / "scene")
     save_model(folder, COARSE)
     save_plan(folder, names)
     return folder

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -12,30 +11,21 @@ import pytest
 from panolog.orchestrator.cli.session import at_end, supervise
 from panolog.orchestrator.cli.session.at_end import when_ended
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.orchestrator.runs.money.records import BudgetReached, BudgetSet
 from panolog.orchestrator.runs.records import Delivered, Noticed, Outcome, Record, RunBegan, RunEnded
 from panolog.orchestrator.runs.storage.state import MirrorState, write_state
-from panolog.orchestrator.runs.store import Database
 from panolog.scene.ply import read_ply, read_sky
 from panolog.workers.tasks import DELIVER, EVAL
-from tests.orchestrator.cli.program import begun, call
+from tests.orchestrator.cli.program import call
 from tests.orchestrator.fakes import Harness
+from tests.orchestrator.history import begun
 
 URL = "s3://bucket/run"
 BEGAN = RunBegan("host", 7, resumed=False)
 DONE = (BEGAN, RunEnded(Outcome.DONE))
 LIMITED = (BEGAN, BudgetSet(deadline=5.0), BudgetReached("the limit of 5 USD"), RunEnded(Outcome.LIMITED))
 FAILED = (BEGAN, RunEnded(Outcome.FAILED, "block 3 has failed"))
-
-
-def run_of(root: Path, *records: Record) -> RunFolder:
-    """A run with that history, of a scene that is gone."""
-    folder = begun(root)
-    with closing(Database(folder.database)) as database:
-        database.append(records)
-    return folder
 
 
 class End:
@@ -67,7 +57,7 @@ def drive(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
 def test_it_follows_the_end_of_a_run(
     tmp_path: Path, end: End, records: tuple[Record, ...], outcome: str
 ) -> None:
-    folder = run_of(tmp_path / "run", *records)
+    folder = begun(tmp_path / "run", *records)
     result = call("resume", folder.root, *end.option)
     assert result.exit_code == 0, result.output
     assert end.said == [[*outcome.split("|"), str(folder.root)]]
@@ -77,7 +67,7 @@ def test_it_follows_the_end_of_a_run(
 def test_a_run_that_fails_or_is_refused_is_told_apart(tmp_path: Path, end: End) -> None:
     """The scene is gone, so neither can be resumed."""
     for name, records, outcome in (("a", FAILED, "failed"), ("b", (BEGAN,), "refused")):
-        folder = run_of(tmp_path / name, *records)
+        folder = begun(tmp_path / name, *records)
         assert call("resume", folder.root, *end.option).exit_code == 2
         (found, reason, run) = end.said[-1]
         assert (found, run) == (outcome, str(folder.root)) and "/gone" in reason
@@ -93,7 +83,7 @@ def test_a_run_that_is_refused_before_there_is_a_folder(tmp_path: Path, end: End
 def test_a_supervisor_carries_it_out_once_when_it_gives_up(
     tmp_path: Path, end: End, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = run_of(tmp_path / "run", BEGAN)
+    folder = begun(tmp_path / "run", BEGAN)
     monkeypatch.setattr(supervise, "_FIRST_S", 0.0)
     drive(monkeypatch, "import os; os.kill(os.getpid(), 9)")
     assert call("resume", folder.root, "--supervise", "--max-resumes", 2, *end.option).exit_code == 1
@@ -106,14 +96,14 @@ def test_a_supervisor_carries_it_out_once_when_it_gives_up(
 def test_a_supervisor_carries_it_out_unless_its_driver_was_stopped(
     tmp_path: Path, end: End, monkeypatch: pytest.MonkeyPatch, code: int, said: list[str]
 ) -> None:
-    folder = run_of(tmp_path / "run", BEGAN)
+    folder = begun(tmp_path / "run", BEGAN)
     drive(monkeypatch, f"import sys; sys.exit({code})")
     assert call("resume", folder.root, "--supervise", *end.option).exit_code == code
     assert [outcome for outcome, *_ in end.said] == said
 
 
 def test_another_driver_keeps_its_machine(tmp_path: Path, end: End) -> None:
-    folder = run_of(tmp_path / "run", BEGAN)
+    folder = begun(tmp_path / "run", BEGAN)
     with lock.hold(folder.lock):
         result = call("resume", folder.root, *end.option)
     assert result.exit_code == 2 and end.said == []
@@ -121,7 +111,7 @@ def test_another_driver_keeps_its_machine(tmp_path: Path, end: End) -> None:
 
 
 def test_a_run_that_is_not_all_in_its_store_keeps_its_machine(tmp_path: Path, end: End) -> None:
-    folder = run_of(tmp_path / "run", *DONE)
+    folder = begun(tmp_path / "run", *DONE)
     said: list[str] = []
     for state, count in ((MirrorState(URL, problem="no access"), 0), (MirrorState(URL, complete=True), 1)):
         write_state(folder.mirror, state)
@@ -132,7 +122,7 @@ def test_a_run_that_is_not_all_in_its_store_keeps_its_machine(tmp_path: Path, en
 
 
 def test_a_command_that_fails_or_hangs_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, file = run_of(tmp_path / "run", *DONE), tmp_path / "goes on"
+    folder, file = begun(tmp_path / "run", *DONE), tmp_path / "goes on"
     result = call("resume", folder.root, "--at-end", "exit 3")
     assert (result.exit_code, "has failed (code 3)" in result.stderr) == (0, True)
     started: list[subprocess.Popen[bytes]] = []

@@ -23,12 +23,12 @@ from panolog.orchestrator.watch.views.comparison.compare import compare
 from panolog.orchestrator.watch.views.comparison.reading import read_runs
 from panolog.orchestrator.watch.views.pages.shell import STATIC
 from panolog.workers.tasks import COARSE, EVAL
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard import api_types
 from tests.orchestrator.watch.dashboard.served import (
     EVIL,
     SCORES,
     Served,
-    append,
     plan,
     progressed,
     serving,

@@ -21,11 +21,11 @@ from panolog.orchestrator.watch.dashboard import server
 from panolog.orchestrator.watch.dashboard.api import router
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.served import (
     EVIL,
     PATIENCE_S,
     Served,
-    append,
     progressed,
     raw,
     serving,

@@ -31,11 +31,11 @@ from panolog.orchestrator.runs.store import Database
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.workers.tasks import COARSE, TaskId
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.browser import DESK, PATIENCE_MS, PHONE, SMALL, opened, unreachable
 from tests.orchestrator.watch.dashboard.served import (
     EVIL,
     Served,
-    append,
     progressed,
     serving,
     started,

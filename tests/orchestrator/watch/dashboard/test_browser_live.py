@@ -37,10 +37,10 @@ from panolog.orchestrator.runs.records import (
 )
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.browser import AWAY, opened
 from tests.orchestrator.watch.dashboard.served import (
     SCORES,
-    append,
     plan,
     progressed,
     serving,

@@ -17,11 +17,11 @@ from panolog.orchestrator.watch.dashboard import discovery, guard, server
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.scene.errors import InputError
 from tests.orchestrator.cli.program import call, one_line
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.served import (
     PATIENCE_S,
     POST,
     Served,
-    append,
     raw,
     serving,
     streaming,

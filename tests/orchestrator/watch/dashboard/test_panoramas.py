@@ -19,8 +19,9 @@ from panolog.orchestrator.watch.views.site import photographs
 from panolog.scene.read import read_scene
 from panolog.scene.stores.cache import FOLDER
 from panolog.workers.tasks import COARSE
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.browser import PHONE, opened
-from tests.orchestrator.watch.dashboard.served import Served, append, serving, write_whole_run
+from tests.orchestrator.watch.dashboard.served import Served, serving, write_whole_run
 from tests.scenes import write_scene
 from tests.visual.compare import expand
 

@@ -8,9 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.runs.config import RunConfig
-from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.orchestrator.runs.machines.history import MACHINE_DIED
 from panolog.orchestrator.runs.money.records import BudgetNear, BudgetReached
 from panolog.orchestrator.runs.presence import Presence
@@ -42,6 +39,7 @@ from panolog.orchestrator.watch.follower.watcher import Watcher
 from panolog.scene.files import write_bytes
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.fakes import SetClock
+from tests.orchestrator.history import append, begun
 
 BEGAN = RunBegan("host", 1, resumed=False)
 STARTED = TaskStarted(COARSE, 1, 0, "gpu1", 2, "cpu", 2, node_id="n1")
@@ -51,9 +49,7 @@ class Run:
     """A run whose records a test writes."""
 
     def __init__(self, root: Path) -> None:
-        self.folder = RunFolder(root)
-        self.clock = SetClock()
-        write_info(self.folder, make_info(SceneRef(path="/gone", fingerprint="f"), RunConfig(width=64)))
+        self.folder, self.clock = begun(root), SetClock()
         self.database = Database(self.folder.database, self.clock)
 
     def add(self, *records: Record, after: float = 1.0) -> None:
@@ -72,7 +68,6 @@ class Run:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Iterator[Run]:
-    (tmp_path / "place").mkdir()
     made = Run(tmp_path / "place")
     with closing(made.database):
         yield made
@@ -198,9 +193,8 @@ def test_a_database_that_is_damaged_or_replaced_stops_no_watcher(run: Run) -> No
     run.folder.database.write_bytes(b"x" * 5000)
     assert not watcher.look()
     run.folder.database.unlink()
-    with closing(Database(run.folder.database)) as database:
-        database.append([RunBegan("host", 9, resumed=False), STARTED])
-        assert watcher.look()
+    append(run.folder, RunBegan("host", 9, resumed=False), STARTED)
+    assert watcher.look()
     assert watcher.run != first
     assert watcher.news().run == watcher.run
 

@@ -23,7 +23,8 @@ from panolog.renderer.render import render, to_bytes
 from panolog.scene.gaussians import Gaussians, logit
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
-from tests.orchestrator.watch.views.models import make_run, save_plan, some
+from tests.orchestrator.history import begun
+from tests.orchestrator.watch.views.models import save_plan, some
 from tests.scenes import write_scene
 from tests.visual.compare import expand
 
@@ -59,7 +60,7 @@ def run_with(root: Path, model: Gaussians | None = None, names: list[str] = NAME
     for number, name in enumerate(names):
         colour = np.full((512, 1024, 3), (20 * number, 255 - 20 * number, 128), np.uint8)
         (root / "scene" / "images" / name).write_bytes(bytes(cv2.imencode(".png", colour)[1]))
-    folder = make_run(root / "a <run>", root / "scene")
+    folder = begun(root / "a <run>", scene=root / "scene")
     save_plan(folder, names, CENTERS[: len(names)])
     folder.of(COARSE).mkdir()
     write_ply(folder.model(COARSE), model or cloud(viewpoints_of(folder)))

@@ -22,8 +22,9 @@ from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import write_ply, write_ply_parts
 from panolog.scene.read import read_scene
 from panolog.workers.tasks import COARSE, TaskId
+from tests.orchestrator.history import begun
 from tests.orchestrator.watch.dashboard.browser import opened
-from tests.orchestrator.watch.views.models import make_run, save_checkpoint, save_model, save_plan, some
+from tests.orchestrator.watch.views.models import save_checkpoint, save_model, save_plan, some
 from tests.orchestrator.watch.views.sites import (
     SIZE,
     balls,
@@ -43,7 +44,7 @@ from tests.scenes import write_scene
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
     """A run that has not begun."""
-    return make_run(tmp_path / "a <run>")
+    return begun(tmp_path / "a <run>")
 
 
 def written(folder: Path) -> dict[str, Any]:
@@ -72,7 +73,7 @@ def test_a_page_begins_at_the_panorama_that_is_named(folder: RunFolder) -> None:
 
 def test_without_a_plan_the_cameras_are_those_of_the_scene(tmp_path: Path) -> None:
     """A run with refine=false has no plan, and had no cameras."""
-    folder = make_run(tmp_path / "run", tmp_path / "scene")
+    folder = begun(tmp_path / "run", scene=tmp_path / "scene")
     assert read_viewpoints(folder, None) is None  # its scene is not here
     scene = read_scene(write_scene(tmp_path / "scene"))
     found = read_viewpoints(folder, None)
@@ -88,7 +89,7 @@ def test_without_a_plan_the_cameras_are_those_of_the_scene(tmp_path: Path) -> No
 
 
 def test_a_panorama_that_is_held_out_comes_from_the_scene(tmp_path: Path) -> None:
-    folder = make_run(tmp_path / "run", tmp_path / "scene")
+    folder = begun(tmp_path / "run", scene=tmp_path / "scene")
     save_plan(folder)
     with pytest.raises(InputError, match=r"^camera 1\.png: is not in the run's plan, and its scene: "):
         read_viewpoints(folder, None, "1.png")
@@ -159,7 +160,7 @@ def test_the_world_is_turned_so_that_y_is_up(folder: RunFolder) -> None:
 def test_photographs_are_small_and_turned_like_their_panoramas(tmp_path: Path) -> None:
     names = [f"pano_{i}.jpg" for i in range(6)]
     write_scene(tmp_path / "scene", names=names)
-    folder = make_run(tmp_path / "run", tmp_path / "scene")
+    folder = begun(tmp_path / "run", scene=tmp_path / "scene")
     save_model(folder, COARSE)
     save_plan(folder, names)
     shown = site_of_run(folder, Wanted())
@@ -221,7 +222,7 @@ WIDTH, HEIGHT = 800, 500  # pixels of a window
 
 def measuring_run(root: Path, metres: float | None) -> Path:
     """The page of two balls, two units apart, five units ahead of the first panorama."""
-    folder = make_run(root / "run")
+    folder = begun(root / "run")
     save_plan(folder)
     viewpoints = viewpoints_of(folder, "0.jpg")
     places = torch.tensor([[-1.0, 0.0, 5.0], [1.0, 0.0, 5.0], [0, 3.0, 30.0]])

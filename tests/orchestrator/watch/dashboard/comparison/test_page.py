@@ -11,8 +11,9 @@ from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.records import Record, RunBegan, ViewEvaluated
 from panolog.orchestrator.watch.views.comparison.page import write_comparison
 from panolog.workers.tasks import COARSE, EVAL
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.browser import PHONE, SMALL, opened, unreachable
-from tests.orchestrator.watch.dashboard.served import EVIL, Served, append, serving
+from tests.orchestrator.watch.dashboard.served import EVIL, Served, serving
 from tests.orchestrator.watch.views.comparison.runs import (
     VALUES,
     metrics,

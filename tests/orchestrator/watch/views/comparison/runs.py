@@ -8,9 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.orchestrator.runs.records import (
     BlockPlan,
     EvaluationSaved,
@@ -26,6 +24,7 @@ from panolog.orchestrator.runs.records import (
 )
 from panolog.orchestrator.runs.store import Database
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.history import begun
 
 BLOCKS = (TaskId.block(0), TaskId.block(1))
 VALUES = {"a.jpg": 20.0, "b.jpg": 24.0, "c.jpg": 28.0}  # WS-PSNR by panorama
@@ -47,10 +46,8 @@ def write(
     **config: Any,
 ) -> RunFolder:
     """A run folder with records at so many seconds after its start; by default those of a finished run."""
-    folder = RunFolder(root)
-    root.mkdir(parents=True)
-    settings = RunConfig(**{"width": 64, "iterations": 100, "device": "cpu", **config})
-    write_info(folder, make_info(SceneRef(path="/scenes/town", fingerprint=fingerprint), settings))
+    settings = {"iterations": 100, "device": "cpu"} | config
+    folder = begun(root, scene="/scenes/town", fingerprint=fingerprint, **settings)
     with closing(Database(folder.database)) as database:
         database.store([(_START + at, record) for at, record in (finished() if records is None else records)])
     if measured is not None:

@@ -23,10 +23,10 @@ from panolog.orchestrator.watch.views.pages.report import write_report
 from panolog.orchestrator.watch.views.palette import SEAM_GRADES
 from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.browser import PHONE, SMALL, opened, unreachable
 from tests.orchestrator.watch.dashboard.served import (
     EVIL,
-    append,
     progressed,
     serving,
     started,
