@@ -11,10 +11,10 @@ from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs.control import Action, ControlRequest
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.presence import Presence
-from panolog.orchestrator.runs.records import BlockPlan, NodeQuarantined, PlanSaved, RunBegan, TaskFailed
+from panolog.orchestrator.runs.records import BlockPlan, NodeQuarantined, PlanSaved, TaskFailed
 from panolog.workers.tasks import TaskId
 from tests.orchestrator.cli.program import call, one_line, shown
-from tests.orchestrator.history import append, begun
+from tests.orchestrator.history import BEGAN, append, begun
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def folder(tmp_path: Path) -> RunFolder:
     """A run with two blocks, of which the second has failed."""
     plan = PlanSaved("plan.json", tuple(BlockPlan(block, 4, 100, train=True) for block in (0, 1)))
     failed = TaskFailed(TaskId.block(1), 3, "NaN", final=True)
-    return begun(tmp_path / "run", RunBegan("host", 1, resumed=False), plan, failed)
+    return begun(tmp_path / "run", BEGAN, plan, failed)
 
 
 @pytest.fixture

@@ -39,9 +39,8 @@ from panolog.orchestrator.watch.follower.watcher import Watcher
 from panolog.scene.files import write_bytes
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.fakes import SetClock
-from tests.orchestrator.history import append, begun
+from tests.orchestrator.history import BEGAN, append, begun
 
-BEGAN = RunBegan("host", 1, resumed=False)
 STARTED = TaskStarted(COARSE, 1, 0, "gpu1", 2, "cpu", 2, node_id="n1")
 
 

@@ -29,6 +29,7 @@ from panolog.orchestrator.runs.state import RunState
 from panolog.orchestrator.watch.views.summary import task_label
 from panolog.orchestrator.watch.views.terminal import WIDE, page, progress
 from panolog.workers.tasks import EVAL, Stage
+from tests.orchestrator.history import started
 from tests.orchestrator.watch.views.test_timing import (
     MEASURED,
     MERGED,
@@ -39,7 +40,6 @@ from tests.orchestrator.watch.views.test_timing import (
     TRAINED,
     ZERO,
     Timed,
-    started,
     state,
 )
 

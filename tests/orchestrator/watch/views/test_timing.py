@@ -25,7 +25,6 @@ from panolog.orchestrator.runs.records import (
     ScoresSaved,
     Stored,
     TaskFailed,
-    TaskStarted,
     TaskYielded,
 )
 from panolog.orchestrator.runs.state import RunState, replay
@@ -33,6 +32,7 @@ from panolog.orchestrator.watch.views.history import History
 from panolog.orchestrator.watch.views.run_view import RunView, StageView, view_run
 from panolog.orchestrator.watch.views.summary import summarize
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.history import started
 
 INFO = {"config": {"blocks": "2x1x1", "refine": True}}
 ZERO, ONE, SHARD = TaskId.block(0), TaskId.block(1), TaskId.shard(0)
@@ -45,10 +45,6 @@ Timed = tuple[float, Record]
 
 def began(previous: float | None = None) -> RunBegan:
     return RunBegan("host", 7, resumed=previous is not None, previous=previous)
-
-
-def started(task: TaskId, iteration: int = 0) -> TaskStarted:
-    return TaskStarted(task, 1, iteration, "host", 8, "cpu", 1)
 
 
 def model(task: TaskId, seconds: float) -> ModelSaved:

@@ -8,20 +8,13 @@ import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.records import Record, RunBegan, ViewEvaluated
+from panolog.orchestrator.runs.records import Record, ViewEvaluated
 from panolog.orchestrator.watch.views.comparison.page import write_comparison
 from panolog.workers.tasks import COARSE, EVAL
-from tests.orchestrator.history import append
+from tests.orchestrator.history import BEGAN, append, started
 from tests.orchestrator.watch.dashboard.browser import PHONE, SMALL, opened, unreachable
 from tests.orchestrator.watch.dashboard.served import EVIL, Served, serving
-from tests.orchestrator.watch.views.comparison.runs import (
-    VALUES,
-    metrics,
-    progressed,
-    started,
-    write,
-    write_picture,
-)
+from tests.orchestrator.watch.views.comparison.runs import VALUES, metrics, progressed, write, write_picture
 from tests.visual.compare import expand
 
 pytestmark = pytest.mark.system
@@ -144,7 +137,7 @@ def test_any_two_runs_and_the_ground_truth_are_compared_and_runs_are_left_out(
 def test_the_page_follows_runs_that_train(browser: Browser, tmp_path: Path) -> None:
     write(tmp_path / "done", measured=metrics())
     begun: list[tuple[float, Record]] = [
-        (0.0, RunBegan("host", 1, resumed=False)),
+        (0.0, BEGAN),
         (0.0, started(COARSE)),
         (1.0, progressed(COARSE, 10, 90)),
     ]

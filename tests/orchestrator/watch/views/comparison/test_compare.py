@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.records import Outcome, Record, RunBegan, RunEnded
+from panolog.orchestrator.runs.records import Outcome, Record, RunEnded
 from panolog.orchestrator.watch.views.comparison.compare import compare
 from panolog.orchestrator.watch.views.comparison.curves import curves_of
 from panolog.orchestrator.watch.views.comparison.page import write_comparison
@@ -26,14 +26,8 @@ from panolog.orchestrator.watch.views.comparison.schema import Comparison
 from panolog.orchestrator.watch.views.comparison.terminal import table
 from panolog.scene.errors import InputError
 from panolog.workers.tasks import COARSE, TaskId
-from tests.orchestrator.watch.views.comparison.runs import (
-    finished,
-    metrics,
-    progressed,
-    started,
-    write,
-    write_picture,
-)
+from tests.orchestrator.history import BEGAN, started
+from tests.orchestrator.watch.views.comparison.runs import finished, metrics, progressed, write, write_picture
 from tests.orchestrator.watch.views.pages.snapshots import self_contained, snapshot_of
 
 HIGHER = {"a.jpg": 21.0, "b.jpg": 23.0, "c.jpg": 31.0}
@@ -84,7 +78,7 @@ def test_settings_that_differ_also_from_an_older_version(tmp_path: Path) -> None
 
 
 BEGUN: list[tuple[float, Record]] = [
-    (0.0, RunBegan("host", 1, resumed=False)),
+    (0.0, BEGAN),
     (0.0, started(COARSE)),
     (9.0, progressed(COARSE, 50, 9)),
 ]
@@ -163,7 +157,7 @@ def test_of_many_tasks_some_are_read_and_sums_are_of_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("panolog.orchestrator.watch.views.comparison.curves._TASKS", 2)
-    many: list[tuple[float, Record]] = [(0.0, RunBegan("host", 1, resumed=False))]
+    many: list[tuple[float, Record]] = [(0.0, BEGAN)]
     for number in range(5):
         task = TaskId.block(number)
         many += [(0.0, started(task)), (30.0, progressed(task, 50, 100)), (60.0, progressed(task, 100, 200))]

@@ -21,7 +21,7 @@ from panolog.orchestrator.engine.scheduling.pool import Failed
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.orchestrator.runs.info import read_info
-from panolog.orchestrator.runs.records import Noticed, RunBegan, Stored, TaskFailed
+from panolog.orchestrator.runs.records import Noticed, Stored, TaskFailed
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.dashboard.messages import (
     BlockCameras,
@@ -37,7 +37,7 @@ from panolog.scene.errors import InputError, RunError
 from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.fakes import Harness, fails
-from tests.orchestrator.history import append, begun
+from tests.orchestrator.history import BEGAN, append, begun
 from tests.orchestrator.watch.views.pages.snapshots import self_contained, snapshot_of
 from tests.visual.compare import expand
 from tests.workers.seams.test_schema import seam
@@ -135,7 +135,7 @@ def test_other_peoples_words_stay_words(tmp_path: Path) -> None:
     folder.root.mkdir()
     begin(folder, SCRIPT)
     failed = TaskFailed(COARSE, 1, SCRIPT, final=True)
-    append(folder, RunBegan("host", 1, resumed=False), Noticed(COARSE, SCRIPT), failed)
+    append(folder, BEGAN, Noticed(COARSE, SCRIPT), failed)
     write_json(folder.metrics, {"views": {SCRIPT: {"psnr": 1.0}}, "lpips_reason": SCRIPT})
     report = Report(write_report(folder))
     assert "alert(1)</script>" not in report.text
@@ -148,7 +148,7 @@ def test_a_run_that_has_hardly_begun_has_a_report_too(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     begin(folder)
     assert "runs/report/events" not in Report(write_report(folder)).answers
-    append(folder, RunBegan("host", 1, resumed=False))
+    append(folder, BEGAN)
     report = Report(write_report(folder))
     assert report.run.summary.label == "driver lost"
     assert [event["type"] for event in report["events"]["events"]] == ["RunBegan"]

@@ -25,13 +25,7 @@ from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.browser import PHONE, SMALL, opened, unreachable
-from tests.orchestrator.watch.dashboard.served import (
-    EVIL,
-    progressed,
-    serving,
-    started,
-    write_whole_run,
-)
+from tests.orchestrator.watch.dashboard.served import EVIL, progressed, serving, started, write_whole_run
 from tests.orchestrator.watch.views.models import save_model
 from tests.visual import legible
 from tests.visual.compare import expand
