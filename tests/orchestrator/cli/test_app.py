@@ -20,12 +20,6 @@ from tests.orchestrator.cli.program import call, finished, one_line, shown
 from tests.orchestrator.fakes import FakePool
 from tests.orchestrator.history import begun
 from tests.orchestrator.watch.views.comparison.runs import metrics, write
-from tests.scenes import write_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scene"))
 
 
 @pytest.fixture

@@ -18,11 +18,6 @@ pytestmark = pytest.mark.system
 PRICES = Path(__file__).parents[3] / "deploy" / "prices.toml"
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("queued") / "town")
-
-
 @pytest.fixture
 def here(tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("PANOLOG_QUEUE", str(tmp_path / "queue"))

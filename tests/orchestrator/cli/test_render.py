@@ -13,15 +13,14 @@ from panolog.scene.ply import write_ply
 from panolog.scene.read import read_scene
 from panolog.workers.training.initialise import scene_gaussians
 from tests.orchestrator.cli.program import call, one_line
-from tests.scenes import write_scene
 
 FRAMES = 4
 
 
 @pytest.fixture
-def ply(tmp_path: Path) -> Path:
+def ply(scene: Path, tmp_path: Path) -> Path:
     path = tmp_path / "model.ply"
-    write_ply(path, scene_gaussians(read_scene(write_scene(tmp_path / "scene"))))
+    write_ply(path, scene_gaussians(read_scene(scene)))
     return path
 
 

@@ -55,12 +55,10 @@ def shown(records: list[Timed], width: int, *, running: bool) -> str:
     """What a terminal shows a second after the last record."""
     began = time.time() - records[-1][0] - 1
     records = [(began + at, record) for at, record in records]
-    console = Console(file=StringIO(), width=width)
-    root = Path("runs/my street")
+    output, root = StringIO(), Path("runs/my street")
     content = page(state(records), root=root, running=running, wide=width >= WIDE)
-    console.print(content, crop=False)
-    assert isinstance(console.file, StringIO)
-    return console.file.getvalue()
+    Console(file=output, width=width).print(content, crop=False)
+    return output.getvalue()
 
 
 @pytest.mark.parametrize("width", [80, 160])
@@ -137,12 +135,10 @@ def test_machines_that_leave_are_shown_with_the_time_left_until_they_have_left(w
 
 def lines(*changes: tuple[RunState, Sequence[Record]]) -> list[str]:
     """What is printed of changes of a run where there is no terminal."""
-    console = Console(file=StringIO(), width=80)
-    with progress(console, Path("run")) as show:
+    with progress(Console(file=(output := StringIO()), width=80), Path("run")) as show:
         for state, records in changes:
             show(state, [Stored(number, 0.0, record) for number, record in enumerate(records, 1)])
-    assert isinstance(console.file, StringIO)
-    return console.file.getvalue().splitlines()
+    return output.getvalue().splitlines()
 
 
 def test_plain_lines_say_what_leaves_and_what_moves() -> None:
