@@ -49,9 +49,7 @@ def write_compressed_ply(path: StrPath, source: SplatSource) -> None:
 
     Reads the source three times and keeps 61 bytes of each Gaussian with spherical harmonics of degree 3.
 
-    Raises:
-        FormatError: there is no Gaussian.
-        OSError: the file cannot be written.
+    Raises FormatError: there is no Gaussian; OSError: the file cannot be written.
     """
     if not source.count:
         raise FormatError("there is no Gaussian to write; select more of the model")
@@ -76,8 +74,7 @@ def write_compressed_ply(path: StrPath, source: SplatSource) -> None:
 def read_compressed_ply(path: StrPath) -> Splats:
     """All Gaussians of a compressed PLY.
 
-    Raises:
-        PlyError: no compressed PLY, truncated, or damaged.
+    Raises PlyError: no compressed PLY, truncated, or damaged.
     """
     path = Path(path)
     if not path.is_file():

@@ -64,7 +64,6 @@ def to_geocentric(epsg: int, points: Doubles, geoid: float | None) -> Doubles:
     """(N, 3) metres in EPSG:4978 of points (N, 3): east, north and up, or geocentric, in the system's unit.
 
     Args: geoid, metres of the geoid above the ellipsoid there, if heights are above the sea.
-
     Raises ConfigError as `unit_of`, if the points are not within the system, or if it has heights above the
     sea and there is no grid for them.
     """

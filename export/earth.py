@@ -21,7 +21,6 @@ def geocentric(latitude: float, longitude: float, height: float) -> Doubles:
     """(3,) metres in the earth-centred, earth-fixed frame (EPSG:4978).
 
     Args: latitude and longitude in degrees, height in metres above the ellipsoid.
-
     Raises ValueError if there is no such place.
     """
     if not (-90 <= latitude <= 90 and math.isfinite(longitude) and math.isfinite(height)):

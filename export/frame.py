@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from panolog.scene.projection import fibonacci_sphere
+
 Doubles = NDArray[np.float64]
 
 Y_DOWN = (0.0, -1.0, 0.0)  # up in a world with COLMAP's axes, which a model without a scene is taken to have
@@ -75,10 +77,7 @@ def sh_rotations(rotation: Doubles) -> list[NDArray[np.float32]]:
     A turned function has at r the value that the old one has at rotationᵀ·r: for every degree that is linear
     in its coefficients, so a solution over many directions is exact.
     """
-    i = np.arange(_SAMPLES)
-    z, turn = 1 - (2 * i + 1) / _SAMPLES, i * np.pi * (3 - np.sqrt(5))  # a Fibonacci sphere
-    radius = np.sqrt(1 - z * z)
-    directions = np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
+    directions = fibonacci_sphere(_SAMPLES)
     new, old = sh_basis(directions), sh_basis(directions @ rotation)
     bands = [slice(d * d - 1, (d + 1) ** 2 - 1) for d in (1, 2, 3)]
     return [np.linalg.lstsq(new[:, b], old[:, b], rcond=None)[0].astype(np.float32) for b in bands]

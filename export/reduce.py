@@ -43,12 +43,10 @@ class Reduced:
 
     @property
     def count(self) -> int:
-        """How many there are."""
         return min(self.source.count, self.most)
 
     @property
     def degree(self) -> int:
-        """Of their spherical harmonics."""
         return self.source.degree
 
     def pieces(self) -> Iterator[Splats]:

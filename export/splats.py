@@ -125,16 +125,13 @@ class InMemory:
 
     @property
     def count(self) -> int:
-        """How many there are."""
         return len(self.splats)
 
     @property
     def degree(self) -> int:
-        """Of their spherical harmonics."""
         return self.splats.degree
 
     def pieces(self) -> Iterator[Splats]:
-        """All of them, `ROWS` or fewer at a time."""
         for start in range(0, len(self.splats), ROWS):
             yield self.splats.select(slice(start, start + ROWS))
 
@@ -198,7 +195,6 @@ class ModelSource:
 
     @property
     def degree(self) -> int:
-        """Of their spherical harmonics."""
         return self.selection.degree
 
     def part(self, part: Part) -> "ModelSource":

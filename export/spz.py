@@ -62,13 +62,10 @@ def write_spz(path: StrPath, source: SplatSource, version: Version = 3) -> None:
     bits as the smallest Gaussians need, at least 12, if all positions then fit; the header says how many.
 
     Args:
-        path: the file to appear.
-        source: what to write.
         version: 3 is what all readers know but PlayCanvas's engine, which reads 4 alone (Spark 2.2 does not).
 
-    Raises:
-        FormatError: there is no Gaussian, or one is more than 2048 units from the origin in an axis.
-        OSError: the file cannot be written.
+    Raises FormatError: there is no Gaussian, or one is more than 2048 units from the origin in an axis;
+    OSError: the file cannot be written.
     """
     with atomic(Path(path)) as temporary, temporary.open("w+b") as file:
         encode(file, source, version)
@@ -103,8 +100,7 @@ def encode(file: BinaryIO, source: SplatSource, version: Version = 3) -> None:
 def read_spz(path: StrPath) -> Splats:
     """All Gaussians of an SPZ of version 2, 3 or 4; degree 4 of spherical harmonics is left out.
 
-    Raises:
-        FormatError: no SPZ, another version, truncated, or damaged.
+    Raises FormatError: no SPZ, another version, truncated, or damaged.
     """
     path = Path(path)
     if not path.is_file():

@@ -138,11 +138,7 @@ class Plan:
     def to_json(self) -> dict[str, Any]:
         """The content of plan.json: plain values, readable without this program (`plan_json.PlanFile`)."""
         return plan_json.PlanFile(
-            rho_tri=self.config.rho_tri,
-            aspect=self.config.aspect,
-            tau_grad=self.config.tau_grad,
-            min_cameras=self.config.min_cameras,
-            min_share=self.config.min_share,
+            **self.config.model_dump(exclude={"cells", "cuts"}),
             grid=self.grid.shape if isinstance(self.grid, Grid) else None,
             cells=self.grid.layout if isinstance(self.grid, Grid) else self.config.cells,
             cuts=self.grid.cuts if isinstance(self.grid, Cuts) else (),
@@ -206,15 +202,7 @@ class Plan:
         places = np.array(pairs, np.int64).reshape(-1, 2).T
         gradient = csr_array((np.ones(len(pairs), np.bool_), tuple(places)), shape=(len(centers), grid.count))
         return Plan(
-            config=PartitionConfig(
-                rho_tri=file.rho_tri,
-                aspect=file.aspect,
-                tau_grad=file.tau_grad,
-                min_cameras=file.min_cameras,
-                min_share=file.min_share,
-                cells=file.cells,
-                cuts=file.cuts,
-            ),
+            config=PartitionConfig(**{name: getattr(file, name) for name in PartitionConfig.model_fields}),
             grid=grid,
             baseline=file.baseline,
             aabb=box,

@@ -103,8 +103,7 @@ def masks_among(images: Iterable[Path]) -> dict[Path, Path]:
 def list_panoramas(scene: Path) -> list[PanoramaFile]:
     """All panoramas in the image folder of a scene, by name; no model is needed.
 
-    Raises:
-        SceneError: there are none, or two differ only in their suffix.
+    Raises SceneError: there are none, or two differ only in their suffix.
     """
     root = scene.resolve()
     folder = image_folder(root)
@@ -121,8 +120,7 @@ def list_panoramas(scene: Path) -> list[PanoramaFile]:
 def list_posed_panoramas(scene: Path) -> list[PanoramaFile]:
     """The panoramas that the scene's model has, by name.
 
-    Raises:
-        SceneError: there is no model, it is damaged, or it names a picture that is missing.
+    Raises SceneError: there is no model, it is damaged, or it names a picture that is missing.
     """
     root = scene.resolve()
     where = model_folder(root)
@@ -141,8 +139,8 @@ def load_resized(path: Path, width: int) -> NDArray[np.uint8]:
 
     What is transparent has the colour of the nearest pixel that is not, so that it has no edge.
 
-    Raises:
-        SceneError: it is damaged, not 2:1, shows fisheye circles or two eyes, or is larger than any panorama.
+    Raises SceneError: it is damaged, not 2:1, shows fisheye circles or two eyes, or is larger than any
+    panorama.
     """
     info = read_info(path)
     check_panorama_size(path, info)

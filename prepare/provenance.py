@@ -44,8 +44,7 @@ class Provenance:
 def read_provenance(path: Path) -> Provenance | None:
     """The provenance of a layer; None of a file without one, which is the user's own, and without a file.
 
-    Raises:
-        OSError: the file is there but cannot be read.
+    Raises OSError: the file is there but cannot be read.
     """
     if not path.is_file():
         return None
@@ -69,8 +68,7 @@ def is_user_file(path: Path) -> bool:
 def read_layer(path: Path) -> NDArray[Any]:
     """The pixels (H, W) of a layer, as they are stored.
 
-    Raises:
-        SceneError: it is damaged, or larger than any panorama.
+    Raises SceneError: it is damaged, or larger than any panorama.
     """
     check_panorama_size(path, read_info(path))
     pixels = decode(path, cv2.IMREAD_UNCHANGED)

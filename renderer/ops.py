@@ -1,7 +1,8 @@
 """The kernels as torch custom ops: torch's dispatcher selects the device, autograd the backward pass."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from inspect import signature
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from panolog.renderer.motion import MOTION_SUMS
 
 HIDDEN, VISIBLE, INVALID = 0, 1, 2  # State in csrc/formulas.h
 
+_NAMES: dict[str, tuple[str, ...]] = {}  # of the arguments, by op
 _LIBRARY: Any = torch.library.Library("panolog", "DEF")  # type: ignore[no-untyped-call]
 
 
@@ -25,13 +27,19 @@ def _op(function: Callable[..., Any], mutates: tuple[str, ...] = ()) -> Callable
     name = function.__name__
     _LIBRARY.define(name + torch.library.infer_schema(function, mutates_args=mutates))
     _LIBRARY.impl(name, function, "CPU")
+    _NAMES[name] = tuple(signature(function).parameters)
     _LIBRARY.impl(name, partial(_on_gpu, name), "CUDA")
     op: Callable[..., Any] = getattr(torch.ops.panolog, name).default
     return op
 
 
+def named(op: str, arguments: Sequence[Any]) -> dict[str, Any]:
+    """The arguments that torch's dispatcher passes to an op, by their names."""
+    return dict(zip(_NAMES[op], arguments, strict=False))
+
+
 def _on_gpu(op: str, *arguments: Any) -> Any:
-    return card_module().run(op, *arguments)
+    return card_module().run(op, named(op, arguments))
 
 
 _threads: int | None = None

@@ -66,9 +66,8 @@ def read_panoramas(folder: Path) -> ColmapModel:
     A panorama is an EQUIRECTANGULAR camera, SphereSfM's SPHERE (which projects alike), or the dummy
     `PINHOLE W H W H W/2 H/2` of Pano360.
 
-    Raises:
-        SceneError: the model is damaged, its poses are broken or its cameras are not panoramas.
-        OSError: a file of it cannot be read.
+    Raises SceneError: the model is damaged, its poses are broken or its cameras are not panoramas; OSError: a
+    file of it cannot be read.
     """
     for camera in read_cameras(folder).values():
         _check_panorama(folder, camera)
@@ -79,12 +78,8 @@ def read_panoramas(folder: Path) -> ColmapModel:
 def read_colmap(folder: Path, *, observations: bool = True) -> ColmapModel:
     """Reads cameras, images and points3D from `folder`, binary if it has cameras.bin, else text.
 
-    Args:
-        observations: whether to keep the observations of the images.
-
-    Raises:
-        SceneError: a file is missing or damaged; the message names it and what in it.
-        OSError: a file cannot be read.
+    Raises SceneError: a file is missing or damaged; the message names it and what in it; OSError: a file
+    cannot be read.
     """
     cameras = read_cameras(folder)
     records = list(read_image_records(folder, observations=observations))
@@ -112,7 +107,6 @@ def write_colmap(
     Each file appears atomically, points3D.bin last: where it is, the model is whole.
 
     Args:
-        folder: where cameras.bin and the others go, such as SCENE/sparse/0; made if missing.
         images: world-to-camera; images and points have ids from 1 in their order.
         width, height: pixels.
         points: (P, 3) world units.

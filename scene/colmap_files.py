@@ -83,8 +83,7 @@ class PointRecords:
 def read_cameras(folder: Path) -> dict[int, ColmapCamera]:
     """The cameras of the model in `folder` by id.
 
-    Raises:
-        SceneError: the file is missing or damaged, or a camera is neither a panorama nor a pinhole.
+    Raises SceneError: the file is missing or damaged, or a camera is neither a panorama nor a pinhole.
     """
     path = _file(folder, "cameras")
     cameras = _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
@@ -253,7 +252,8 @@ def _text_images(path: Path, observations: bool) -> Iterator[ImageRecord]:
         pose = _numbers(where, words[1:8])
         number, camera = _numbers(where, [words[0], words[8]])
         if "\ufffd" in words[9]:
-            raise SceneError(f"{where}: the image name `{_ascii(words[9])}` is not UTF-8; rename it")
+            shown = words[9][:60].encode("ascii", "replace").decode()
+            raise SceneError(f"{where}: the image name `{shown}` is not UTF-8; rename it")
         entries = second.split()
         if len(entries) % 3:
             raise SceneError(f"{below}: the points of {words[9][:60]} are not triples; the file is truncated")
@@ -334,10 +334,6 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
 def _records(lines: Iterator[tuple[str, str]]) -> Iterator[tuple[str, str]]:
     """The lines that are neither empty nor comments."""
     return ((where, line) for where, line in lines if line and not line.startswith("#"))
-
-
-def _ascii(name: str) -> str:
-    return name[:60].encode("ascii", "replace").decode()
 
 
 def _numbers(where: str, words: Sequence[str]) -> list[float]:

@@ -63,11 +63,9 @@ def fit_affine(prior: Array, inverse: Array, seed: int, share: Array | None = No
     Args:
         prior: (M,) monocular values at M ≥ 2 points.
         inverse: (M,) inverse radial depths 1/r of the same points.
-        seed: for the choice of trial lines.
         share: (M,) weight of each point; 1 if left out.
 
-    Raises:
-        AlignmentError: the prior is constant.
+    Raises AlignmentError: the prior is constant.
     """
     share = np.ones(len(prior)) if share is None else share
     line = _least_median(prior, inverse, generator(seed, "depth", "alignment", len(prior)))
@@ -219,16 +217,13 @@ def align_depth(
     the sky mask where there is one, without it where the prior is 0.
 
     Args:
-        scene: its panorama `view.row` and its points are used.
         view: the decoded panorama; its image is not used.
-        seed: for the choice of trial lines.
         kind: "inverse" or "depth": what the depth image holds.
         min_points: usable points below which the prior is refused.
         max_residual: median residual, as a fraction of the points' spread, above which it is refused.
 
-    Raises:
-        AlignmentError: there are too few points or the result is implausible; the message is the reason.
-        ValueError: the view has no depth image.
+    Raises AlignmentError: there are too few points or the result is implausible; the message is the reason;
+    ValueError: the view has no depth image.
     """
     panorama = scene.panoramas[view.row]
     if view.inverse_depth is None:

@@ -76,8 +76,7 @@ def atomic(path: Path) -> Iterator[Path]:
     The bytes are on the disk before the name is, so neither a kill nor a power cut leaves half a file under
     `path`. If the block raises, what is at `path` stays.
 
-    Raises:
-        OSError: the folder is missing or cannot be written, or the disk is full.
+    Raises OSError: the folder is missing or cannot be written, or the disk is full.
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{SUFFIX}")
     try:
@@ -94,8 +93,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     What was there is removed; a power cut between the two renames leaves it as `.NAME.….part`. If the block
     raises, it stays.
 
-    Raises:
-        OSError: the folder above is missing or cannot be written, or the disk is full.
+    Raises OSError: the folder above is missing or cannot be written, or the disk is full.
     """
     new, old = (folder.with_name(f".{folder.name}.{secrets.token_hex(4)}{SUFFIX}") for _ in range(2))
     new.mkdir()

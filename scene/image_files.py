@@ -47,9 +47,7 @@ def read_info(path: Path) -> ImageInfo:
 
     JPEG, PNG, WebP and usual TIFFs are read at their ends only; any other format is decoded.
 
-    Raises:
-        SceneError: the file is missing, truncated or no image.
-        OSError: the file cannot be read.
+    Raises SceneError: the file is missing, truncated or no image; OSError: the file cannot be read.
     """
     if not path.is_file():
         raise SceneError(f"{path}: there is no such image")
@@ -70,9 +68,8 @@ def read_info(path: Path) -> ImageInfo:
 def decode(path: Path, flags: int) -> NDArray[Any]:
     """The pixels of an image file as OpenCV gives them with `flags`: (H, W) or (H, W, channels), BGR.
 
-    Raises:
-        ImageError: the file is truncated or cannot be decoded.
-        SceneError: it is missing or cannot be read.
+    Raises ImageError: the file is truncated or cannot be decoded; SceneError: it is missing or cannot be
+    read.
     """
     return _decoded(path, _read(path), flags)
 
@@ -130,9 +127,8 @@ def decode_panorama(path: Path, width: int | None = None, reduction: int = 1) ->
     of 2, 4 or 8 a JPEG is decoded at that fraction of its size, in a fraction of the time and memory. Other
     formats are decoded whole: OpenCV would take a few pixels of each square and leave the others out.
 
-    Raises:
-        ImageError: the file is truncated, cannot be decoded or is not 2:1.
-        SceneError: it is missing or cannot be read.
+    Raises ImageError: the file is truncated, cannot be decoded or is not 2:1; SceneError: it is missing or
+    cannot be read.
     """
     return decode_with_alpha(path, width, reduction)[0]
 
@@ -145,8 +141,7 @@ def decode_with_alpha(
     None where all of it is to be used. A resized pixel that mixes in anything transparent is not used, and
     its colour is that of its parts by how opaque they are, whatever the file has below transparent ones.
 
-    Raises:
-        ImageError, SceneError: as `decode_panorama`.
+    Raises ImageError, SceneError: as `decode_panorama`.
     """
     data = _read(path)
     reduction = reduction if data.startswith(_JPEG) else 1
@@ -179,8 +174,7 @@ def not_a_panorama(path: Path, width: int, height: int) -> ImageError:
 def decode_used(path: Path) -> NDArray[np.bool_] | None:
     """(H, W) True = use, of a picture's alpha channel: as `decode_with_alpha` without resizing.
 
-    Raises:
-        ImageError, SceneError: as `decode_panorama`.
+    Raises ImageError, SceneError: as `decode_panorama`.
     """
     opacity = _opacity(path, _read(path))
     return None if opacity is None or opacity.all() else opacity > 0
@@ -192,8 +186,7 @@ def decode_mask(path: Path) -> NDArray[np.bool_]:
     White may be 255 or 1. Where there is white, what is darker than half of it is black, as at edges and in
     JPEGs; in a map of classes, without white, 0 is.
 
-    Raises:
-        ImageError, SceneError: as `decode`.
+    Raises ImageError, SceneError: as `decode`.
     """
     pixels = decode(path, cv2.IMREAD_UNCHANGED)
     opaque = np.ones(pixels.shape[:2], bool)
@@ -263,8 +256,7 @@ def check_images(paths: Sequence[Path]) -> tuple[int, int]:
 def read_infos(paths: Sequence[Path]) -> list[ImageInfo]:
     """The headers of panoramas, which all have one size.
 
-    Raises:
-        SceneError: a file is missing, truncated or of another size than the first, or they are not 2:1.
+    Raises SceneError: a file is missing, truncated or of another size than the first, or they are not 2:1.
     """
     if missing := [path for path in paths if not path.is_file()]:
         more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
@@ -287,8 +279,7 @@ def read_infos(paths: Sequence[Path]) -> list[ImageInfo]:
 def check_layer(paths: Sequence[Path | None], bits: int) -> None:
     """Checks masks (up to 8 bit) or depth maps (16 bit): whole, 2:1; depth maps have one channel.
 
-    Raises:
-        SceneError: one of them is not.
+    Raises SceneError: one of them is not.
     """
     for path in filter(None, paths):
         info = read_info(path)
@@ -303,8 +294,7 @@ def check_layer(paths: Sequence[Path | None], bits: int) -> None:
 def layer_record(path: Path) -> tuple[str, str] | None:
     """The record in a layer that PanoLOG made: key and digest (`prepare.provenance`); None without one.
 
-    Raises:
-        OSError: the file is missing or cannot be read.
+    Raises OSError: the file is missing or cannot be read.
     """
     with path.open("rb") as file:
         found = _RECORD.search(file.read(_RECORD_SEARCHED))

@@ -144,18 +144,14 @@ class PanoramaCache:
         """Opens nothing yet.
 
         Args:
-            scene: the scene.
-            rows: the rows of scene.panoramas that will be requested.
             width: pixels of the views, even and at most the scene's; their height is half of it.
             budget: bytes of decoded views to keep in the host's memory.
             locate: where the scene's files are; called by the threads that decode.
             device: where the views of `get` are, "cpu" or "cuda".
             room: bytes of decoded views that stay on a GPU, beyond those on their way (`passing_views`).
             threads: cores of the task, which a GPU's views are decoded on. On the CPU training needs them.
-            upload: how views get to the device; by default as the device requires.
 
-        Raises:
-            ConfigError: `width` is odd or more than the panoramas have.
+        Raises ConfigError: `width` is odd or more than the panoramas have.
         """
         self._panoramas = {row: scene.panoramas[row] for row in rows}
         if width < 2 or width % 2 or width > scene.width:
@@ -195,9 +191,7 @@ class PanoramaCache:
     def get(self, row: int) -> View:
         """The view of scene.panoramas[row]; waits until it is decoded, not until it is on a GPU.
 
-        Raises:
-            SceneError: one of its files cannot be decoded.
-            KeyError: `row` is not one of the cache's rows.
+        Raises SceneError: one of its files cannot be decoded; KeyError: `row` is not one of the cache's rows.
         """
         return self._upload.finish(self._request(row).result()[1])
 
@@ -261,21 +255,19 @@ def load_view(
     """Decodes one panorama and what belongs to it, found with `locate`, at (width / 2, width) pixels.
 
     Args: layers, which may have some already.
-
-    Raises:
-        SceneError: one of its files cannot be decoded.
+    Raises SceneError: one of its files cannot be decoded.
     """
     image, opaque = decode_with_alpha(locate(panorama.image), width)
     found = _load_layers(panorama, row, width, layers or DecodedLayers(locate=locate), opaque)
     return replace(found, image=torch.from_numpy(image))
 
 
-def load_layers(panorama: Panorama, row: int, width: int, locate: Locate = here) -> View:
+def load_layers(panorama: Panorama, row: int, width: int) -> View:
     """As `load_view`, but without the picture: `image` has no pixels."""
-    opaque = decode_used(locate(panorama.image)) if panorama.transparent else None
+    opaque = decode_used(panorama.image) if panorama.transparent else None
     if opaque is not None:
         opaque = resize_used(opaque, (width, width // 2))
-    return _load_layers(panorama, row, width, DecodedLayers(locate=locate), opaque)
+    return _load_layers(panorama, row, width, DecodedLayers(), opaque)
 
 
 def _load_layers(

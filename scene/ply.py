@@ -39,13 +39,8 @@ _ROW = np.dtype([(name, "<f4") for name in COLUMNS])
 def write_ply(path: StrPath, gaussians: Gaussians, *, offset: Vector = NO_OFFSET) -> None:
     """Writes Gaussians as a PLY, atomically.
 
-    Args:
-        path: the file to appear.
-        gaussians: what to write.
-        offset: `Scene.offset`, for a comment; the positions are written as they are.
-
-    Raises:
-        OSError: the file cannot be written.
+    Args: offset, `Scene.offset`, for a comment; the positions are written as they are.
+    Raises OSError: the file cannot be written.
 
     >>> import panolog
     >>> panolog.write_ply("model.ply", panolog.initial_gaussians(panolog.read_scene(SCENE)))
@@ -67,17 +62,14 @@ def write_ply_parts(
     """Writes the Gaussians of all parts, in order, atomically.
 
     Args:
-        path: the file to appear.
         parts: any number of Gaussians; the sky of all of them together is the last `sky` rows.
         count: rows of all parts together, because the header comes first.
         sky: how many of them, at the end, are sky.
-        offset: as in `write_ply`.
         exact: `Gaussians.exact` of all of them.
         exported: degree of the spherical harmonics of a file for viewers, to which they were turned.
 
-    Raises:
-        ValueError: the parts are not `count` rows, or their sky is not the last `sky` rows.
-        OSError: the file cannot be written.
+    Raises ValueError: the parts are not `count` rows, or their sky is not the last `sky` rows; OSError: the
+    file cannot be written.
     """
     rest = SH_REST if exported is None else _REST_OF_DEGREE[exported]
     with atomic(path) as temporary, temporary.open("wb") as file:
@@ -105,15 +97,11 @@ def join_ply(
     """Writes rows of other PLYs, in order, as they stand there, atomically: at the speed of the disk.
 
     Args:
-        path: the file to appear.
         parts: files that `write_ply` wrote, each with the rows to take: a range with step 1, or (n,) numbers.
         sky: how many rows, at the end of all, are sky.
-        offset: as in `write_ply`.
         exact: `Gaussians.exact` of all of them.
 
-    Raises:
-        PlyError: a file is truncated, or has another layout.
-        OSError: a file cannot be read or written.
+    Raises PlyError: a file is truncated, or has another layout; OSError: a file cannot be read or written.
     """
     with atomic(path) as temporary, temporary.open("wb", buffering=0) as file:
         file.write(_header(sum(len(rows) for _, rows in parts), sky, offset, exact))
@@ -132,8 +120,7 @@ def read_ply(path: StrPath) -> Gaussians:
 
     Needs hardly more memory than they take.
 
-    Raises:
-        PlyError: not a binary PLY of Gaussians, or truncated.
+    Raises PlyError: not a binary PLY of Gaussians, or truncated.
 
     >>> import panolog
     >>> len(panolog.read_ply(MODEL))
@@ -153,8 +140,7 @@ def read_ply(path: StrPath) -> Gaussians:
 def read_ply_chunks(path: Path, rows: int = CHUNK) -> Iterator[Gaussians]:
     """The Gaussians of `read_ply` in order, at most `rows` at a time.
 
-    Raises:
-        PlyError: not a binary PLY of Gaussians, or truncated.
+    Raises PlyError: not a binary PLY of Gaussians, or truncated.
     """
     table, rest, sky = _open(path)
     for start in range(0, table.count, rows):
@@ -182,8 +168,7 @@ def read_sky(path: Path) -> Gaussians:
 def ply_header(path: Path) -> tuple[int, int]:
     """(Gaussians, how many of them at the end are sky).
 
-    Raises:
-        PlyError: not a binary PLY of Gaussians, or truncated.
+    Raises PlyError: not a binary PLY of Gaussians, or truncated.
     """
     table, _, sky = _open(path)
     return table.count, sky

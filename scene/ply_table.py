@@ -38,8 +38,7 @@ class Table:
     def rows(self, start: int, stop: int) -> NDArray[Any]:
         """Rows start to stop (exclusive) as records of `dtype`.
 
-        Raises:
-            PlyError: the file has become shorter since its header was read.
+        Raises PlyError: the file has become shorter since its header was read.
         """
         records = np.fromfile(
             self.path, self.dtype, stop - start, offset=self.offset + start * self.dtype.itemsize
@@ -62,8 +61,7 @@ class Header:
 def read_header(path: Path, file: BinaryIO) -> Header:
     """Reads the header of a PLY; `file` is then at the first row.
 
-    Raises:
-        PlyError: no PLY, another first element than `vertex`, or a list property.
+    Raises PlyError: no PLY, another first element than `vertex`, or a list property.
     """
     lines = _header_lines(path, file)
     words = [line.split() for line in lines if line and not line.startswith(("comment", "obj_info"))]
@@ -90,8 +88,7 @@ def read_header(path: Path, file: BinaryIO) -> Header:
 def read_table(path: Path) -> Table:
     """Reads the header of a binary PLY and checks that all rows of its first element, `vertex`, are there.
 
-    Raises:
-        PlyError: no such file, no PLY, ASCII, another first element, a list property, or truncated.
+    Raises PlyError: no such file, no PLY, ASCII, another first element, a list property, or truncated.
     """
     if not path.is_file():
         raise PlyError(f"{path}: there is no such file")
@@ -112,8 +109,7 @@ def read_table(path: Path) -> Table:
 def read_vertices(table: Table) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
     """Positions (P, 3) and colours (P, 3) of a point cloud, None where it has none.
 
-    Raises:
-        PlyError: no position, or colours that are not 8 bit.
+    Raises PlyError: no position, or colours that are not 8 bit.
     """
     position, color = point_columns(table.path, table.dtype.names or ())
     if any(table.dtype[name] != np.uint8 for name in color):
@@ -126,8 +122,7 @@ def read_vertices(table: Table) -> tuple[NDArray[np.float64], NDArray[np.uint8] 
 def point_columns(path: Path, names: Sequence[str]) -> tuple[list[str], list[str]]:
     """The names of a point cloud's columns: x y z, and red green blue or diffuse_red and so on, or none.
 
-    Raises:
-        PlyError: x, y or z is missing.
+    Raises PlyError: x, y or z is missing.
     """
     if missing := [name for name in "xyz" if name not in names]:
         raise PlyError(f"{path}: the point cloud has no column {missing[0]}")
@@ -141,8 +136,7 @@ def point_columns(path: Path, names: Sequence[str]) -> tuple[list[str], list[str
 def sky_of(table: Table) -> int:
     """How many rows at the end are sky Gaussians, from the comment `panolog sky N`; 0 without one.
 
-    Raises:
-        PlyError: more than there are rows.
+    Raises PlyError: more than there are rows.
     """
     found = [re.fullmatch(r"panolog sky (\d+)", comment) for comment in table.comments]
     sky = next((int(match[1]) for match in found if match), 0)
@@ -161,8 +155,7 @@ def exact_of(table: Table) -> bool:
 def offset_of(table: Table) -> Vector:
     """What is to be added to its positions, from the comment `panolog offset X Y Z`; nothing without one.
 
-    Raises:
-        PlyError: they are no three numbers.
+    Raises PlyError: they are no three numbers.
     """
     found = next((it.split()[2:] for it in table.comments if it.startswith("panolog offset ")), None)
     if found is None:

@@ -48,13 +48,9 @@ def read_scene(path: StrPath) -> Scene:
 
     Every image file is opened and found complete, but none is decoded.
 
-    Args:
-        path: the scene's folder, or its URL in an object store: `Scene.root` is then its outline here.
-
-    Raises:
-        SceneError: what is wrong with it, in one line.
-        PlyError: its points3D.ply is damaged.
-        StoreError, StoreLostError: the store has no such scene, refuses access or fails.
+    Args: path, the scene's folder, or its URL in an object store: `Scene.root` is then its outline here.
+    Raises SceneError: what is wrong with it, in one line; PlyError: its points3D.ply is damaged; StoreError,
+    StoreLostError: the store has no such scene, refuses access or fails.
 
     >>> import panolog
     >>> scene = panolog.read_scene(SCENE)
@@ -81,8 +77,7 @@ def _read_stored(url: str) -> Scene:
 def model_folder(root: Path) -> Path:
     """Where the COLMAP model of a scene is.
 
-    Raises:
-        SceneError: there is no scene or no model.
+    Raises SceneError: there is no scene or no model.
     """
     if not root.is_dir():
         what = "is a file" if root.exists() else "there is no such folder"
@@ -120,8 +115,7 @@ def find_offset(centers: NDArray[np.float64]) -> Vector | None:
 def check_names(where: Path, names: Sequence[str]) -> None:
     """Checks that names of panoramas stay in the image folder and that their stems are unique.
 
-    Raises:
-        SceneError: a name is absolute, has `..` or is not UTF-8, or two differ only in their extension.
+    Raises SceneError: a name is absolute, has `..` or is not UTF-8, or two differ only in their extension.
     """
     for name in names:
         if not (plain := name.encode("utf-8", "replace").decode()) == name:
@@ -139,13 +133,9 @@ def read_split(root: Path, stems: Sequence[str]) -> tuple[tuple[int, ...], tuple
     `root/train.txt` and `root/test.txt` hold one stem a line. With one of the two, the other set is the rest;
     with both, what neither names is left out; with none, every 8th is test.
 
-    Args:
-        root: the scene's folder.
-        stems: names of the panoramas without extension, in natural order.
-
-    Raises:
-        SceneError: a file is not UTF-8 or names what the scene does not have, a panorama is in both, or a set
-            is empty.
+    Args: stems, names of the panoramas without extension, in natural order.
+    Raises SceneError: a file is not UTF-8 or names what the scene does not have, a panorama is in both, or a
+    set is empty.
     """
     rows = {stem: row for row, stem in enumerate(stems)}
     train, test = (_read_split_file(root / name, rows) for name in ("train.txt", "test.txt"))
@@ -238,8 +228,7 @@ def _affine_of(depth: Path | None, affine: tuple[float, float] | None) -> tuple[
 def find_layer(root: Path, layer: str, names: Sequence[str]) -> list[Path | None]:
     """The file of each panorama in the folder `layer`: STEM.png, or NAME.png as COLMAP names masks.
 
-    Raises:
-        SceneError: the folder is there, but no panorama has a file in it.
+    Raises SceneError: the folder is there, but no panorama has a file in it.
     """
     folder = root / layer
     if not folder.is_dir():
@@ -263,8 +252,7 @@ def _read_depth_params(folder: Path) -> dict[str, tuple[float, float]]:
 
     They are as the file has them: where a fit failed, tools write a scale of 0 or NaN.
 
-    Raises:
-        SceneError: the file is not JSON of that form.
+    Raises SceneError: the file is not JSON of that form.
     """
     path = folder / "depth_params.json"
     if not path.is_file():

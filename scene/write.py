@@ -117,12 +117,10 @@ def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress =
     """Writes `new` to the folder `output`, which must be new or empty.
 
     Args:
-        link: link the panoramas and their layers instead of copying them.
         progress: called after each panorama that is copied, and again after each that gives points a colour.
 
-    Raises:
-        SceneError: it could not be trained; `output` is then untouched.
-        OSError: a file cannot be read or written.
+    Raises SceneError: it could not be trained; `output` is then untouched; OSError: a file cannot be read or
+    written.
     """
     target = output.resolve()
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -216,7 +216,9 @@ def _block(streets: Streets, column: int, row: int, seed: int) -> list[Shape]:
     if row == 0:
         return shapes + _river(random)
     if kind == 1:
-        return shapes + (_church, _monument, _park)[(column + row) % 3](random)
+        if (column + row) % 3 == 0:
+            return shapes + _paved(random) + moved(church(), PITCH / 2 - 57.8, PITCH / 2)
+        return shapes + (_monument if (column + row) % 3 == 1 else _park)(random)
     style = _STYLES[(seed + column // _DISTRICT + 2 * (row // _DISTRICT)) % len(_STYLES)]
     rows = zip(houses(random, style), _avenues(random, style), (south, north, west, east), strict=True)
     for facing, trees, there in rows:
@@ -293,10 +295,6 @@ def _paved(random: np.random.Generator) -> list[Shape]:
     for x, y in product((17.5, 38.5), (edge + 3, PITCH - edge - 3)):
         shapes += _bench(x, y)
     return shapes
-
-
-def _church(random: np.random.Generator) -> list[Shape]:
-    return _paved(random) + moved(church(), PITCH / 2 - 57.8, PITCH / 2)
 
 
 def _monument(random: np.random.Generator) -> list[Shape]:

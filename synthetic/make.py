@@ -156,9 +156,7 @@ def make_place(
         progress: called first with 0, then after each panorama, in order: how many are done, and of how many.
             Each counts twice: its picture, and what it sees of the sparse cloud.
 
-    Raises:
-        ConfigError: too few panoramas, or a width that cannot be.
-        OSError: `folder` cannot be written.
+    Raises ConfigError: too few panoramas, or a width that cannot be; OSError: `folder` cannot be written.
     """
     panoramas = len(place.centers)
     for part in ("images", "depths", "skymasks"):

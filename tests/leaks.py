@@ -197,9 +197,18 @@ def _command(pid: int) -> str:
 
 
 def _parent(pid: int) -> int:
-    """The parent of a process; 0 of one that is gone."""
-    fields = _bytes(_PROC / str(pid) / "stat").rpartition(b")")[2].split()
-    return int(fields[1]) if fields else 0
+    """The parent of a process; 0 of one that is gone.
+
+    It is read of all processes around each test; without Path and a file object, in a third of the time.
+    """
+    with suppress(OSError):
+        file = os.open(f"{_PROC}/{pid}/stat", os.O_RDONLY)
+        try:
+            fields = os.read(file, 4096).rpartition(b")")[2].split()  # a name and 52 numbers: < 1200 bytes
+        finally:
+            os.close(file)
+        return int(fields[1]) if fields else 0
+    return 0
 
 
 def _sockets() -> set[str]:

@@ -1,20 +1,8 @@
 """Bytes of a GPU that a task needs, by counting the tensors that live at once in its largest moments.
 
-A test (tests/workers/test_device_memory.py) runs the same code on tensors without memory and compares. With
-10 M Gaussians at 4096 x 2048 the backward pass of a training iteration with exact projection takes 12.5 GB.
-With affine projection it takes 6 % less, which is not counted:
-
-    bytes of a Gaussian                                 bytes of a pixel
-    parameters and both moments of Adam      3 x 236    colour, alpha, inverse depth     20
-    their gradients                              236    and the gradients of these       20
-    splat, its rays, their gradient      128 + 52    three panoramas, depth targets   42
-    screen position, and its gradient          8 + 8
-    tiles met, where they end, state, depth       17    and of a pair of a splat and a tile 5
-    statistics of densification                    8
-    units of two rates                             8
-
-Each moment is a sum of such terms, and the need is that of the largest one. A densification holds the old and
-the new parameters or moments of one kind at a time, without gradients: less than an iteration.
+A test (tests/workers/test_device_memory.py) runs the same code on tensors without memory and compares;
+docs/design.md has the terms. The need is that of the largest moment. A densification holds the old and the
+new parameters or moments of one kind at a time, without gradients: less than an iteration.
 """
 
 from collections.abc import Sequence

@@ -98,21 +98,17 @@ def _evaluate_views(spec: EvaluateSpec, model: Gaussians, steps: _Steps) -> Iter
             panorama, view = scene.panoramas[row], views.get(row)
             yield from views.notices()
             if view is not None:
-                metrics, png = _measured(spec, model, panorama, view, lpips)
-                fitted = None
+                options = spec.width, spec.near, spec.crop_bottom, lpips
+                metrics, png = evaluate_view(model, panorama, view, *options)
+                there: dict[str, float | None] | None = None
                 for fit in _fits(spec, model, scene, view):
                     yield from steps.alive()
-                    fitted = fit
-                there = None if fitted is None else _at(spec, model, panorama, view, lpips, fitted)
+                    fitted = replace(panorama, rotation=fit.rotation, translation=fit.translation)
+                    there = {"pixels": fit.pixels}
+                if there is not None:
+                    there = evaluate_view(model, fitted, view, *options)[0] | there
                 yield Evaluated(spec.task, panorama.name, metrics, png, there)
             yield from steps.done()
-
-
-def _measured(
-    spec: EvaluateSpec, model: Gaussians, panorama: Panorama, view: View, lpips: Lpips | None
-) -> tuple[dict[str, float | None], bytes]:
-    crop = spec.crop_bottom
-    return evaluate_view(model, panorama, view, spec.width, spec.near, crop_bottom=crop, lpips=lpips)
 
 
 def _fits(spec: EvaluateSpec, model: Gaussians, scene: Scene, view: View) -> Iterator[PoseFit]:
@@ -132,21 +128,12 @@ def _fits(spec: EvaluateSpec, model: Gaussians, scene: Scene, view: View) -> Ite
     )
 
 
-def _at(
-    spec: EvaluateSpec, model: Gaussians, panorama: Panorama, view: View, lpips: Lpips | None, fit: PoseFit
-) -> dict[str, float | None]:
-    """The metrics at a fitted pose, and as "pixels" how far that is from the panorama's own."""
-    there = replace(panorama, rotation=fit.rotation, translation=fit.translation)
-    return _measured(spec, model, there, view, lpips)[0] | {"pixels": fit.pixels}
-
-
 def evaluate_view(
     model: Gaussians,
     panorama: Panorama,
     view: View,
     width: int,
     near: float,
-    *,
     crop_bottom: float = 0.0,
     lpips: Lpips | None = None,
 ) -> tuple[dict[str, float | None], bytes]:

@@ -150,8 +150,7 @@ def _gradient(
     spec: ScoreSpec, scene: Scene, model: Gaussians, view: View, near: float
 ) -> tuple[PhotometricLoss, Tensor]:
     """The rendering loss of one view, and its gradient by the means (N - sky, 3)."""
-    panorama = scene.panoramas[view.row]
-    camera = Camera.of(panorama.rotation, panorama.translation, spec.width, spec.width // 2)
+    camera = Camera.at(scene.panoramas[view.row], spec.width)
     color = render(model, camera, sh_degree=spec.config.sh.degree, near=near).color
     rows, weight = loss_rows(spec.config.loss, view), spec.config.loss.lambda_ssim
     loss = photometric_loss(color, view.image, view.mask, weight, rows, view.exposure)

@@ -18,13 +18,11 @@ from scipy.sparse import csr_array
 
 from benchmarks import report
 from benchmarks.paper import pages, study, tables
-from benchmarks.paper.crops import Comparison, compare
 from benchmarks.paper.goals import KINDS
-from benchmarks.paper.measure import Gallery
 from benchmarks.paper.results import Result, Results
 from benchmarks.paper.runner import Bench, run_all
 from benchmarks.paper.study import Study
-from benchmarks.paper.variants import Settings, Variant, groups, stages, variants
+from benchmarks.paper.variants import Settings, groups, stages, variants
 from panolog.orchestrator.runs.config import load_config
 from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.orchestrator.runs.machines.machine import cores
@@ -32,11 +30,9 @@ from panolog.partition.plan import Plan, read_plan
 from panolog.partition.scores import read_scores
 from panolog.renderer.process import prepare
 from panolog.scene.errors import InputError
-from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 from panolog.workers.training.recipes import RECIPES
 
-_SHOWN = ("paper", "authors", "panolog", "panolog-time", "panolog-stage1")  # in crops
 _PLANS = ("paper", "authors", "panolog")  # whose overlap is shown
 
 
@@ -148,7 +144,7 @@ def measure(options: argparse.Namespace, settings: Settings) -> Study:
         so_far().save(options.output)
     made = so_far()
     made.save(options.output)
-    pages.write(options.output, made, [c for b in benches if b.seed == 0 for c in _crops(b, chosen)])
+    pages.write(options.output, made)
     return made
 
 
@@ -171,18 +167,6 @@ def _words(options: argparse.Namespace) -> list[str]:
     words += ["--blocks", options.blocks, "--seeds", str(options.seeds)]
     words += [part for setting in options.sets for part in ("--set", setting)]
     return words + [part for scene, kind in options.kinds.items() for part in ("--kind", f"{scene}={kind}")]
-
-
-def _crops(bench: Bench, chosen: Sequence[Variant]) -> list[Comparison]:
-    """Of the variants that matter most, or of the first ones where none of these was run."""
-    names = [v.name for v in chosen if v.name in bench.done and not bench.done[v.name].result.same_as]
-    shown = [name for name in names if name in _SHOWN]
-    shown = shown if len(shown) > 1 else names[: len(_SHOWN)]
-    if not shown:
-        return []
-    gallery = Gallery.of(bench.done[shown[0]].root, bench.settings.device)
-    models = {name: read_ply(RunFolder(bench.done[name].root).point_cloud) for name in shown}
-    return compare(bench.scene.name, gallery, models)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

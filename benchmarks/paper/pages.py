@@ -1,27 +1,22 @@
-"""The report of a study: Markdown, CSV, pictures, one HTML page, and the page of the documentation."""
+"""The report of a study: Markdown, CSV, pictures, and the page of the documentation."""
 
 import csv
 import io
 from collections.abc import Sequence
 from pathlib import Path
 
-import jinja2
-
-from benchmarks.paper.crops import Comparison
 from benchmarks.paper.curves import overlap_curve, quality_curve, standalone
 from benchmarks.paper.goals import table as goal_table
 from benchmarks.paper.runner import other_settings
 from benchmarks.paper.study import Study
 from benchmarks.paper.tables import csv_rows
 from benchmarks.paper.variants import flat, variants
-from benchmarks.report import cell
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import write_json
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
 from panolog.workers.training.recipes import Recipe
 
-_TEMPLATE = Path(__file__).with_name("page.html.j2")
 RECIPES_FILE = "recipes.json"
 FIRST_LINE = "<!-- Written by `python -m benchmarks.paper … --docs`: do not edit. -->"
 _METHOD = (
@@ -50,8 +45,8 @@ def pictures(study: Study) -> dict[str, str]:
     return made | ({"overlap.svg": overlap} if overlap else {})
 
 
-def write(folder: Path, study: Study, comparisons: Sequence[Comparison]) -> str:
-    """Writes report.md, results.csv, the pictures and report.html; returns the Markdown."""
+def write(folder: Path, study: Study) -> str:
+    """Writes report.md, results.csv and the pictures; returns the Markdown."""
     drawn = pictures(study)
     for name, svg in drawn.items():
         write_bytes(folder / name, standalone(svg).encode())
@@ -60,7 +55,6 @@ def write(folder: Path, study: Study, comparisons: Sequence[Comparison]) -> str:
     sheet = io.StringIO()
     csv.writer(sheet, lineterminator="\n").writerows(csv_rows(study.results.all))
     write_bytes(folder / "results.csv", sheet.getvalue().encode())
-    write_bytes(folder / "report.html", page(study, drawn, comparisons).encode())
     return text
 
 
@@ -109,21 +103,3 @@ def measured_recipes(studies: Sequence[Study]) -> list[Recipe]:
                 raise InputError(f"{result.variant} of {result.scene} has {changes}: measure it again")
             found[now["recipe"]] = None
     return list(found)
-
-
-def page(study: Study, drawn: dict[str, str], comparisons: Sequence[Comparison]) -> str:
-    """All of a study as one HTML page without outside files."""
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters["cell"] = cell
-    environment.filters["bold"] = lambda text: text.replace("**", "").replace("`", "")
-    found = study.goals
-    return environment.from_string(_TEMPLATE.read_text()).render(
-        study=study,
-        goals=goal_table(found) if found else None,
-        tables=study.tables,
-        pictures=drawn,
-        comparisons=comparisons,
-        texts=(_METHOD, _CURVES),
-    )

@@ -19,7 +19,8 @@ BUDGET = 30_000  # scene Gaussians of a task, where memory is the limit
 _GRIDS = {1: "1x1x1", 2: "2x1x1", 4: "2x2x1", 8: "4x2x1"}  # by the number of blocks
 _SWITCHES = {  # settings of the panolog recipe that mean something only together
     "relocation": (
-        *("densify.method", "densify.growth", "densify.filled", "densify.weight", "densify.until"),
+        *("densify.method", "densify.growth", "densify.long_runs", "densify.filled"),
+        *("densify.weight", "densify.until"),
         *("densify.opacity_decay", "densify.noise", "densify.max_gaussians"),
     ),
     "block growth": ("stage2.growth", "stage2.opacity_decay"),

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.export.detail import MOST, SIDE, Detail, Leaf, Node
+from panolog.export.detail import SIDE, Detail, Leaf, Node
 from panolog.export.gltf.glb import BASE, SPZ, encode_glb
 from panolog.export.splats import InMemory, Splats, SplatSource
 from panolog.scene.errors import FormatError
@@ -41,7 +41,6 @@ def write_tiles(
     *,
     to_ecef: Doubles | None,
     side: float = SIDE,
-    most: int = MOST,
     levels: int | None = None,
 ) -> None:
     """Writes a folder with `tileset.json` and a GLB of each leaf and level; it appears whole or not at all.
@@ -55,11 +54,10 @@ def write_tiles(
         to_ecef: (4, 4) from the tileset's axes, x, −z and y of the source's, to the earth-centred frame in
             metres: `enu_to_ecef` if the source's x is east and its −z north. None leaves the tileset where
             the source has its origin.
-        side, most, levels: as of `Detail`.
+        side, levels: as of `Detail`.
 
-    Raises:
-        FormatError: the folder exists already, there is no Gaussian, or `to_ecef` is no rigid transform.
-        OSError: the files cannot be written.
+    Raises FormatError: the folder exists already, there is no Gaussian, or `to_ecef` is no rigid transform;
+    OSError: the files cannot be written.
     """
     folder = Path(folder)
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
@@ -70,7 +68,7 @@ def write_tiles(
     with atomic_folder(folder) as temporary:
         scratch = temporary / "scratch"
         scratch.mkdir()
-        detail = Detail(source, scratch, side=side, most=most, levels=levels)
+        detail = Detail(source, scratch, side=side, levels=levels)
         leaves = [_write_leaf(temporary, leaf, detail.sides) for leaf in detail.leaves()]
         shutil.rmtree(scratch)
         root = _tile_of(detail.tree, leaves)

@@ -51,7 +51,9 @@ def write_site(folder: Path, write_model: Callable[[Path], str], page: Page) -> 
     that of a .sog, or of the lod-meta.json of Streamed SOG.
     Raises ConfigError if there is something else at `folder`; OSError if it cannot be written.
     """
-    if folder.is_symlink() or (folder.exists() and not (_is_site(folder) or _is_empty(folder))):
+    free = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+    ours = all((folder / name).is_file() for name in (DESCRIPTION, ENTRY, ENGINE))
+    if folder.is_symlink() or not (free or ours):
         raise ConfigError(f"{folder}: is not a page of a model, and is not replaced; give a new folder")
     with atomic_folder(folder) as new:
         model = write_model(new)
@@ -120,14 +122,6 @@ def _document(page: Page, replaced: dict[str, str]) -> str:
         assert found, f"index.html has no {place}"
         html = before + text + after
     return html
-
-
-def _is_site(folder: Path) -> bool:
-    return all((folder / name).is_file() for name in (DESCRIPTION, ENTRY, ENGINE))
-
-
-def _is_empty(folder: Path) -> bool:
-    return folder.is_dir() and not any(folder.iterdir())
 
 
 def _json(content: dict[str, Any]) -> str:

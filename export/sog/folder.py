@@ -24,9 +24,8 @@ _HEAD = 200  # bytes of an index in which the name of its generator stands
 def new_folder(folder: Path) -> Iterator[Path]:
     """Yields an empty temporary folder, which becomes `folder` when the block ends well.
 
-    Raises:
-        FormatError: there is something that this package has not written.
-        OSError: the folder above is missing or cannot be written.
+    Raises FormatError: there is something that this package has not written; OSError: the folder above is
+    missing or cannot be written.
     """
     folder = Path(os.path.abspath(folder))  # noqa: PTH100  # without following links, so that `..` has a name
     _check(folder)

@@ -62,16 +62,14 @@ def read_sog(path: StrPath) -> Splats:
     """All Gaussians of a SOG, in its order.
 
     Args: path of a .sog, of a folder with meta.json, or of this meta.json.
-
-    Raises:
-        FormatError: it is missing, damaged, of an unknown version, or holds more than `MOST` Gaussians.
-        OSError: it cannot be read.
+    Raises FormatError: it is missing, damaged, of an unknown version, or holds more than `MOST` Gaussians;
+    OSError: it cannot be read.
     """
     path = Path(path)
     if not path.is_file() and not path.is_dir():
         raise FormatError(f"{path}: there is no SOG; give a .sog file, or a folder with meta.json")
     if path.name == INDEX or ((path / INDEX).is_file() and not (path / META).is_file()):
-        raise FormatError(f"{path}: a SOG that streams has many files; read_streamed reads one level of them")
+        raise FormatError(f"{path}: a SOG that streams has many files; give the folder of one of them")
     if path.is_dir():
         files: Folder | Archive = Folder(path)
     else:

@@ -105,14 +105,11 @@ def write_streamed(
     While it is written, a file without a name on the same disk takes 236 bytes of each Gaussian.
 
     Args:
-        folder: what to write.
-        source: the scene, at least one Gaussian.
         sky: what is always shown whole.
         side, most, levels: of leaves, as `Detail` has them.
 
-    Raises:
-        FormatError: there are no Gaussians, too many of the sky, or something else is at `folder`.
-        OSError: the folder cannot be written, or the disk is full.
+    Raises FormatError: there are no Gaussians, too many of the sky, or something else is at `folder`;
+    OSError: the folder cannot be written, or the disk is full.
     """
     if not source.count:
         raise FormatError("nothing is selected: a model that streams needs at least one Gaussian")

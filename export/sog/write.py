@@ -34,9 +34,7 @@ _METHOD, _QUALITY = 1, 0
 def write_sog(path: StrPath, source: SplatSource) -> None:
     """Writes Gaussians as one .sog file, atomically, in Morton order.
 
-    Raises:
-        FormatError: there are no Gaussians, or more than `MOST`.
-        OSError: the file cannot be written.
+    Raises FormatError: there are no Gaussians, or more than `MOST`; OSError: the file cannot be written.
     """
     with threads() as pool, atomic(Path(path)) as temporary:
         files = encode(source, pool)
@@ -58,7 +56,6 @@ def encode(source: SplatSource, pool: Executor, *, sort: bool = True) -> dict[st
     """The files of a SOG by name: images, then meta.json.
 
     Args: source; pool, threads to use; sort, whether in Morton order or in that of the source.
-
     Raises FormatError as `write_sog`.
     """
     if not 0 < source.count <= MOST:

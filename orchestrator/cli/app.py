@@ -20,7 +20,7 @@ from panolog.orchestrator.cli import (
     scene,
 )
 from panolog.orchestrator.cli.console import Lasting, say
-from panolog.orchestrator.cli.usage import Command, Group
+from panolog.orchestrator.cli.usage import Command, Group, flag
 from panolog.orchestrator.runs import log
 from panolog.scene.errors import InputError, PanologError, explained, in_one_line
 
@@ -102,17 +102,11 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _program(
     _version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+        bool, flag("Print the version.", "--version", callback=_print_version, is_eager=True)
     ] = False,
     verbose: Annotated[
         int,
-        typer.Option(
-            "--verbose",
-            "-v",
-            count=True,
-            show_default=False,
-            help="Log to stderr: -v decisions, -vv details.",
-        ),
+        flag("Log to stderr: -v decisions, -vv details.", "--verbose", "-v", count=True, show_default=False),
     ] = 0,
 ) -> None:
     """Reconstruct places from 360° panoramas as one 3D Gaussian Splatting model."""

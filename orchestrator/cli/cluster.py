@@ -22,7 +22,7 @@ from panolog.orchestrator.cli.options import (
     with_preparation,
     with_run_config,
 )
-from panolog.orchestrator.cli.usage import Command, Group
+from panolog.orchestrator.cli.usage import Command, Group, argument, option
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,32 +36,14 @@ app = typer.Typer(
     " `leave` is for the machines of the cluster themselves.",
 )
 
-HeadSourceArg = Annotated[
-    str,
-    typer.Argument(
-        metavar="SCENE|IMAGES|VIDEO", help="The scene, a folder of panoramas or a video, on the head node."
-    ),
-]
-HeadRunArg = Annotated[str, typer.Argument(metavar="RUN", help="Folder of the run on the head node.")]
-HeadRunOption = Annotated[
-    str, typer.Option("--output", "-o", metavar="RUN", help="Folder of the new run on the head node.")
-]
+HeadRunArg = Annotated[str, argument("RUN", "Folder of the run on the head node.")]
 ServerOption = Annotated[
     str,
-    typer.Option(
+    option(
+        "http://HOST:8265",
+        "URL of the cluster's Ray dashboard, which is its job server.",
         "--address",
-        metavar="http://HOST:8265",
         envvar="RAY_API_SERVER_ADDRESS",
-        help="URL of the cluster's Ray dashboard, which is its job server.",
-    ),
-]
-SecondsArg = Annotated[
-    int, typer.Argument(min=0, max=86_400, metavar="SECONDS", help="Seconds until the machine ends.")
-]
-NodeOption = Annotated[
-    str,
-    typer.Option(
-        "--node", metavar="ID", help="How the id of the node begins, if this machine has several of Ray's."
     ),
 ]
 _LOCAL = "http://127.0.0.1:8265"
@@ -71,8 +53,10 @@ _LOCAL = "http://127.0.0.1:8265"
 @with_run_config
 @with_preparation
 def submit(
-    source: HeadSourceArg,
-    output: HeadRunOption,
+    source: Annotated[
+        str, argument("SCENE|IMAGES|VIDEO", "The scene, a folder of panoramas or a video, on the head node.")
+    ],
+    output: Annotated[str, option("RUN", "Folder of the new run on the head node.", "--output", "-o")],
     config: "RunConfig",
     options: "Options",
     address: ServerOption = _LOCAL,
@@ -176,7 +160,12 @@ def stop(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption = 
 
 
 @app.command(cls=Command)
-def leave(seconds: SecondsArg = 120, node: NodeOption = "") -> None:
+def leave(
+    seconds: Annotated[int, argument("SECONDS", "Seconds until the machine ends.", min=0, max=86_400)] = 120,
+    node: Annotated[
+        str, option("ID", "How the id of the node begins, if this machine has several of Ray's.", "--node")
+    ] = "",
+) -> None:
     """Announce that this machine leaves its cluster: tasks here save a checkpoint and move.
 
     Returns once they have, at the latest after so many seconds: for the preStop hook of a pod, and for the

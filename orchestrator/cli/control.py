@@ -9,6 +9,7 @@ import typer
 
 from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
 from panolog.orchestrator.cli.options import BlockArg, JsonOption, RunArg
+from panolog.orchestrator.cli.usage import argument, flag, option
 from panolog.scene.errors import ConfigError, RunFolderError
 from panolog.scene.stores.url import is_url, parse_url
 
@@ -51,10 +52,7 @@ def retry(run: RunArg, block: BlockArg) -> None:
 
 def release(
     run: RunArg,
-    node: Annotated[
-        str,
-        typer.Argument(metavar="NODE", help="Its name in status, such as a host, or the begin of its id."),
-    ],
+    node: Annotated[str, argument("NODE", "Its name in status, such as a host, or the begin of its id.")],
 ) -> None:
     """Use a machine or a GPU in quarantine again."""
     _request(run, "release", node=node)
@@ -80,40 +78,31 @@ def _request(run: Path, action: str, block: int | None = None, node: str | None 
 
 def clean(
     folders: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="RUN|FOLDER|URL", help="Runs, folders with runs below them, or runs in stores."
-        ),
+        list[str], argument("RUN|FOLDER|URL", "Runs, folders with runs below them, or runs in stores.")
     ],
     keep_checkpoints: Annotated[
         int | None,
-        typer.Option(
-            metavar="N",
-            min=1,
-            help="Checkpoints that stay of a task that is not done. Default: as in the run's settings.",
+        option(
+            "N", "Checkpoints that stay of a task that is not done. Default: as in the run's settings.", min=1
         ),
     ] = None,
     blocks: Annotated[
         bool,
-        typer.Option(
-            "--blocks",
-            help="Also remove the models of blocks and other parts of runs that are done: the merged model"
+        flag(
+            "Also remove the models of blocks and other parts of runs that are done: the merged model"
             " has their Gaussians.",
+            "--blocks",
         ),
     ] = False,
     older_than: Annotated[
-        str | None,
-        typer.Option(metavar="30d", help="Only runs whose last record is older, such as 12h, 30d or 8w."),
+        str | None, option("30d", "Only runs whose last record is older, such as 12h, 30d or 8w.")
     ] = None,
     keep_manifests: Annotated[
-        int,
-        typer.Option(
-            metavar="K", min=1, help="URL: the last K states of the run that stay whole, some seconds apart."
-        ),
+        int, option("K", "URL: the last K states of the run that stay whole, some seconds apart.", min=1)
     ] = 10,
-    yes: Annotated[bool, typer.Option("--yes", help="URL: confirm that what is listed is removed.")] = False,
+    yes: Annotated[bool, flag("URL: confirm that what is listed is removed.", "--yes")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would be removed, with its bytes; remove nothing.")
+        bool, flag("Say what would be removed, with its bytes; remove nothing.", "--dry-run")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -3,36 +3,28 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from panolog.orchestrator.cli.console import say
+from panolog.orchestrator.cli.usage import argument, flag, option
 from panolog.scene.errors import InputError
 
 PORT = 8360  # fixed, so that an open page reconnects to a restarted server
 
 
 def dashboard(
-    folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="A folder with runs, or one run.")
-    ] = Path(),
+    folder: Annotated[Path, argument("FOLDER", "A folder with runs, or one run.")] = Path(),
     host: Annotated[
-        str,
-        typer.Option(
-            metavar="ADDRESS", help="Address to serve on; any but this machine's own requires a token."
-        ),
+        str, option("ADDRESS", "Address to serve on; any but this machine's own requires a token.")
     ] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option(metavar="PORT", min=0, max=65535, help="Port to serve on; 0 = any free port.")
-    ] = PORT,
+    port: Annotated[int, option("PORT", "Port to serve on; 0 = any free port.", min=0, max=65535)] = PORT,
     queue: Annotated[
         Path | None,
-        typer.Option(
+        option(
+            "DIR",
+            "Folder of the queue that the page of all runs shows. Default: as `panolog queue`.",
             "--queue",
-            metavar="DIR",
-            help="Folder of the queue that the page of all runs shows. Default: as `panolog queue`.",
         ),
     ] = None,
-    open_: Annotated[bool, typer.Option("--open", help="Open the page in this machine's browser.")] = False,
+    open_: Annotated[bool, flag("Open the page in this machine's browser.", "--open")] = False,
 ) -> None:
     """Serve the runs below FOLDER as web pages, until Ctrl-C."""
     if not folder.is_dir():

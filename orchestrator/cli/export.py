@@ -1,49 +1,22 @@
 """`panolog export`."""
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Annotated
 
 from panolog.orchestrator.cli.console import print_result, progress_bar, say
-from panolog.orchestrator.cli.options import AnyModelArg, JsonOption
+from panolog.orchestrator.cli.options import JsonOption
 from panolog.orchestrator.cli.stores import opened
+from panolog.orchestrator.cli.usage import argument, flag, option
 from panolog.scene.errors import InputError
 from panolog.scene.stores.url import is_url
 
 _CHOICE = "What of the model"
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_format = partial(flag, panel="Formats")
+_choice = partial(option, panel=_CHOICE)
+_place = partial(option, panel="Where it is")
 
-
-def _format(name: str, text: str) -> Any:
-    return typer.Option(f"--{name}", help=text, rich_help_panel="Formats")
-
-
-def _choice(metavar: str, text: str, **limits: Any) -> Any:
-    return typer.Option(metavar=metavar, help=text, rich_help_panel=_CHOICE, **limits)
-
-
-def _place(metavar: str, text: str, **limits: Any) -> Any:
-    return typer.Option(metavar=metavar, help=text, rich_help_panel="Where it is", **limits)
-
-
-Output = Annotated[
-    Path,
-    typer.Option(
-        "--output", "-o", metavar="FILE|FOLDER", help="One file, whose ending says the format; or a folder."
-    ),
-]
-Sog = Annotated[bool, _format("sog", "SOG of PlayCanvas.")]
-Web = Annotated[bool, _format("web", "Streamed SOG with a page that shows it, for any web server.")]
-Spz = Annotated[bool, _format("spz", "SPZ of Niantic.")]
-CompressedPly = Annotated[bool, _format("compressed-ply", "PLY of SuperSplat.")]
-Ply = Annotated[bool, _format("ply", "PLY of all trainers, turned upright for viewers.")]
-Glb = Annotated[bool, _format("glb", "glTF with KHR_gaussian_splatting.")]
-Tiles = Annotated[bool, _format("3dtiles", "3D Tiles for globes such as Cesium.")]
-SkyImage = Annotated[bool, _format("sky-image", "The sky as a panorama: sky.jpg and sky.exr.")]
-WithoutSky = Annotated[bool, typer.Option("--without-sky", help="The scene alone.", rich_help_panel=_CHOICE)]
-Degree = Annotated[int, _choice("0..3", "Degree of spherical harmonics.", min=0, max=3)]
-MinOpacity = Annotated[float, _choice("0..1", "Leave out what is fainter.", min=0, max=0.999)]
 Crop = Annotated[
     str | None,
     _choice("X,Y,Z,X,Y,Z", "Lower and upper corner of what is kept, in the model's coordinates."),
@@ -52,39 +25,43 @@ Levels = Annotated[
     int | None,
     _choice("N", "Levels of detail of --web and --3dtiles. Default: as many as it takes.", min=1, max=8),
 ]
-SpzVersion = Annotated[int, _choice("3|4", "Version of SPZ.", min=3, max=4)]
 Up = Annotated[
     str | None,
     _place("z|-y|X,Y,Z", "The model's direction up. Default: that of a run's cameras, -y of a PLY."),
 ]
-Epsg = Annotated[int | None, _place("N", "Coordinate system of the scene's coordinates.", min=1)]
-Metres = Annotated[float | None, _place("M", "Metres of a unit. Default: as the scene says.", min=1e-6)]
 Geoid = Annotated[
     float | None,
     _place("M", "Heights are above the sea: how high that is there above the ellipsoid.", min=-120, max=120),
 ]
+Output = Annotated[
+    Path, option("FILE|FOLDER", "One file, whose ending says the format; or a folder.", "--output", "-o")
+]
 
 
 def export(
-    source: AnyModelArg,
+    source: Annotated[str, argument("RUN|PLY", "Folder or URL of a run, or a PLY file.")],
     output: Output,
-    sog: Sog = False,
-    web: Web = False,
-    spz: Spz = False,
-    compressed_ply: CompressedPly = False,
-    ply: Ply = False,
-    glb: Glb = False,
-    tiles: Tiles = False,
-    sky_image: SkyImage = False,
-    without_sky: WithoutSky = False,
-    sh: Degree = 3,
-    min_opacity: MinOpacity = 0.0,
+    sog: Annotated[bool, _format("SOG of PlayCanvas.", "--sog")] = False,
+    web: Annotated[
+        bool, _format("Streamed SOG with a page that shows it, for any web server.", "--web")
+    ] = False,
+    spz: Annotated[bool, _format("SPZ of Niantic.", "--spz")] = False,
+    compressed_ply: Annotated[bool, _format("PLY of SuperSplat.", "--compressed-ply")] = False,
+    ply: Annotated[bool, _format("PLY of all trainers, turned upright for viewers.", "--ply")] = False,
+    glb: Annotated[bool, _format("glTF with KHR_gaussian_splatting.", "--glb")] = False,
+    tiles: Annotated[bool, _format("3D Tiles for globes such as Cesium.", "--3dtiles")] = False,
+    sky_image: Annotated[bool, _format("The sky as a panorama: sky.jpg and sky.exr.", "--sky-image")] = False,
+    without_sky: Annotated[bool, flag("The scene alone.", "--without-sky", panel=_CHOICE)] = False,
+    sh: Annotated[int, _choice("0..3", "Degree of spherical harmonics.", min=0, max=3)] = 3,
+    min_opacity: Annotated[float, _choice("0..1", "Leave out what is fainter.", min=0, max=0.999)] = 0.0,
     crop: Crop = None,
     levels: Levels = None,
-    spz_version: SpzVersion = 3,
+    spz_version: Annotated[int, _choice("3|4", "Version of SPZ.", min=3, max=4)] = 3,
     up: Up = None,
-    epsg: Epsg = None,
-    metres: Metres = None,
+    epsg: Annotated[int | None, _place("N", "Coordinate system of the scene's coordinates.", min=1)] = None,
+    metres: Annotated[
+        float | None, _place("M", "Metres of a unit. Default: as the scene says.", min=1e-6)
+    ] = None,
     geoid: Geoid = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -2,12 +2,11 @@
 
 import inspect
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
-
+from panolog.orchestrator.cli.usage import argument, flag, option
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,218 +18,97 @@ if TYPE_CHECKING:
 _SETTINGS, _MACHINES, _TOLD = "Settings", "Machines and the driver", "Notifications and logs"
 BUDGET = "Cost and time (docs/money.md)"
 _MADE = "Panoramas or a video instead of a scene"
+_setting, _machine, _note, _limit, _making = (
+    partial(option, panel=panel) for panel in (_SETTINGS, _MACHINES, _TOLD, BUDGET, _MADE)
+)
 
-SceneArg = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Pano360 scene.")]
-AnySceneArg = Annotated[
-    str, typer.Argument(metavar="SCENE", help="Folder or URL of a COLMAP or Pano360 scene.")
-]
-SourceArg = Annotated[
-    str,
-    typer.Argument(
-        metavar="SCENE|IMAGES|VIDEO",
-        help="Scene (folder, s3://, gs://, az://), folder of panoramas, or 360° video.",
-    ),
-]
-AnyRunArg = Annotated[str, typer.Argument(metavar="RUN", help="Folder or URL of a run.")]
-RunArg = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
-RunsArg = Annotated[list[Path], typer.Argument(metavar="RUN", help="Folders of two runs or more.")]
-ModelArg = Annotated[Path, typer.Argument(metavar="RUN|PLY", help="Folder of a run, or a PLY file.")]
-AnyModelArg = Annotated[str, typer.Argument(metavar="RUN|PLY", help="Folder or URL of a run, or a PLY file.")]
-BlockArg = Annotated[int, typer.Argument(metavar="BLOCK", min=0, help="Number of a block.")]
-NewRunOption = Annotated[
-    str, typer.Option("--output", "-o", metavar="RUN", help="Folder or URL of the new run.")
-]
+SceneArg = Annotated[Path, argument("SCENE", "Folder of a COLMAP or Pano360 scene.")]
+AnySceneArg = Annotated[str, argument("SCENE", "Folder or URL of a COLMAP or Pano360 scene.")]
+AnyRunArg = Annotated[str, argument("RUN", "Folder or URL of a run.")]
+RunArg = Annotated[Path, argument("RUN", "Folder of a run.")]
+ModelArg = Annotated[Path, argument("RUN|PLY", "Folder of a run, or a PLY file.")]
+BlockArg = Annotated[int, argument("BLOCK", "Number of a block.", min=0)]
 LocalOption = Annotated[
     Path | None,
-    typer.Option(
-        "--local",
-        metavar="DIR",
-        help="Folder on this machine of a run with a URL. Default: in the cache.",
-        rich_help_panel=_MACHINES,
-    ),
+    _machine("DIR", "Folder on this machine of a run with a URL. Default: in the cache.", "--local"),
 ]
-NewSceneOption = Annotated[
-    Path, typer.Option("--output", "-o", metavar="SCENE", help="Folder of the new scene.")
-]
-PageOption = Annotated[
-    Path | None, typer.Option("--output", "-o", metavar="FILE.html", help="Write the page to this file.")
-]
-PortOption = Annotated[
-    int, typer.Option(metavar="PORT", min=0, max=65535, help="Port to serve on; 0 = any free port.")
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
-LinkOption = Annotated[bool, typer.Option("--link", help="Link the panoramas instead of copying them.")]
+NewSceneOption = Annotated[Path, option("SCENE", "Folder of the new scene.", "--output", "-o")]
+PageOption = Annotated[Path | None, option("FILE.html", "Write the page to this file.", "--output", "-o")]
+JsonOption = Annotated[bool, flag("Print one JSON object on stdout.", "--json")]
+LinkOption = Annotated[bool, flag("Link the panoramas instead of copying them.", "--link")]
 AddressOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="HOST:PORT|auto",
-        help="Ray cluster to run on. Default: this machine.",
-        rich_help_panel=_MACHINES,
-    ),
+    str | None, _machine("HOST:PORT|auto", "Ray cluster to run on. Default: this machine.")
 ]
 NiceOption = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        min=0,
-        max=19,
-        help="Let other programs go first: 0 to 19. Default: 0.",
-        rich_help_panel=_MACHINES,
-    ),
+    int | None, _machine("N", "Let other programs go first: 0 to 19. Default: 0.", min=0, max=19)
 ]
 DashboardOption = Annotated[
-    bool,
-    typer.Option("--dashboard", help="Show the run in the browser while it runs.", rich_help_panel=_MACHINES),
+    bool, flag("Show the run in the browser while it runs.", "--dashboard", panel=_MACHINES)
 ]
 SuperviseOption = Annotated[
     bool,
-    typer.Option(
+    flag(
+        "Resume the run when its driver is killed or crashes, or its cluster is lost.",
         "--supervise",
-        help="Resume the run when its driver is killed or crashes, or its cluster is lost.",
-        rich_help_panel=_MACHINES,
+        panel=_MACHINES,
     ),
 ]
 ResumesOption = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        min=1,
-        help="With --supervise: resumes in a row without progress. Default: 10.",
-        rich_help_panel=_MACHINES,
-    ),
+    int | None, _machine("N", "With --supervise: resumes in a row without progress. Default: 10.", min=1)
 ]
 NotifyOption = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="KIND:URL",
-        help="Notify by webhook, slack, ntfy or mail (docs/notifications.md); repeatable.",
-        rich_help_panel=_TOLD,
-    ),
+    _note("KIND:URL", "Notify by webhook, slack, ntfy or mail (docs/notifications.md); repeatable."),
 ]
 LogOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="SINK",
-        help="Curves also to mlflow, tensorboard or wandb; repeatable.",
-        rich_help_panel=_TOLD,
-    ),
+    list[str] | None, _note("SINK", "Curves also to mlflow, tensorboard or wandb; repeatable.")
 ]
 PricesOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE",
-        help="Prices of machines. Default: ~/.config/panolog/prices.toml.",
-        rich_help_panel=BUDGET,
-    ),
+    str | None, _limit("FILE", "Prices of machines. Default: ~/.config/panolog/prices.toml.")
 ]
 MaxCostOption = Annotated[
     str | None,
-    typer.Option(
-        metavar="AMOUNT|none",
-        help="End the training before the run costs more, and deliver what there is.",
-        rich_help_panel=BUDGET,
-    ),
+    _limit("AMOUNT|none", "End the training before the run costs more, and deliver what there is."),
 ]
-DeadlineOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="6h|08:00|none",
-        help="The same, so that all is done by then.",
-        rich_help_panel=BUDGET,
-    ),
-]
+DeadlineOption = Annotated[str | None, _limit("6h|08:00|none", "The same, so that all is done by then.")]
 AcceptOption = Annotated[
     bool,
-    typer.Option(
-        "--accept-changes",
-        help="Go on with other settings in run.json than those that the run was begun with.",
-    ),
+    flag("Go on with other settings in run.json than those that the run was begun with.", "--accept-changes"),
 ]
 AtEndOption = Annotated[
     str | None,
-    typer.Option(
-        "--at-end",
-        metavar="COMMAND",
-        help="Carried out when the run has ended for good, but not if it is stopped.",
-        rich_help_panel=BUDGET,
-    ),
+    _limit("COMMAND", "Carried out when the run has ended for good, but not if it is stopped.", "--at-end"),
 ]
-DeviceOption = Annotated[
-    str | None,
-    typer.Option(metavar="auto|cpu|cuda", help="Device to compute on. Default: auto."),
-]
+DeviceOption = Annotated[str | None, option("auto|cpu|cuda", "Device to compute on. Default: auto.")]
 BlocksOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="2x1x1|8|auto",
-        help="Blocks along x, y, z; so many balanced ones; or as many as it takes.",
-    ),
+    str | None, option("2x1x1|8|auto", "Blocks along x, y, z; so many balanced ones; or as many as it takes.")
 ]
 FrameOption = Annotated[
     str,
-    typer.Option(
-        metavar="export|model",
-        help="Axes of FILE if it is no plain PLY: as `panolog export` writes it, or as the run's model.",
+    option(
+        "export|model",
+        "Axes of FILE if it is no plain PLY: as `panolog export` writes it, or as the run's model.",
     ),
-]
-WidthOption = Annotated[
-    int | None, typer.Option(metavar="W", help="Of the panoramas in pixels. Default: as they are.")
 ]
 
-PairsOption = Annotated[
-    Literal["auto", "exhaustive", "sequential"],
-    typer.Option("--pairs", metavar="HOW", help="Pairs to match: auto, exhaustive or sequential."),
-]
-MapperOption = Annotated[
-    Literal["incremental", "global"], typer.Option(metavar="HOW", help="Mapper: incremental or global.")
-]
 ParallaxOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="DEGREES", help="Video: parallax between two frames. Default: 4.", rich_help_panel=_MADE
-    ),
-]
-FramesOption = Annotated[
-    int | None,
-    typer.Option(metavar="N", min=2, help="Video: take at most N frames.", rich_help_panel=_MADE),
+    float | None, _making("DEGREES", "Video: parallax between two frames. Default: 4.")
 ]
 UpOption = Annotated[
     Literal["up", "right", "down", "left"] | None,
-    typer.Option(
-        metavar="up|right|down|left",
-        help="Two lenses, not stitched: where up is in the first circle. Default: up.",
-        rich_help_panel=_MADE,
-    ),
+    _making("up|right|down|left", "Two lenses, not stitched: where up is in the first circle. Default: up."),
 ]
+FramesOption = Annotated[int | None, _making("N", "Video: take at most N frames.", min=2)]
 DistanceOption = Annotated[
     tuple[str, str, float] | None,
-    typer.Option(
-        metavar="NAME NAME METRES",
-        help="Distance between two of them; sets the scale.",
-        rich_help_panel=_MADE,
-    ),
+    _making("NAME NAME METRES", "Distance between two of them; sets the scale."),
 ]
-TrajectoryOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Known trajectory, TUM or CSV (docs/sfm.md).",
-        rich_help_panel=_MADE,
-    ),
-]
+TrajectoryOption = Annotated[Path | None, _making("FILE", "Known trajectory, TUM or CSV (docs/sfm.md).")]
 GpsOption = Annotated[
-    bool,
-    typer.Option(
-        "--gps/--no-gps", help="Scale and north from GPS in EXIF.", show_default=False, rich_help_panel=_MADE
-    ),
+    bool, flag("Scale and north from GPS in EXIF.", "--gps/--no-gps", panel=_MADE, show_default=False)
 ]
 PartialOption = Annotated[
-    bool,
-    typer.Option(
-        "--partial",
-        help="Accept poses of half of the panoramas or fewer.",
-        rich_help_panel=_MADE,
-    ),
+    bool, flag("Accept poses of half of the panoramas or fewer.", "--partial", panel=_MADE)
 ]
 
 
@@ -250,37 +128,17 @@ def axes_of(frame: str) -> Literal["export", "model"]:
 
 
 def run_config(
-    config: Annotated[
-        Path | None, typer.Option(metavar="F.yaml", help="Settings in YAML.", rich_help_panel=_SETTINGS)
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="KEY=VALUE", help="One setting; repeatable.", rich_help_panel=_SETTINGS
-        ),
-    ] = None,
+    config: Annotated[Path | None, _setting("F.yaml", "Settings in YAML.")] = None,
+    settings: Annotated[list[str] | None, _setting("KEY=VALUE", "One setting; repeatable.", "--set")] = None,
     blocks: BlocksOption = None,
-    iterations: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Of Stage I and of each block. Default: 30,000."),
-    ] = None,
-    width: WidthOption = None,
+    iterations: Annotated[int | None, option("N", "Of Stage I and of each block. Default: 30,000.")] = None,
+    width: Annotated[int | None, option("W", "Of the panoramas in pixels. Default: as they are.")] = None,
     device: DeviceOption = None,
     memory: Annotated[
-        str | None,
-        typer.Option(
-            metavar="GIB",
-            help="Memory that a task may take; Gaussians grow to what fits.",
-            rich_help_panel=_SETTINGS,
-        ),
+        str | None, _setting("GIB", "Memory that a task may take; Gaussians grow to what fits.")
     ] = None,
     recipe: Annotated[
-        str | None,
-        typer.Option(
-            metavar="paper|authors|panolog",
-            help="Preset of what is not given. Default: panolog.",
-            rich_help_panel=_SETTINGS,
-        ),
+        str | None, _setting("paper|authors|panolog", "Preset of what is not given. Default: panolog.")
     ] = None,
 ) -> "RunConfig":
     """The options that set up a run, as its settings."""
@@ -300,31 +158,23 @@ def preparation(
     partial: PartialOption = False,
     nadir: Annotated[
         float | None,
-        typer.Option(
-            metavar="DEGREES",
+        _making(
+            "DEGREES",
+            "Mask so much around straight down. Default: 10, unless there are masks.",
             min=0,
             max=90,
-            help="Mask so much around straight down. Default: 10, unless there are masks.",
-            rich_help_panel=_MADE,
         ),
     ] = None,
     static: Annotated[
         bool | None,
-        typer.Option(
+        flag(
+            "Mask what all panoramas show. Default: yes, unless there are masks.",
             "--static/--no-static",
-            help="Mask what all panoramas show. Default: yes, unless there are masks.",
+            panel=_MADE,
             show_default=False,
-            rich_help_panel=_MADE,
         ),
     ] = None,
-    depth_model: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="M.onnx",
-            help="Estimate depth with this network.",
-            rich_help_panel=_MADE,
-        ),
-    ] = None,
+    depth_model: Annotated[Path | None, _making("M.onnx", "Estimate depth with this network.")] = None,
 ) -> "Options":
     """The options that make a scene of panoramas or a video, as far as they are not the defaults."""
     from panolog.orchestrator.runs.preparation.settings import Options

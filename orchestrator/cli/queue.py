@@ -3,6 +3,7 @@
 import inspect
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +12,7 @@ import typer
 from panolog.orchestrator.cli import run as runs
 from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
 from panolog.orchestrator.cli.options import BUDGET, JsonOption, preparation, run_config, wanted
-from panolog.orchestrator.cli.usage import Command, Group
+from panolog.orchestrator.cli.usage import Command, Group, argument, flag, option
 from panolog.scene.errors import QueueError
 
 if TYPE_CHECKING:
@@ -23,56 +24,45 @@ app = typer.Typer(
 )
 QueueOption = Annotated[
     Path | None,
-    typer.Option(
-        "--queue",
-        metavar="DIR",
-        help="Folder of the queue, on a disk of this machine. Default: PANOLOG_QUEUE, or"
+    option(
+        "DIR",
+        "Folder of the queue, on a disk of this machine. Default: PANOLOG_QUEUE, or"
         " ~/.local/state/panolog/queue.",
+        "--queue",
     ),
 ]
-_SHARE = "Share of the machine (docs/queue.md)"  # the panel of these options in the help
+_share = partial(option, panel="Share of the machine (docs/queue.md)")
 GpusOption = Annotated[
     int | None,
-    typer.Option(
-        metavar="N",
-        min=0,
-        max=1024,
-        help="GPUs that the run has for itself. Default: an even part; 0 with --device cpu.",
-        rich_help_panel=_SHARE,
+    _share(
+        "N", "GPUs that the run has for itself. Default: an even part; 0 with --device cpu.", min=0, max=1024
     ),
 ]
 CoresOption = Annotated[
     int | None,
-    typer.Option(
-        metavar="N",
-        min=1,
-        max=65_536,
-        help="CPU cores that the run has for itself. Default: an even part.",
-        rich_help_panel=_SHARE,
-    ),
+    _share("N", "CPU cores that the run has for itself. Default: an even part.", min=1, max=65_536),
 ]
 RamOption = Annotated[
     float | None,
-    typer.Option(
+    _share(
+        "GIB",
+        "Main memory of this machine that the run may use. Default: an even part.",
         "--ram",
-        metavar="GIB",
         min=0.1,
         max=1e6,
-        help="Main memory of this machine that the run may use. Default: an even part.",
-        rich_help_panel=_SHARE,
     ),
 ]
 QueuedDeadlineOption = Annotated[
     str | None,
-    typer.Option(
-        "--deadline",
-        metavar="6h|08:00",
-        help="The same, so that all is done at a time, or so long from the start of the run, not from now;"
+    option(
+        "6h|08:00",
+        "The same, so that all is done at a time, or so long from the start of the run, not from now;"
         " 08:00 is the next one after its start.",
-        rich_help_panel=BUDGET,
+        "--deadline",
+        panel=BUDGET,
     ),
 ]
-IdArg = Annotated[int, typer.Argument(metavar="ID", min=1, help="Number of an entry; see `queue list`.")]
+IdArg = Annotated[int, argument("ID", "Number of an entry; see `queue list`.", min=1)]
 
 
 @app.callback()
@@ -121,7 +111,7 @@ def add(
 @app.command("list", cls=Command)
 def list_(
     queue: QueueOption = None,
-    all_: Annotated[bool, typer.Option("--all", help="Also show entries that were removed.")] = False,
+    all_: Annotated[bool, flag("Also show entries that were removed.", "--all")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Show the entries of the queue in order."""
@@ -136,9 +126,9 @@ def list_(
 @app.command(cls=Command)
 def move(
     id: IdArg,
-    before: Annotated[int | None, typer.Option(metavar="ID", min=1, help="Before this entry.")] = None,
-    first: Annotated[bool, typer.Option("--first", help="To the begin.")] = False,
-    last: Annotated[bool, typer.Option("--last", help="To the end.")] = False,
+    before: Annotated[int | None, option("ID", "Before this entry.", min=1)] = None,
+    first: Annotated[bool, flag("To the begin.", "--first")] = False,
+    last: Annotated[bool, flag("To the end.", "--last")] = False,
     queue: QueueOption = None,
 ) -> None:
     """Move an entry that waits."""
@@ -189,14 +179,9 @@ def retry(
 @app.command(cls=Command)
 def run(
     at_once: Annotated[
-        int,
-        typer.Option(
-            metavar="N", min=1, max=64, help="Runs side by side at most; each has its share of the machine."
-        ),
+        int, option("N", "Runs side by side at most; each has its share of the machine.", min=1, max=64)
     ] = 1,
-    wait: Annotated[
-        bool, typer.Option("--wait", help="Wait for new entries when none is left, until a signal.")
-    ] = False,
+    wait: Annotated[bool, flag("Wait for new entries when none is left, until a signal.", "--wait")] = False,
     queue: QueueOption = None,
 ) -> None:
     """Run what waits, in order; first resume what was running."""

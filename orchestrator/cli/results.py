@@ -15,12 +15,11 @@ from panolog.orchestrator.cli.options import (
     JsonOption,
     ModelArg,
     PageOption,
-    PortOption,
     RunArg,
-    RunsArg,
     axes_of,
 )
 from panolog.orchestrator.cli.stores import opened
+from panolog.orchestrator.cli.usage import argument, flag, option
 from panolog.scene.errors import InputError
 from panolog.scene.stores.url import is_url
 
@@ -32,21 +31,19 @@ def evaluate(
     run: RunArg,
     as_json: JsonOption = False,
     model: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Evaluate this PLY, SOG or SPZ, not the run's model.")
+        Path | None, option("FILE", "Evaluate this PLY, SOG or SPZ, not the run's model.")
     ] = None,
     frame: FrameOption = "export",
     crop_bottom: Annotated[
         float | None,
-        typer.Option(
-            metavar="FRACTION",
+        option(
+            "FRACTION",
+            "Part of the height to leave out at the bottom (paper: 0.1). Default: as in the run.",
             min=0,
             max=0.99,
-            help="Part of the height to leave out at the bottom (paper: 0.1). Default: as in the run.",
         ),
     ] = None,
-    seams: Annotated[
-        bool, typer.Option("--seams", help="Also show what is seen of the faces between blocks.")
-    ] = False,
+    seams: Annotated[bool, flag("Also show what is seen of the faces between blocks.", "--seams")] = False,
     device: DeviceOption = None,
 ) -> None:
     """Measure the quality of a model on the held-out panoramas."""
@@ -73,40 +70,20 @@ def evaluate(
 
 def render(
     source: ModelArg,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder of the results.")],
-    poses: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Pose list: JSON, COLMAP images.txt or TUM.")
-    ] = None,
-    model: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Render this PLY, SOG or SPZ, not the run's model.")
-    ] = None,
+    output: Annotated[Path, option("FOLDER", "Folder of the results.", "--output", "-o")],
+    poses: Annotated[Path | None, option("FILE", "Pose list: JSON, COLMAP images.txt or TUM.")] = None,
+    model: Annotated[Path | None, option("FILE", "Render this PLY, SOG or SPZ, not the run's model.")] = None,
     frame: FrameOption = "export",
-    path: Annotated[
-        int | None, typer.Option(min=2, metavar="FRAMES", help="A smooth path along the run's panoramas.")
-    ] = None,
-    width: Annotated[
-        int | None, typer.Option(metavar="W", help="Panoramas: width in pixels. Default: as in training.")
-    ] = None,
-    fov: Annotated[
-        float | None, typer.Option(metavar="DEGREES", help="Perspective views of this horizontal angle.")
-    ] = None,
+    path: Annotated[int | None, option("FRAMES", "A smooth path along the run's panoramas.", min=2)] = None,
+    width: Annotated[int | None, option("W", "Panoramas: width in pixels. Default: as in training.")] = None,
+    fov: Annotated[float | None, option("DEGREES", "Perspective views of this horizontal angle.")] = None,
     size: Annotated[
-        str | None,
-        typer.Option(metavar="WxH", help="Perspective views: size in pixels. Default: 16:9, as in training."),
+        str | None, option("WxH", "Perspective views: size in pixels. Default: 16:9, as in training.")
     ] = None,
-    yaw: Annotated[
-        float | None, typer.Option(metavar="DEGREES", help="Perspective views: turn to the right.")
-    ] = None,
-    pitch: Annotated[
-        float | None, typer.Option(metavar="DEGREES", help="Perspective views: turn upwards.")
-    ] = None,
-    mp4: Annotated[
-        bool, typer.Option("--mp4", help="Write one video, FOLDER/video.mp4 (VP9), instead of PNGs.")
-    ] = False,
-    fps: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, max=240, help="Video: frames per second. Default: 30."),
-    ] = None,
+    yaw: Annotated[float | None, option("DEGREES", "Perspective views: turn to the right.")] = None,
+    pitch: Annotated[float | None, option("DEGREES", "Perspective views: turn upwards.")] = None,
+    mp4: Annotated[bool, flag("Write one video, FOLDER/video.mp4 (VP9), instead of PNGs.", "--mp4")] = False,
+    fps: Annotated[int | None, option("N", "Video: frames per second. Default: 30.", min=1, max=240)] = None,
     device: DeviceOption = None,
 ) -> None:
     """Render pictures or a video of a model, from a pose list or along a path."""
@@ -137,18 +114,13 @@ def partition(
     run: RunArg,
     blocks: BlocksOption = None,
     tau: Annotated[
-        float | None,
-        typer.Option(
-            "--tau", metavar="SHARE", help="τ_grad of eq. 11: gradient share that assigns a camera."
-        ),
+        float | None, option("SHARE", "τ_grad of eq. 11: gradient share that assigns a camera.", "--tau")
     ] = None,
     rho: Annotated[
-        float | None,
-        typer.Option("--rho", metavar="FACTOR", help="ρ_tri of eq. 7: margin around the cameras."),
+        float | None, option("FACTOR", "ρ_tri of eq. 7: margin around the cameras.", "--rho")
     ] = None,
     output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="FOLDER", help="Write plan.json and plan.png to this folder."),
+        Path | None, option("FOLDER", "Write plan.json and plan.png to this folder.", "--output", "-o")
     ] = None,
     as_json: JsonOption = False,
     device: DeviceOption = None,
@@ -168,33 +140,28 @@ def partition(
 
 def view(
     source: ModelArg,
-    task: Annotated[
-        str | None, typer.Option(metavar="coarse|block/003", help="Show the model of this task.")
-    ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Start at this panorama of the run, like 004.jpg."),
-    ] = None,
+    task: Annotated[str | None, option("coarse|block/003", "Show the model of this task.")] = None,
+    camera: Annotated[str | None, option("NAME", "Start at this panorama of the run, like 004.jpg.")] = None,
     output: Annotated[
         Path | None,
-        typer.Option(
+        option(
+            "FOLDER|FILE.html",
+            "Write the page instead of serving it: as a folder for any web server, or as one file.",
             "--output",
             "-o",
-            metavar="FOLDER|FILE.html",
-            help="Write the page instead of serving it: as a folder for any web server, or as one file.",
         ),
     ] = None,
     max_gaussians: Annotated[
         int | None,
-        typer.Option(
+        option(
+            "N",
+            "Show at most N Gaussians, those that cover most. Default: all; 1,000,000 in one file.",
             "--max-gaussians",
-            metavar="N",
             min=1,
-            help="Show at most N Gaussians, those that cover most. Default: all; 1,000,000 in one file.",
         ),
     ] = None,
     most: Annotated[int | None, typer.Option("--most", min=1, hidden=True)] = None,  # its former name
-    port: PortOption = 0,
+    port: Annotated[int, option("PORT", "Port to serve on; 0 = any free port.", min=0, max=65535)] = 0,
 ) -> None:
     """Show the model of a run, a block or a file in 3D, in the browser, until Ctrl-C."""
     _require(source)
@@ -229,8 +196,15 @@ def view(
 
 
 def _open_served(url: str, port: int) -> None:
-    """Opens a page that is served, or says how to reach it, and how to stop it."""
-    if not _open(url):
+    """Opens a page that is served, or says how to reach it, and how to stop it.
+
+    A browser for terminals could not show it, so on Linux there have to be windows.
+    """
+    import os
+    import webbrowser
+
+    windows = sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")))
+    if not (windows and webbrowser.open(url)):
         forward = f"ssh -L {port}:127.0.0.1:{port}"
         say(f"there is no browser here: open the address elsewhere after {forward}, or give -o FOLDER")
     say("Ctrl-C stops it")
@@ -244,19 +218,8 @@ def _say_count(page: "Page") -> None:
         say(f"{shown:,}{part} Gaussians")
 
 
-def _open(url: str) -> bool:
-    """Opens a page in a browser with windows; one for terminals could not show it. False if there is none."""
-    import os
-    import webbrowser
-
-    windows = sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")))
-    return windows and webbrowser.open(url)
-
-
 def report(
-    runs: Annotated[
-        list[str], typer.Argument(metavar="RUN", help="Folder or URL of a run; several folders are compared.")
-    ],
+    runs: Annotated[list[str], argument("RUN", "Folder or URL of a run; several folders are compared.")],
     output: PageOption = None,
 ) -> None:
     """Write a run as one page to share: RUN/report.html, or FILE.html; several, compared, as FILE.html."""
@@ -278,7 +241,11 @@ def report(
     print(page)
 
 
-def compare(runs: RunsArg, as_json: JsonOption = False, output: PageOption = None) -> None:
+def compare(
+    runs: Annotated[list[Path], argument("RUN", "Folders of two runs or more.")],
+    as_json: JsonOption = False,
+    output: PageOption = None,
+) -> None:
     """Compare runs: settings that differ, sizes, times and metrics; with -o as one page to share."""
     from panolog.orchestrator.watch.views.comparison.compare import compare as compare_runs
     from panolog.orchestrator.watch.views.comparison.reading import picture_of, read_runs

@@ -30,18 +30,17 @@ from panolog.orchestrator.cli.options import (
     LocalOption,
     LogOption,
     MaxCostOption,
-    NewRunOption,
     NiceOption,
     NotifyOption,
     PricesOption,
     ResumesOption,
-    SourceArg,
     SuperviseOption,
     wanted,
     with_preparation,
     with_run_config,
 )
 from panolog.orchestrator.cli.stores import mirrored, opened
+from panolog.orchestrator.cli.usage import argument, flag, option
 
 if TYPE_CHECKING:
     from panolog.orchestrator.runs.config import RunConfig
@@ -54,8 +53,13 @@ _RESUMES = 10  # of a supervisor in a row without progress
 @with_run_config
 @with_preparation
 def run(
-    source: SourceArg,
-    output: NewRunOption,
+    source: Annotated[
+        str,
+        argument(
+            "SCENE|IMAGES|VIDEO", "Scene (folder, s3://, gs://, az://), folder of panoramas, or 360° video."
+        ),
+    ],
+    output: Annotated[str, option("RUN", "Folder or URL of the new run.", "--output", "-o")],
     config: "RunConfig",
     options: "Options",
     address: AddressOption = None,
@@ -104,7 +108,7 @@ def resume(
     log: LogOption = None,
     local: LocalOption = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Take a run with a URL from a driver that may still be at work.")
+        bool, flag("Take a run with a URL from a driver that may still be at work.", "--force")
     ] = False,
     accept_changes: AcceptOption = False,
     prices: PricesOption = None,
@@ -143,27 +147,24 @@ def resume(
 def demo(
     output: Annotated[
         Path | None,
-        typer.Option(
+        option(
+            "RUN",
+            "Folder of the run; its scene is written next to it.",
             "--output",
             "-o",
-            metavar="RUN",
-            help="Folder of the run; its scene is written next to it.",
             show_default="runs/demo, runs/flight or runs/city",
         ),
     ] = None,
     address: AddressOption = None,
     flight: Annotated[
         bool,
-        typer.Option(
-            "--flight",
-            help="A flight over nine blocks of houses instead of a street; with --city, above it too.",
+        flag(
+            "A flight over nine blocks of houses instead of a street; with --city, above it too.", "--flight"
         ),
     ] = False,
     city: Annotated[
         int | None,
-        typer.Option(
-            metavar="K", min=2, max=20_000, help="A city of so many panoramas: a drive along all its streets."
-        ),
+        option("K", "A city of so many panoramas: a drive along all its streets.", min=2, max=20_000),
     ] = None,
 ) -> None:
     """Reconstruct a synthetic place: a small town, minutes on two CPU cores."""
@@ -183,9 +184,9 @@ def doctor(
     config: "RunConfig",
     scene: Annotated[
         str | None,
-        typer.Argument(
-            metavar="SCENE|IMAGES|VIDEO",
-            help="Also estimate what a run of this scene (folder or URL) needs, or check the panoramas or the"
+        argument(
+            "SCENE|IMAGES|VIDEO",
+            "Also estimate what a run of this scene (folder or URL) needs, or check the panoramas or the"
             " video.",
         ),
     ] = None,
@@ -259,9 +260,7 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
 
 def events(
     run: AnyRunArg,
-    follow: Annotated[
-        bool, typer.Option("--follow", help="Print new events as long as the run is live.")
-    ] = False,
+    follow: Annotated[bool, flag("Print new events as long as the run is live.", "--follow")] = False,
 ) -> None:
     """Print the history of a run as JSON lines."""
     with opened(run, "events") as (root, _):

@@ -14,16 +14,14 @@ from panolog.orchestrator.cli.options import (
     GpsOption,
     JsonOption,
     LinkOption,
-    MapperOption,
     NewSceneOption,
-    PairsOption,
     ParallaxOption,
     PartialOption,
     SceneArg,
     TrajectoryOption,
     UpOption,
 )
-from panolog.orchestrator.cli.usage import Command, Group
+from panolog.orchestrator.cli.usage import Command, Group, argument, flag, option
 from panolog.scene.errors import InputError
 
 app = typer.Typer(
@@ -33,12 +31,8 @@ app = typer.Typer(
 )
 
 _NETWORK_HELP = "ONNX, with its manifest M.yaml next to it."
-NetworkDeviceOption = Annotated[
-    str, typer.Option("--device", metavar="auto|cpu|cuda|tensorrt", help="Device of the network.")
-]
-BatchOption = Annotated[
-    int, typer.Option(metavar="N", min=1, max=1024, help="Panoramas per call of the network.")
-]
+NetworkDeviceOption = Annotated[str, option("auto|cpu|cuda|tensorrt", "Device of the network.", "--device")]
+BatchOption = Annotated[int, option("N", "Panoramas per call of the network.", min=1, max=1024)]
 
 
 @app.command(cls=Command)
@@ -68,20 +62,15 @@ def check(scene: AnySceneArg, as_json: JsonOption = False) -> None:
 
 @app.command("import", cls=Command)
 def import_(
-    source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="Scene of another program: a file or a folder.")
-    ],
+    source: Annotated[Path, argument("SOURCE", "Scene of another program: a file or a folder.")],
     output: NewSceneOption,
     format: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Format of SOURCE (docs/import.md). Default: detected.")
+        str | None, option("NAME", "Format of SOURCE (docs/import.md). Default: detected.")
     ] = None,
     images: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Folder of the panoramas, if SOURCE does not name it."),
+        Path | None, option("FOLDER", "Folder of the panoramas, if SOURCE does not name it.")
     ] = None,
-    points: Annotated[
-        Path | None, typer.Option(metavar="PLY", help="Point cloud to use instead of the one in SOURCE.")
-    ] = None,
+    points: Annotated[Path | None, option("PLY", "Point cloud to use instead of the one in SOURCE.")] = None,
     link: LinkOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -142,12 +131,15 @@ def stitch(
 
 @app.command(cls=Command)
 def sfm(
-    source: Annotated[
-        Path, typer.Argument(metavar="IMAGES|VIDEO", help="Folder of panoramas, or a 360° video.")
-    ],
+    source: Annotated[Path, argument("IMAGES|VIDEO", "Folder of panoramas, or a 360° video.")],
     output: NewSceneOption,
-    pairs: PairsOption = "auto",
-    mapper: MapperOption = "incremental",
+    pairs: Annotated[
+        Literal["auto", "exhaustive", "sequential"],
+        option("HOW", "Pairs to match: auto, exhaustive or sequential.", "--pairs"),
+    ] = "auto",
+    mapper: Annotated[
+        Literal["incremental", "global"], option("HOW", "Mapper: incremental or global.")
+    ] = "incremental",
     parallax: ParallaxOption = None,
     frames: FramesOption = None,
     up: UpOption = None,
@@ -187,20 +179,16 @@ def mask(
     scene: SceneArg,
     nadir: Annotated[
         str | None,
-        typer.Option(
-            metavar="DEGREES|auto",
-            help="Mask everything within this angle of straight down; auto: the cap that is black there.",
+        option(
+            "DEGREES|auto",
+            "Mask everything within this angle of straight down; auto: the cap that is black there.",
         ),
     ] = None,
     static: Annotated[
         bool,
-        typer.Option(
-            "--static", help="Mask what looks the same in all panoramas around straight down: the operator."
-        ),
+        flag("Mask what looks the same in all panoramas around straight down: the operator.", "--static"),
     ] = False,
-    model: Annotated[
-        Path | None, typer.Option(metavar="M.onnx", help=f"Mask what this network finds. {_NETWORK_HELP}")
-    ] = None,
+    model: Annotated[Path | None, option("M.onnx", f"Mask what this network finds. {_NETWORK_HELP}")] = None,
     batch: BatchOption = 2,
     device: NetworkDeviceOption = "auto",
     as_json: JsonOption = False,
@@ -223,7 +211,7 @@ def mask(
 @app.command(cls=Command)
 def depth(
     scene: SceneArg,
-    model: Annotated[Path, typer.Option("--model", metavar="M.onnx", help=f"Network. {_NETWORK_HELP}")],
+    model: Annotated[Path, option("M.onnx", f"Network. {_NETWORK_HELP}", "--model")],
     batch: BatchOption = 2,
     device: NetworkDeviceOption = "auto",
     as_json: JsonOption = False,

@@ -1,4 +1,4 @@
-"""How commands and groups present their usage. Separate: the program and its groups need it."""
+"""How commands and groups present their usage, and how arguments and options are declared."""
 
 import re
 from typing import Any
@@ -21,6 +21,21 @@ _PLAIN = (
     (r"Input should be a valid number.*", "write a number"),
     (r"Input should be ", "must be "),
 )
+
+
+def argument(metavar: str, text: str, **more: Any) -> Any:
+    """An argument of a command. Args: text, its help; more, as typer's."""
+    return typer.Argument(metavar=metavar, help=text, **more)
+
+
+def option(metavar: str, text: str, *names: str, panel: str | None = None, **more: Any) -> Any:
+    """An option with a value. Args: text, its help; names, by default its own; panel of the help."""
+    return typer.Option(*names, metavar=metavar, help=text, rich_help_panel=panel, **more)
+
+
+def flag(text: str, *names: str, panel: str | None = None, **more: Any) -> Any:
+    """An option without a value. Args: as `option`."""
+    return typer.Option(*names, help=text, rich_help_panel=panel, **more)
 
 
 class _PlainUsage:

@@ -29,19 +29,15 @@ class Steady:
     """
 
     def __init__(self, clock: Clock = CLOCK) -> None:
-        """Begins now. Args: clock, of the machine."""
         self._clock = clock
         self._began = clock.time() - clock.monotonic()
 
     def time(self) -> float:
-        """Seconds since the epoch, for records."""
         steady, now = self._began + self._clock.monotonic(), self._clock.time()
         return now if abs(now - steady) < _JUMP_S else steady
 
     def monotonic(self) -> float:
-        """Seconds that never jump, for durations."""
         return self._clock.monotonic()
 
     def sleep(self, seconds: float) -> None:
-        """Waits where nothing reports an end."""
         self._clock.sleep(seconds)

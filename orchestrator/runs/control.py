@@ -1,8 +1,7 @@
 """The control channel of a run: requests of the user to its driver, as small files in RUN/control.
 
-Any process that may write the run folder may send a request. The driver polls the folder, removes the files
-and carries out what is possible (`answer`). Only the file system is used, so the channel works wherever the
-run folder is mounted.
+Any process that may write the run folder may send one. The driver polls the folder, removes the files and
+carries out what is possible (`answer`).
 """
 
 import json
@@ -196,7 +195,6 @@ def _no_release(state: RunState, node: str) -> str | None:
 
 
 def _in_quarantine(state: RunState, node: str) -> list[NodeState]:
-    """Those of a host, or the ids that begin so."""
     quarantined = state.quarantined()
     by_host = [known for known in quarantined if known.host == node]
     return by_host or [known for known in quarantined if known.id.startswith(node)]

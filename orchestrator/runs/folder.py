@@ -5,6 +5,7 @@ import os
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -15,181 +16,60 @@ from panolog.workers.tasks import COARSE, Stage, TaskId
 _RETENTION = 10_000_000  # bytes of retention.json at most: names of 100,000 tasks have two
 
 
+class _At:
+    """A path below the root of a run."""
+
+    def __init__(self, below: str) -> None:
+        self._below = below
+
+    def __get__(self, folder: "RunFolder", _: object) -> Path:
+        return folder.root / self._below
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """The paths of a run."""
 
     root: Path
 
-    @property
-    def info(self) -> Path:
-        """run.json."""
-        return self.root / "run.json"
-
-    @property
-    def database(self) -> Path:
-        """run.db."""
-        return self.root / "run.db"
-
-    @property
-    def preflight(self) -> Path:
-        """What the run was expected to need."""
-        return self.root / "preflight.json"
-
-    @property
-    def scene(self) -> Path:
-        """The scene of a run that was given panoramas or a video."""
-        return self.root / "scene"
-
-    @property
-    def preparation(self) -> Path:
-        """How that scene is made: settings, progress, and what each step has come to."""
-        return self.root / "prepare"
-
-    @property
-    def lock(self) -> Path:
-        """Held by the one driver."""
-        return self.root / "lock"
-
-    @property
-    def supervisor(self) -> Path:
-        """What a supervisor has locked while it waits before a resume."""
-        return self.root / "supervisor"
-
-    @property
-    def presence(self) -> Path:
-        """What the live driver says without its database."""
-        return self.root / "driver"
-
-    @property
-    def control(self) -> Path:
-        """Requests of the user to the driver."""
-        return self.root / "control"
-
-    @property
-    def follower(self) -> Path:
-        """What of the run has been passed on, to each target and each sink."""
-        return self.root / "follower"
-
-    @property
-    def retention(self) -> Path:
-        """Which models were removed because the merged model stands for them."""
-        return self.root / "retention.json"
-
-    @property
-    def mirror(self) -> Path:
-        """How far the run has been copied to its object store; absent if it has none."""
-        return self.root / "store" / "state.json"
-
-    @property
-    def report(self) -> Path:
-        """The finished run as one page."""
-        return self.root / "report.html"
-
-    @property
-    def plan(self) -> Path:
-        """The partition."""
-        return self.root / "partition" / "plan.json"
-
-    @property
-    def outline(self) -> Path:
-        """The place before it is partitioned, as a plan of one block: cameras, and the box around them."""
-        return self.root / "outline" / "plan.json"
-
-    @property
-    def outline_points(self) -> Path:
-        """Some of the sparse points, PLY."""
-        return self.root / "outline" / "points.ply"
+    info = _At("run.json")  # `info.RunInfo`
+    database = _At("run.db")  # see `store`
+    preflight = _At("preflight.json")  # what the run was expected to need
+    scene = _At("scene")  # the scene of a run that was given panoramas or a video
+    preparation = _At("prepare")  # how that scene is made: settings, progress, and what each step has come to
+    lock = _At("lock")  # held by the one driver
+    supervisor = _At("supervisor")  # what a supervisor has locked while it waits before a resume
+    presence = _At("driver")  # what the live driver says without its database
+    control = _At("control")  # requests of the user to the driver
+    follower = _At("follower")  # what of the run has been passed on, to each target and each sink
+    retention = _At("retention.json")  # which models were removed because the merged model stands for them
+    mirror = _At("store/state.json")  # how far the run has been copied to its store; absent without one
+    report = _At("report.html")  # the finished run as one page
+    plan = _At("partition/plan.json")  # the partition
+    outline = _At("outline/plan.json")  # the place before it is partitioned, as a plan of one block
+    outline_points = _At("outline/points.ply")  # some of the sparse points, PLY
+    plan_picture = _At("partition/plan.png")  # the partition from above
+    scores = _At("partition/scores.npz")  # all gradient scores (eq. 10), sparse: see `partition.scores`
+    point_cloud = _At("point_cloud.ply")  # the merged model
+    sky = _At("sky.ply")  # the sky of the merged model alone
+    web = _At("web")  # the merged model for browsers: a page with its viewer, which any web server can serve
+    page = _At("view.html")  # the merged model for browsers as one HTML file, which opens without a server
+    adjusted = _At("adjusted.npz")  # poses before and after bundle adjustment, points; absent if they stay
+    measured = _At("capture.npz")  # how panoramas were captured, before Stage I; absent if not modelled
+    poses = _At("poses.json")  # how far cameras were moved by bundle adjustment and in Stage I
+    sparse = _At("sparse/0")  # the scene's COLMAP model with the poses that were refined
+    exposure = _At("exposure.json")  # the exposure of each training panorama, as Stage I has learnt it
+    movers = _At("movers")  # what Stage I takes for movers: a mask STEM.png of each panorama that has some
+    mover_shares = _At("movers.json")  # what part of each training panorama is covered by movers
+    georeference = _At("georef.json")  # where on the earth the merged model is, and what it was made of
+    metrics = _At("eval/metrics.json")  # the metrics of the merged model
+    images = _At("eval/images")  # held-out renders above their photographs
+    seams = _At("eval/seams.json")  # what was measured at the faces between blocks
 
     @property
     def known_plan(self) -> Path:
         """The partition, or before there is one the outline: perhaps neither is there."""
         return self.plan if self.plan.exists() else self.outline
-
-    @property
-    def plan_picture(self) -> Path:
-        """The partition from above."""
-        return self.root / "partition" / "plan.png"
-
-    @property
-    def scores(self) -> Path:
-        """All gradient scores (eq. 10), sparse: see `partition.scores`."""
-        return self.root / "partition" / "scores.npz"
-
-    @property
-    def point_cloud(self) -> Path:
-        """The merged model."""
-        return self.root / "point_cloud.ply"
-
-    @property
-    def sky(self) -> Path:
-        """The sky of the merged model alone."""
-        return self.root / "sky.ply"
-
-    @property
-    def web(self) -> Path:
-        """The merged model for browsers: a page with its viewer, which any web server can serve."""
-        return self.root / "web"
-
-    @property
-    def page(self) -> Path:
-        """The merged model for browsers as one HTML file, which opens without a server."""
-        return self.root / "view.html"
-
-    @property
-    def adjusted(self) -> Path:
-        """Poses and points after bundle adjustment, and the poses before; absent if they stay."""
-        return self.root / "adjusted.npz"
-
-    @property
-    def measured(self) -> Path:
-        """How the panoramas were captured, as measured before Stage I; absent if that is not modelled."""
-        return self.root / "capture.npz"
-
-    @property
-    def poses(self) -> Path:
-        """How far cameras were moved by bundle adjustment and in Stage I."""
-        return self.root / "poses.json"
-
-    @property
-    def sparse(self) -> Path:
-        """The scene's COLMAP model with the poses that were refined."""
-        return self.root / "sparse" / "0"
-
-    @property
-    def exposure(self) -> Path:
-        """The exposure of each training panorama, as Stage I has learnt it."""
-        return self.root / "exposure.json"
-
-    @property
-    def movers(self) -> Path:
-        """What Stage I takes for movers: a mask STEM.png of each panorama that has some."""
-        return self.root / "movers"
-
-    @property
-    def mover_shares(self) -> Path:
-        """What part of each training panorama is covered by movers."""
-        return self.root / "movers.json"
-
-    @property
-    def georeference(self) -> Path:
-        """Where on the earth the merged model is, and what it was made of."""
-        return self.root / "georef.json"
-
-    @property
-    def metrics(self) -> Path:
-        """The metrics of the merged model."""
-        return self.root / "eval" / "metrics.json"
-
-    @property
-    def images(self) -> Path:
-        """Held-out renders above their photographs."""
-        return self.root / "eval" / "images"
-
-    @property
-    def seams(self) -> Path:
-        """What was measured at the faces between blocks."""
-        return self.root / "eval" / "seams.json"
 
     def seam(self, below: int, above: int) -> Path:
         """The folder of the pictures of a face between two blocks."""
@@ -343,20 +223,23 @@ def model_of(folder: RunFolder, task: TaskId | None = None) -> Path:
 
 def removed_models(folder: RunFolder) -> frozenset[str]:
     """Tasks whose models were removed because the merged model stands for them; none if that is not noted."""
+    names = read_object(folder.retention, _RETENTION).get("removed_models")
+    return frozenset(it for it in names if isinstance(it, str)) if isinstance(names, list) else frozenset()
+
+
+def read_object(path: Path, most: int) -> dict[str, Any]:
+    """The JSON object in a file that may be anything; {} if it is none, or no plain file.
+
+    Args: most, bytes that are read.
+    """
     try:
-        handle = os.open(folder.retention, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError:
-        return frozenset()
-    try:
-        content = json.loads(os.read(handle, _RETENTION))
+        with FileIO(
+            path, opener=lambda name, how: os.open(name, how | os.O_NOFOLLOW | os.O_NONBLOCK)
+        ) as file:
+            content = json.loads(file.read(most) or b"")
     except (OSError, ValueError, RecursionError):
-        return frozenset()
-    finally:
-        os.close(handle)
-    names = content.get("removed_models") if isinstance(content, dict) else None
-    return (
-        frozenset(name for name in names if isinstance(name, str)) if isinstance(names, list) else frozenset()
-    )
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

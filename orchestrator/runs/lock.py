@@ -1,7 +1,6 @@
 """One driver for each run folder: a lock that ends with its holder and can be queried without being taken.
 
-Open-file-description locks of Linux: unlike flock they can be queried without being taken, unlike POSIX
-record locks they also keep apart two openers in one process.
+Open-file-description locks of Linux: unlike POSIX record locks they also keep apart two openers in a process.
 """
 
 import fcntl
@@ -30,7 +29,6 @@ def hold(path: Path) -> Iterator[None]:
 
 
 def _take(path: Path) -> int:
-    """A descriptor that has the lock. Raises as `hold`."""
     while True:
         try:
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)

@@ -2,8 +2,6 @@
 
 The file has a fixed size and is overwritten in place, which needs no free space on most file systems. It also
 has a token, by which a worker knows that it sees the same folder as the driver.
-
-`why_waiting` separates errors of such a disk from others.
 """
 
 import errno
@@ -15,9 +13,9 @@ import shutil
 import sqlite3
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.folder import read_object
 from panolog.orchestrator.runs.units import gib
 
 _SIZE = 1024  # bytes; of a longer reason the beginning is kept
@@ -73,27 +71,12 @@ class Presence:
 
 def waiting(path: Path) -> str:
     """Why a live driver waits for its disk; "" if it does not or nothing is known."""
-    return str(_read(path).get("waiting", ""))
+    return str(read_object(path, _SIZE).get("waiting", ""))
 
 
 def token(path: Path) -> str:
     """The token of the driver; "" if the file is not here."""
-    return str(_read(path).get("token", ""))
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """The content; nothing if it is missing, not plain or half written."""
-    try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError:
-        return {}
-    try:
-        content = json.loads(os.read(handle, _SIZE))
-    except (OSError, ValueError):
-        return {}
-    finally:
-        os.close(handle)
-    return content if isinstance(content, dict) else {}
+    return str(read_object(path, _SIZE).get("token", ""))
 
 
 def why_waiting(error: BaseException, root: Path, size: int = 0) -> str:

@@ -1,8 +1,7 @@
 """Queries of a database that may be empty, live, left by a killed driver, or a read-only copy.
 
-A driver that is killed in the middle of a commit leaves a journal, which SQLite rolls back when a writer
-opens the database. A reader of the same user does so too; SQLite's locks keep it apart from a driver that
-starts meanwhile. Of another user's folder a copy is read.
+A driver that is killed in the middle of a commit leaves a journal. A reader of the same user rolls it back,
+as a writer does; of another user's folder a copy is read.
 """
 
 import os
@@ -138,7 +137,6 @@ def _roll_back(path: Path, timeout_s: float) -> bool:
 
 
 def _copied(path: Path) -> sqlite3.Connection:
-    """A connection to a copy, which ends with it."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / path.name
         for suffix in ("", "-journal"):

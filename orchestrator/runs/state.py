@@ -62,8 +62,6 @@ class Status(StrEnum):
 
 @dataclass(frozen=True)
 class TaskState:
-    """One task."""
-
     id: TaskId
     status: Status = Status.WAITING
     attempts: int = 0  # by the present driver
@@ -257,7 +255,6 @@ def _with_money(state: RunState, stored: Stored) -> RunState:
 
 
 def _changes(task: TaskState, record: OfTask, time: float) -> dict[str, Any]:
-    """What a record of some time changes in its own task."""
     changes: dict[str, Any] = {}
     match record:
         case TaskStarted():
@@ -322,7 +319,6 @@ def _end(task: TaskState, record: TaskFailed | TaskYielded) -> dict[str, Any]:
 
 
 def _with_nodes(state: RunState, record: Record, time: float) -> RunState:
-    """What a record of some time changes of the nodes."""
     where = state.task(record.task).where if isinstance(record.task, TaskId) else ()
     if isinstance(record, NodeQuarantined):
         _excuse(state, record)
@@ -356,7 +352,6 @@ _FRESH: dict[str, Any] = {"failures": (), **dict.fromkeys([*_IN_A_ROW, *_COUNTS]
 
 
 def _request(task: TaskState, record: PauseRequested | UnpauseRequested | RetryRequested) -> dict[str, Any]:
-    """The user's request about a task. One that runs continues until it yields."""
     held = {"held": isinstance(record, PauseRequested)}
     changes: dict[str, Any] = dict(_FRESH) if isinstance(record, RetryRequested) else held
     if task.status != Status.RUNNING:

@@ -1,11 +1,8 @@
 """RUN/run.db: every record in order, in SQLite. The driver writes it, any process reads it.
 
 The journal is a rollback journal, not a WAL: `run.db` alone is complete after every commit, so that a plain
-copy of it, also on read-only media or a network share, can be read. Readers take all rows of a query at once
-and so never hold the driver up for long.
-
-Of progress only a part is stored, by the rule of `thinning`; the latest of each task is kept in place, so
-that readers always see it.
+copy of it can be read, also on read-only media. Of progress only a part is stored, by the rule of `thinning`;
+the latest of each task is kept in place.
 """
 
 import json
@@ -88,8 +85,6 @@ _SERIES = ("rate", "loss", "psnr", "gaussians", "memory")
 
 @dataclass(frozen=True)
 class _Stream:
-    """The progress of a task."""
-
     stored: int  # how many records
     time: float  # of the last one, seconds since the epoch
     latest: Stored | None = None  # if it was not stored
@@ -172,7 +167,6 @@ class Database:
                 self._connection.execute("ROLLBACK")
 
     def _read_last(self) -> int:
-        """The id of the last record, stored or not."""
         sql = "SELECT MAX((SELECT IFNULL(MAX(id), 0) FROM events), (SELECT IFNULL(MAX(id), 0) FROM latest))"
         return int(self._connection.execute(sql).fetchone()[0])
 
@@ -224,7 +218,6 @@ class Database:
         return _stored(self._connection.execute(f"{_STATE} UNION ALL {_PROGRESS} ORDER BY id"))
 
     def close(self) -> None:
-        """Lets go of the file."""
         self._connection.close()
 
 

@@ -1,10 +1,8 @@
-"""What is kept of what a run repeats: progress and previews, so that days of it stay small.
+"""What is kept of what a run repeats, so that days of it stay small.
 
-Progress. Workers send it about once per second. Of each task the first `DENSE` records are stored, later ones
-at intervals that grow by `GROWTH` with each: however often a task is repeated, what is stored depends on the
-time alone. The latest is always known, see `store.Database`.
-
-Previews. Of each task the first, the latest and at most `PREVIEWS` in all are kept, evenly spaced.
+Of each task the first `DENSE` records of progress are stored, later ones at intervals that grow by `GROWTH`
+with each: however often a task is repeated, what is stored depends on the time alone. Of previews the first,
+the latest and at most `PREVIEWS` in all are kept, evenly spaced.
 """
 
 import math

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from panolog.prepare.check.evidence import Array
 from panolog.prepare.check.residuals import Tracks, measure_residuals
 from panolog.renderer.motion import Common
-from panolog.scene.colmap import Observations, Posed
+from panolog.scene.colmap import Observations
 from panolog.scene.colmap_files import EQUIRECTANGULAR
 from panolog.scene.model import Scene
 
@@ -64,14 +64,7 @@ def adjust(scene: Scene, tracks: Tracks) -> Adjusted:
     used, observations = _in_several([_used(scene, tracks, each.name) for each in scene.panoramas])
     if not len(used) or not np.isfinite(before).any():
         return Adjusted(scene.poses, scene.points, before, before)
-    model = _reconstruction_of(
-        [(each.name, each.rotation, each.translation) for each in scene.panoramas],
-        width=scene.width,
-        height=scene.height,
-        points=scene.points[used],
-        colors=scene.colors[used],
-        observations=observations,
-    )
+    model = _reconstruction_of(scene, used, observations)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
     options.refine_sensor_from_rig = options.print_summary = options.ceres.use_gpu = False
@@ -118,33 +111,26 @@ def _in_several(observations: list[Observations]) -> tuple[NDArray[np.int64], li
 
 
 def _reconstruction_of(
-    images: Sequence[Posed],
-    *,
-    width: int,
-    height: int,
-    points: NDArray[np.float64],
-    colors: NDArray[np.uint8],
-    observations: Sequence[Observations],
+    scene: Scene, used: NDArray[np.int64], observations: Sequence[Observations]
 ) -> "pycolmap.Reconstruction":
-    """A model with one EQUIRECTANGULAR camera; images and points have ids from 1 in their order."""
+    """A model with one camera and the points `used` (U,); images and points have ids from 1 on."""
     import pycolmap  # noqa: PLC0415 (slow and large: loaded where a model is made)
 
+    size = {"width": scene.width, "height": scene.height}
     camera = pycolmap.Camera(
-        camera_id=1, model=EQUIRECTANGULAR, width=width, height=height, params=[float(width), float(height)]
+        camera_id=1, model=EQUIRECTANGULAR, **size, params=[float(side) for side in size.values()]
     )
     reconstruction = pycolmap.Reconstruction()
     reconstruction.add_camera_with_trivial_rig(camera)
-    tracks = [pycolmap.Track() for _ in points]
-    for index, ((name, rotation, translation), (rows, pixels)) in enumerate(
-        zip(images, observations, strict=True), start=1
+    tracks = [pycolmap.Track() for _ in used]
+    for index, (panorama, (rows, pixels)) in enumerate(
+        zip(scene.panoramas, observations, strict=True), start=1
     ):
-        image = pycolmap.Image(
-            name, np.asarray(pixels, np.float64).reshape(-1, 2), camera_id=1, image_id=index
-        )
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.asarray(rotation, np.float64)), translation)
+        image = pycolmap.Image(panorama.name, pixels.reshape(-1, 2), camera_id=1, image_id=index)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(panorama.rotation), panorama.translation)
         reconstruction.add_image_with_trivial_frame(image, pose)
         for feature, row in enumerate(rows):
             tracks[row].add_element(index, feature)
-    for point, color, track in zip(points, colors, tracks, strict=True):
+    for point, color, track in zip(scene.points[used], scene.colors[used], tracks, strict=True):
         reconstruction.add_point3D(point, track, color)
     return reconstruction

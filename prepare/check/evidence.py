@@ -61,8 +61,7 @@ def gather_evidence(scene: Scene) -> Evidence:
 
     Without tracks a panorama is taken to see the points nearest to it that no others are in front of.
 
-    Raises:
-        SceneError: a panorama cannot be decoded, or the model is damaged.
+    Raises SceneError: a panorama cannot be decoded, or the model is damaged.
     """
     views = _spread(scene)
     rows, pixels = _tracks(scene, views)

@@ -27,7 +27,6 @@ from panolog.scene.errors import SceneError
 from panolog.scene.image_files import decode_panorama
 from panolog.scene.images import CURVE, TOE, load_layers
 from panolog.scene.model import Panorama, Scene
-from panolog.scene.write import StageProgress, no_progress
 
 WIDTH = 1024  # pixels of the panoramas as they are measured
 POINTS = 4000  # of each panorama, at most
@@ -69,9 +68,7 @@ class Exposures:
         return float(np.sqrt((self.log_gain**2).mean()) / np.log(2))
 
 
-def measure_exposures(
-    scene: Scene, rows: Sequence[int], progress: StageProgress = no_progress
-) -> Exposures | None:
+def measure_exposures(scene: Scene, rows: Sequence[int]) -> Exposures | None:
     """The exposures of some panoramas of a scene.
 
     None if most of them have seen too few common points, unless all have EXIF that says their exposures. A
@@ -83,7 +80,6 @@ def measure_exposures(
     with ThreadPoolExecutor(initializer=cv2.setNumThreads, initargs=(1,)) as threads:
         sampled = threads.map(lambda row, some: _samples(scene, row, some, far), rows, seen)
         for number, (found, colors) in enumerate(sampled):
-            progress("exposure", number + 1, len(rows))
             views.append(np.full(len(found), number))
             points.append(found)
             values.append(colors)

@@ -27,7 +27,6 @@ from panolog.prepare.check.residuals import FEWEST, measure_residuals, read_trac
 from panolog.scene.errors import SceneError
 from panolog.scene.image_files import decode_with_alpha
 from panolog.scene.model import Scene
-from panolog.scene.write import StageProgress, no_progress
 
 _FEWEST_PANORAMAS = 3
 _WIDTH = 512  # pixels of the panoramas as their colours are compared
@@ -37,7 +36,7 @@ _TURNED, _BETTER = 24, 0.15  # random turns, and by how much a picture at its pl
 _NAMED = 20  # panoramas that get a line each
 
 
-def find_misplaced(scene: Scene, progress: StageProgress = no_progress) -> dict[str, str]:
+def find_misplaced(scene: Scene) -> dict[str, str]:
     """What is wrong with single panoramas, by name, in the scene's order.
 
     A panorama that cannot be decoded counts as one that fits. Raises SceneError if the model is damaged.
@@ -46,11 +45,11 @@ def find_misplaced(scene: Scene, progress: StageProgress = no_progress) -> dict[
         return {}
     tracks = read_tracks(scene)
     apart = np.full(len(scene.panoramas), np.nan) if tracks is None else measure_residuals(scene, tracks)
-    fits = _color_fits(scene, progress)
+    fits = _color_fits(scene)
     stray = strays(scene.centers)
     found = {}
     for row, panorama in enumerate(scene.panoramas):
-        if _is_off(apart[row], apart):
+        if np.isfinite(apart[row]) and apart[row] > max(_OFF, _TIMES * float(np.nanmedian(apart))):
             found[panorama.name] = f"its points are {apart[row]:.0f} px from where it has observed them"
         elif _fits_nowhere(fits[row], fits[:, 0]):
             others = np.nanmedian(fits[:, 0])
@@ -70,10 +69,6 @@ def misplaced_lines(found: dict[str, str]) -> list[str]:
     return [*lines[:_NAMED], f"pose: {len(lines) - _NAMED} more are not: {', '.join(list(found)[_NAMED:])}"]
 
 
-def _is_off(apart: float, every: Array) -> bool:
-    return bool(np.isfinite(apart) and apart > max(_OFF, _TIMES * float(np.nanmedian(every))))
-
-
 def _fits_nowhere(fit: Array, every: Array) -> bool:
     """Args: fit, own and turned correlations as `_color_fit`; every (K,), the panoramas' own."""
     own, turned = fit
@@ -83,17 +78,14 @@ def _fits_nowhere(fit: Array, every: Array) -> bool:
     return usual >= FIT and own < _SHARE * usual and own < turned + _BETTER
 
 
-def _color_fits(scene: Scene, progress: StageProgress) -> Array:
+def _color_fits(scene: Scene) -> Array:
     """(K, 2) of `_color_fit`; NaN where it is not known."""
     every = np.full((len(scene.panoramas), 2), np.nan)
     if len(scene.points) == 0 or is_colorless(scene.colors):
         return every
     turns = Rotation.random(_TURNED, random_state=1).as_matrix()
     with ThreadPoolExecutor(initializer=cv2.setNumThreads, initargs=(1,)) as threads:
-        measured = threads.map(partial(_color_fit, scene, turns), range(len(every)))
-        for row, fit in enumerate(measured):
-            progress("poses", row + 1, len(every))
-            every[row] = fit
+        every[:] = list(threads.map(partial(_color_fit, scene, turns), range(len(every))))
     return every
 
 

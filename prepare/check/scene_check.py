@@ -88,8 +88,7 @@ class SceneCheck:
 def check_scene(scene: Scene) -> SceneCheck:
     """Measures how poses, points and panoramas of a scene fit.
 
-    Raises:
-        SceneError: a panorama cannot be decoded, or the model is damaged.
+    Raises SceneError: a panorama cannot be decoded, or the model is damaged.
     """
     evidence = gather_evidence(scene)
     apart = residuals(evidence)

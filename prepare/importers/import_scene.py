@@ -80,15 +80,12 @@ def import_scene(
     """Reads a scene of another program and writes it to `output`, which appears whole or not at all.
 
     Args:
-        source: what to import.
-        output: the scene's folder, new or empty.
         format: a key of FORMATS; detected if None.
         link: link the panoramas instead of copying them.
         progress: called with the name of each stage, such as "features", and how much of it is done.
 
-    Raises:
-        InputError: the source is wrong, or `output` is not empty; `output` is then unchanged.
-        OSError: a file cannot be read or written.
+    Raises InputError: the source is wrong, or `output` is not empty; `output` is then unchanged; OSError: a
+    file cannot be read or written.
     """
     require_new(output)
     name = choose_format(source, format)
@@ -122,8 +119,7 @@ def import_scene(
 def choose_format(source: ImportSource, name: str | None) -> str:
     """The format: `name` if it is given, else the only one that recognizes the source.
 
-    Raises:
-        InputError: there is no such format or source, or none or several formats recognize it.
+    Raises InputError: there is no such format or source, or none or several formats recognize it.
     """
     if name is not None and name not in FORMATS:
         raise ConfigError(f"--format {name}: there is no such format; one of {', '.join(FORMATS)}")

@@ -107,14 +107,10 @@ def posed_image(
     """A panorama with a camera-to-world matrix (3 or 4, 4).
 
     Args:
-        matrix: the matrix.
-        name: the panorama's file name.
-        folders: where to look for it.
         axes: (3, 3) as in `pose_from_camera_to_world`.
         spelled: the name to look for, if not as it is in the file.
 
-    Raises:
-        SceneError: the matrix is no pose, or there is no such file.
+    Raises SceneError: the matrix is no pose, or there is no such file.
     """
     rows = 3 if len(matrix) == 3 else 4
     rotation, translation = pose_from_camera_to_world(matrix.where, matrix.array(rows, 4), axes)
@@ -127,8 +123,8 @@ def find_panorama(where: str, folders: Sequence[Path], name: str) -> tuple[str, 
     Searches `folders` in order for the name, for its last part, and for both with another extension: programs
     write names without one, or with that of the original. Folders in the name are kept.
 
-    Raises:
-        SceneError: the name leaves the folder, or no file belongs to it; `where` says which field named it.
+    Raises SceneError: the name leaves the folder, or no file belongs to it; `where` says which field named
+    it.
     """
     clean = PurePosixPath(name.replace("\\", "/"))
     if clean.is_absolute():
@@ -157,8 +153,7 @@ def _spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
 def read_stems(path: Path) -> list[str]:
     """The lines of a split file without the extensions of images; empty without the file.
 
-    Raises:
-        SceneError: the file is not text, or too large to be a list of names.
+    Raises SceneError: the file is not text, or too large to be a list of names.
     """
     if not path.is_file():
         return []

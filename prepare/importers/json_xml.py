@@ -104,10 +104,8 @@ class JsonNode:
 def load_json(path: Path, memory: int = MEMORY) -> JsonNode:
     """The content of a JSON file.
 
-    Raises:
-        SceneError: no such file, no JSON (NaN and Infinity are none), or too large to be parsed in so many
-            bytes.
-        OSError: it cannot be read.
+    Raises SceneError: no such file, no JSON (NaN and Infinity are none), or too large to be parsed in so many
+    bytes; OSError: it cannot be read.
     """
     data = _read(path, _JSON_COST, memory)
     try:
@@ -123,14 +121,12 @@ def load_json_in_pieces(
     """The content of a JSON file with an object, without the list `key` of it, which may be of any length.
 
     Args:
-        path: the file.
         key: of the list in the object.
         each: gets the members of the list, one after the other. None is kept.
         memory: bytes that the rest of the object, or a member of the list, may need.
 
-    Raises:
-        SceneError: no such file, no JSON object, or too large; whatever `each` raises.
-        OSError: it cannot be read.
+    Raises SceneError: no such file, no JSON object, or too large; whatever `each` raises; OSError: it cannot
+    be read.
     """
     if not path.is_file():
         raise SceneError(f"{path}: there is no such file")
@@ -268,9 +264,8 @@ def _no_json(path: Path, error: Exception) -> SceneError:
 def load_xml(path: Path, memory: int = MEMORY) -> Element:
     """The root of an XML file; entities and document types are refused.
 
-    Raises:
-        SceneError: no such file, no XML, or too large to be parsed in so many bytes.
-        OSError: it cannot be read.
+    Raises SceneError: no such file, no XML, or too large to be parsed in so many bytes; OSError: it cannot be
+    read.
     """
     data = _read(path, _XML_COST, memory)
     try:

@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.json_xml import JsonNode, load_json_in_pieces
-from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
+from panolog.prepare.importers.point_cloud import PointCloud
 from panolog.prepare.importers.poses import Array, nearest_rotation
 from panolog.scene.colmap import LARGEST
 from panolog.scene.errors import SceneError
@@ -58,30 +58,20 @@ def read(source: ImportSource) -> ImportedScene:
     root = content.get("root_path")
     if source.images is None and root is not None and root.value:
         folders = [Path(root.text()), *folders]
-    parts = content["views"], content["extrinsics"], content.get("intrinsics")
-    return _assemble(*parts, structure, folders, read_point_cloud(source.cloud_file(*_CLOUDS), source.memory))
+    cloud, views = source.cloud(*_CLOUDS), content["views"]
+    return assemble(views, content["extrinsics"], folders, cloud, content.get("intrinsics"), structure)
 
 
 def assemble(
-    views: JsonNode, extrinsics: JsonNode, folders: Sequence[Path], cloud: PointCloud
-) -> ImportedScene:
-    """The scene of two parts of an sfm_data without structure.
-
-    Raises:
-        SceneError: what is wrong with it, with file and field.
-    """
-    return _assemble(views, extrinsics, None, _Structure(views.path, 0), folders, cloud)
-
-
-def _assemble(
     views: JsonNode,
     extrinsics: JsonNode,
-    intrinsics: JsonNode | None,
-    structure: "_Structure",
     folders: Sequence[Path],
     cloud: PointCloud,
+    intrinsics: JsonNode | None = None,
+    structure: "_Structure | None" = None,
 ) -> ImportedScene:
     """The scene of the parts of an sfm_data. Raises SceneError with file and field."""
+    structure = structure or _Structure(views.path, 0)
     poses = {key: _pose(value) for key, value in _by_key(extrinsics)}
     _check_spherical(views, intrinsics)
     points, tracks = structure.points, structure.tracks

@@ -21,9 +21,8 @@ def read_point_cloud(path: Path | None, memory: int = MEMORY) -> PointCloud:
 
     Colours are uchar `red green blue`, or `diffuse_red` and so on.
 
-    Raises:
-        PlyError: no such PLY, truncated, a number that is not finite, or more vertices than `memory` holds.
-        OSError: it cannot be read.
+    Raises PlyError: no such PLY, truncated, a number that is not finite, or more vertices than `memory`
+    holds; OSError: it cannot be read.
     """
     if path is None:
         return np.empty((0, 3)), None

@@ -13,8 +13,7 @@ _TOLERANCE = 1e-3  # how far from orthonormal a rotation that was written as tex
 def nearest_rotation(where: str, matrix: Array) -> Array:
     """(3, 3) the rotation nearest to `matrix` (3, 3).
 
-    Raises:
-        SceneError: it is none, even roughly, or it mirrors; `where` says which field it is.
+    Raises SceneError: it is none, even roughly, or it mirrors; `where` says which field it is.
     """
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > _TOLERANCE:
         raise SceneError(f"{where}: is not a rotation (its rows are not orthonormal); export it again")
@@ -31,8 +30,7 @@ def pose_from_camera_to_world(where: str, matrix: Array, axes: Array) -> tuple[A
     `axes` (3, 3) maps our camera axes to those of the format: `FLIP_YZ` or the identity. A uniform scale in
     the matrix is taken out, as it has no meaning for a camera.
 
-    Raises:
-        SceneError: its left part is not a rotation.
+    Raises SceneError: its left part is not a rotation.
     """
     scale = np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
     if not 1e-9 < scale < 1e9:

@@ -47,8 +47,7 @@ class DepthJob:
 def plan_depth(pictures: Sequence[PanoramaFile], model: Path, device: str = "auto") -> DepthJob:
     """Opens the network and finds out which maps exist already.
 
-    Raises:
-        InputError: the model, its manifest or the device cannot be used.
+    Raises InputError: the model, its manifest or the device cannot be used.
     """
     path = manifest_path(model)
     manifest = read_manifest(path, DepthManifest)
@@ -68,9 +67,8 @@ def make_depth(job: DepthJob, batch: int = BATCH, progress: Progress = no_progre
     Args: batch, images that the network gets at once, unless the model has a batch size of its own; progress,
     called after each panorama.
 
-    Raises:
-        InputError: a panorama is damaged, or an output is not what the manifest says.
-        RunError: the network failed.
+    Raises InputError: a panorama is damaged, or an output is not what the manifest says; RunError: the
+    network failed.
     """
     given, done = job.manifest.input, 0
     many = max(1, (job.network.batch or batch) // (2 if given.seam == "turn" else 1))

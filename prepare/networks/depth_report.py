@@ -1,6 +1,6 @@
 """What `panolog scene depth` does: makes depth maps, and reports how they fit the sparse points (eq. 4)."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from panolog.prepare.networks.depth_maps import DepthJob, make_depth, plan_depth
+from panolog.prepare.networks.depth_maps import make_depth, plan_depth
 from panolog.prepare.networks.inverse_depth import NEAREST
 from panolog.prepare.panorama_files import list_posed_panoramas
 from panolog.scene.depth_alignment import Alignment, AlignmentError, align_depth
@@ -89,19 +89,11 @@ class DepthReport:
             yield f"the network estimates one world unit as {content['metres_per_unit']:.4g} m"
 
 
-def report_depth(job: DepthJob, maps: Sequence[MapAlignment]) -> DepthReport:
-    """The report of a finished job."""
-    metric = job.manifest.depth.factor is not None and not job.given
-    return DepthReport(len(job.todo), job.done, job.given, job.network.device, metric, tuple(maps))
-
-
 def align_depth_maps(scene: Scene, progress: Progress) -> list[MapAlignment]:
     """Aligns each depth map of the scene at its own size, as training does with its default settings.
 
     Args: progress, called after each map.
-
-    Raises:
-        InputError: a layer cannot be decoded.
+    Raises InputError: a layer cannot be decoded.
     """
     found = []
     rows = [row for row, panorama in enumerate(scene.panoramas) if panorama.depth is not None]
@@ -127,4 +119,6 @@ def estimate_depth(
     job = plan_depth(list_posed_panoramas(scene), model, device)
     say(f"{len(job.todo)} panoramas on {job.network.device}; {job.done} are done, {job.given} maps are given")
     make_depth(job, batch, partial(progress, "depth"))
-    return report_depth(job, align_depth_maps(read_scene(scene), partial(progress, "alignment")))
+    maps = align_depth_maps(read_scene(scene), partial(progress, "alignment"))
+    metric = job.manifest.depth.factor is not None and not job.given
+    return DepthReport(len(job.todo), job.done, job.given, job.network.device, metric, tuple(maps))

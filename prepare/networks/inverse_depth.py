@@ -34,8 +34,7 @@ def make_layers(outputs: dict[str, Floats], manifest: DepthManifest) -> DepthLay
     clamped. For a network with a confidence but no sky, the sky mask is empty: without a sky mask, 0 would
     mean sky.
 
-    Raises:
-        ConfigError: an output has another shape than the manifest's input makes one expect.
+    Raises ConfigError: an output has another shape than the manifest's input makes one expect.
     """
     inverse = _inverse(outputs, manifest)
     sky = _side(outputs, manifest, manifest.sky, "sky", inverse.shape)

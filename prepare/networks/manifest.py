@@ -145,8 +145,7 @@ class MaskManifest(ManifestPart):
 def manifest_path(model: Path) -> Path:
     """The manifest next to a model: M.yaml, M.yml or M.json.
 
-    Raises:
-        ConfigError: there is no such model, or no manifest next to it.
+    Raises ConfigError: there is no such model, or no manifest next to it.
     """
     if not model.is_file():
         raise ConfigError(f"{model}: there is no such model")
@@ -163,8 +162,7 @@ def manifest_path(model: Path) -> Path:
 def read_manifest(path: Path, kind: type[Kind]) -> Kind:
     """The manifest of a depth estimator or of a network that masks.
 
-    Raises:
-        ConfigError: anything is wrong; the message names the field.
+    Raises ConfigError: anything is wrong; the message names the field.
     """
     try:
         return kind.model_validate(_read(path))

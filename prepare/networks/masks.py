@@ -62,8 +62,7 @@ class MaskJob:
 def find_static(pictures: Sequence[PanoramaFile], progress: Progress = no_progress) -> StaticRegion:
     """The region that stays the same in the panoramas, or in MOST of them, evenly chosen.
 
-    Raises:
-        SceneError: a panorama is damaged, or there are too few.
+    Raises SceneError: a panorama is damaged, or there are too few.
     """
     if len(pictures) < FEWEST:
         raise SceneError(
@@ -76,8 +75,7 @@ def find_static(pictures: Sequence[PanoramaFile], progress: Progress = no_progre
 def find_nadir(pictures: Sequence[PanoramaFile], progress: Progress = no_progress) -> float:
     """The angle of `black_nadir` of the panoramas, or of MOST of them, evenly chosen.
 
-    Raises:
-        SceneError: a panorama is damaged, or nothing is black in all of them.
+    Raises SceneError: a panorama is damaged, or nothing is black in all of them.
     """
     found = black_nadir(_some(pictures, _not_enlarged, progress))
     if found is None:
@@ -111,9 +109,8 @@ def make_masks(
 ) -> list[MaskResult]:
     """Writes a mask for each panorama; can be interrupted at any moment and called again.
 
-    Raises:
-        SceneError: a panorama or a mask is damaged, or there are two masks of the user for one panorama.
-        RunError: the network failed.
+    Raises SceneError: a panorama or a mask is damaged, or there are two masks of the user for one panorama;
+    RunError: the network failed.
     """
     results = []
     for done, picture in enumerate(pictures, 1):
@@ -191,8 +188,7 @@ def _resized(ignored: Mask, height: int) -> Mask:
 def _given(picture: PanoramaFile) -> Path | None:
     """The user's own mask of a panorama.
 
-    Raises:
-        SceneError: there are two, one that was kept and one that was put or changed since.
+    Raises SceneError: there are two, one that was kept and one that was put or changed since.
     """
     path, kept, colmap = picture.layer(MASKS), picture.layer(GIVEN), picture.colmap_layer(MASKS)
     if is_user_file(path):

@@ -30,9 +30,7 @@ class MoverNetwork:
     def find(self, panorama: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """(h, 2h) True = ignore, of a panorama (width / 2, width, 3) RGB.
 
-        Raises:
-            ConfigError: an output is not what the manifest says.
-            RunError: the network failed.
+        Raises ConfigError: an output is not what the manifest says; RunError: the network failed.
         """
         output = run_all(self._network, network_images(panorama, self._given), self._batch)[self._head.output]
         try:

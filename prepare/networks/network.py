@@ -88,7 +88,8 @@ class Network:
         options = runtime.SessionOptions()
         options.log_severity_level = _FATAL
         runtime.set_default_logger_severity(_FATAL)
-        wanted = providers(device, runtime.get_available_providers(), tensorrt=_has_tensorrt())
+        tensorrt = any(map(importlib.util.find_spec, ("tensorrt", "tensorrt_libs")))
+        wanted = providers(device, runtime.get_available_providers(), tensorrt=tensorrt)
         if len(wanted) > 1:  # the CUDA libraries that came with torch, or with packages of their own
             with contextlib.redirect_stdout(sys.stderr):  # it prints which libraries are missing
                 runtime.preload_dlls()
@@ -161,8 +162,7 @@ def providers(device: str, available: Sequence[str], *, tensorrt: bool) -> list[
     Args: device, "auto" or one of DEVICES; available, what onnxruntime was built with; tensorrt, whether its
     library is installed: builds for GPUs name it in any case.
 
-    Raises:
-        DeviceError: there is no such device, or this onnxruntime does not know it.
+    Raises DeviceError: there is no such device, or this onnxruntime does not know it.
     """
     if device != "auto" and device not in DEVICES:
         raise DeviceError(f"--device {device}: choose auto, {', '.join(DEVICES)}")
@@ -212,7 +212,3 @@ def _errors(runtime: Any) -> tuple[type[Exception], ...]:
     members = [getattr(state, name) for name in dir(state)]
     found = [it for it in members if isinstance(it, type) and issubclass(it, Exception)]
     return (*found, ValueError, RuntimeError, MemoryError)
-
-
-def _has_tensorrt() -> bool:
-    return any(importlib.util.find_spec(name) for name in ("tensorrt", "tensorrt_libs"))

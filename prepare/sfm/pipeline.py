@@ -90,7 +90,7 @@ def make_scene(
         memory=memory,
         places=places,
     )
-    left_out = (*copies, *_left_out(source))
+    left_out = (*copies, *look_into(_image_folder(source)).left_out)  # a file has nothing below it
     reports = [
         _report(part, number, settings, places, notes, left_out)
         for number, part in enumerate(found if settings.parts else found[:1], start=1)
@@ -170,15 +170,11 @@ def _report(
 
 
 def _write(output: Path, report: SfmReport, link: bool, progress: StageProgress) -> None:
-    """Writes the scene of a part, with its report."""
-    scene, new = part_folder(output, report.number), _scene(report.found, report.world)
+    """Writes the scene of a part, with its report: the first in SCENE, the second in SCENE-2."""
+    scene = output if report.number == 1 else output.with_name(f"{output.name}-{report.number}")
+    new = _scene(report.found, report.world)
     write_scene(scene, new, link=link, progress=lambda d, n: progress("scene", d, n))
     write_report(scene, report)
-
-
-def part_folder(output: Path, number: int) -> Path:
-    """Where the part of that number becomes a scene: the first in SCENE, the second in SCENE-2."""
-    return output if number == 1 else output.with_name(f"{output.name}-{number}")
 
 
 def panoramas_in_folder(source: Path) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
@@ -186,8 +182,7 @@ def panoramas_in_folder(source: Path) -> tuple[tuple[PanoramaFile, ...], LayerFi
 
     A picture NAME_mask.png next to NAME.jpg is its mask.
 
-    Raises:
-        SceneError: there is no such folder, there are fewer than two panoramas, or their names collide.
+    Raises SceneError: there is no such folder, there are fewer than two panoramas, or their names collide.
     """
     if not source.is_dir():
         raise SceneError(f"{source}: there is no such folder or video")
@@ -231,11 +226,6 @@ def without_copies(
         )
     chosen = {layer: [files[row] for row in kept] for layer, files in layers.items()}
     return tuple(panoramas[row] for row in kept), chosen, lines
-
-
-def _left_out(source: Path) -> tuple[str, ...]:
-    """`FolderContent.left_out` of a source; nothing of a video."""
-    return tuple(look_into(_image_folder(source)).left_out)  # a file has nothing below it
 
 
 def _image_folder(source: Path) -> Path:

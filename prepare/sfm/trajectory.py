@@ -48,7 +48,9 @@ def read_trajectory(path: Path) -> Trajectory:
     rows = [(number, line) for number, line in rows if not line.lstrip().startswith("#")]
     if not rows:
         raise SceneError(f"{path}: is empty; give lines of t x y z qx qy qz qw, or CSV with a header")
-    return _read_csv(path, rows) if "," in rows[0][1] else _read_tum(path, rows)
+    if "," in rows[0][1]:
+        return _read_csv(path, rows)
+    return _timed(path, np.array([_numbers(path, number, line.split(), 8)[:4] for number, line in rows]))
 
 
 def places_of(trajectory: Trajectory, names: Sequence[str], times: Sequence[float] | None) -> Array:
@@ -126,11 +128,6 @@ def _similarity(a: Array, b: Array) -> Similarity:
     return Similarity(scale, rotation, target - scale * rotation @ middle)
 
 
-def _read_tum(path: Path, rows: Sequence[tuple[int, str]]) -> Trajectory:
-    table = [_numbers(path, number, line.split(), 8)[:4] for number, line in rows]
-    return _timed(path, np.array(table))
-
-
 def _read_csv(path: Path, rows: Sequence[tuple[int, str]]) -> Trajectory:
     head = [cell.strip().lower() for cell in next(csv.reader([rows[0][1]]))]
     try:
@@ -156,12 +153,10 @@ def _read_csv(path: Path, rows: Sequence[tuple[int, str]]) -> Trajectory:
 
 
 def _timed(path: Path, table: Array) -> Trajectory:
+    if not len(table):
+        raise SceneError(f"{path}: has a header only; give a line for each place")
     order = np.argsort(table[:, 0], kind="stable")
-    return Trajectory(path, table[order, 1:4], table[order, 0], None) if len(table) else _empty(path)
-
-
-def _empty(path: Path) -> Trajectory:
-    raise SceneError(f"{path}: has a header only; give a line for each place")
+    return Trajectory(path, table[order, 1:4], table[order, 0], None)
 
 
 def _numbers(path: Path, number: int, cells: Sequence[str], count: int) -> list[float]:

@@ -28,12 +28,10 @@ def triangulate(
 
     Args:
         where: the source, for messages.
-        images: at least two, with unique names.
         size: of the panoramas, in pixels.
         progress: called after each step of the stages "features", "matches" and "points".
 
-    Raises:
-        SceneError: too few points that fit: the poses do not fit the panoramas, or these share too little.
+    Raises SceneError: too few points that fit: the poses do not fit the panoramas, or these share too little.
     """
     with tempfile.TemporaryDirectory() as name, silence_colmap():
         panoramas = tuple(PanoramaFile(where, image.name, image.file) for image in images)

@@ -79,8 +79,7 @@ class Workspace:
     def ids(self) -> list[int]:
         """The database's id of each panorama, once `find_features` has written them.
 
-        Raises:
-            SceneError: COLMAP could not read one of the files.
+        Raises SceneError: COLMAP could not read one of the files.
         """
         with pycolmap.Database.open(self.database) as database:
             of_name = {image.name: image.image_id for image in database.read_all_images()}

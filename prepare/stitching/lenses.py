@@ -19,6 +19,10 @@ from panolog.scene.errors import SceneError
 
 Array = NDArray[np.float64]
 Up = Literal["up", "right", "down", "left"]
+APPROXIMATE = (
+    "stitched: the lenses are taken as equidistant within their circles, which may bend straight lines by a"
+    " degree or two; panoramas that the camera's own program exports are more exact"
+)
 WIDEST = 16_384  # pixels of a panorama
 _STEPS = 8  # of Newton's method, which doubles the digits in each
 _MOST = 2.1  # radians from the axis, more than any lens shows

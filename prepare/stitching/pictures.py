@@ -13,7 +13,7 @@ from panolog.prepare.panorama_files import look_into, masks_among
 from panolog.prepare.provenance import MAX_BYTES
 from panolog.prepare.stitching.calibrate import AGREED, Lenses, OverlapError, calibrate, disagreement
 from panolog.prepare.stitching.circles import CircleError, Picture, halves
-from panolog.prepare.stitching.lenses import Pair, Up, pairs_as_json, read_pairs
+from panolog.prepare.stitching.lenses import APPROXIMATE, Pair, Up, pairs_as_json, read_pairs
 from panolog.prepare.stitching.stitch import Stitcher
 from panolog.prepare.world.exif import camera_of, essential_exif
 from panolog.scene.errors import SceneError
@@ -122,7 +122,8 @@ def stitch_pictures(
     Args:
         width: pixels; by default all that the lenses resolve, of several cameras those with the fewest.
         up: where up is in the first circle; by default as in lenses.json, or else up.
-        note: called with a line about each picture in which both lenses do not agree.
+        note: called with a line about how exact the panoramas are, and about each picture in which both
+            lenses do not agree.
 
     Raises:
         SceneError: `output` has other files, two panoramas had the same name, or as `find_pairs`.
@@ -138,6 +139,7 @@ def stitch_pictures(
     if distinct != known:
         output.mkdir(parents=True, exist_ok=True)
         write_bytes(output / LENSES, pairs_as_json(distinct))
+    note(APPROXIMATE)
     width = width or common_width(distinct)
     stitchers = {pair: Stitcher(pair, width) for pair in distinct}
     for done, (file, target) in enumerate(targets.items(), 1):

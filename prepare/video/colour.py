@@ -68,8 +68,7 @@ class Converter:
 def check_colours(frame: av.VideoFrame) -> tuple[str, str]:
     """The matrix and the range of a frame, as the filter `scale` calls them.
 
-    Raises:
-        ColourError: it is HDR, or its matrix is not known.
+    Raises ColourError: it is HDR, or its matrix is not known.
     """
     if frame.color_trc in _HDR:
         raise ColourError(f"its frames are HDR ({_HDR[frame.color_trc]}); export it in SDR, BT.709")

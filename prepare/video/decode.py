@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.file_kinds import describe_file
 from panolog.prepare.panorama_files import SUFFIXES
-from panolog.prepare.stitching.lenses import Up
+from panolog.prepare.stitching.lenses import APPROXIMATE, Up
 from panolog.prepare.video.colour import ColourError, Converter, check_colours
 from panolog.prepare.video.layout import Layout, LayoutError, layout_of
 from panolog.prepare.video.lenses import (
@@ -63,14 +63,12 @@ class Video:
         """Decodes the first frame and checks how it lies on the sphere.
 
         Args:
-            path, container: the open file.
             ahead: a thread that decodes the next frame while the last one is used.
             effort: what decoding may leave out.
             lenses: of a video that is to be stitched; second: the video of the second one, if there is one.
 
-        Raises:
-            SceneError: there is no frame, or it is no panorama of a usable size.
-            OSError: the file cannot be read.
+        Raises SceneError: there is no frame, or it is no panorama of a usable size; OSError: the file cannot
+        be read.
         """
         self.path = path
         self.decoded = 0  # frames so far
@@ -173,7 +171,7 @@ class Video:
 
     def notes(self) -> list[str]:
         """Messages about a video that was decoded, one line each."""
-        lines = []
+        lines = [] if self._lenses is None else [f"{self.path}: {APPROXIMATE}"]
         counted, seconds = self._stream.frames > 0, self._duration()
         there, whole = (self.passed, self.promised) if counted else (self.time + 1, seconds)
         if there < _ENDS_EARLY * whole:
@@ -272,8 +270,7 @@ def open_video(path: Path, effort: Effort = "exact", up: Up | None = None) -> It
         "chosen" decodes in several threads, and of large videos no frames that no others refer to, most of
         which are coded worst. "draft" also leaves out what smooths the borders of blocks in large ones.
         up, of a video that is to be stitched, where up is in its first circle; None: up.
-    Raises:
-        SceneError: it is missing, cannot be opened, is no panorama, or its width is out of bounds.
+    Raises SceneError: it is missing, cannot be opened, is no panorama, or its width is out of bounds.
     """
     if not path.is_file():
         raise SceneError(f"{path}: there is no such video")
@@ -305,8 +302,7 @@ def _video_stream(
 def video_digest(path: Path) -> str:
     """Identifies a video by its size and three samples, also after it is moved or copied.
 
-    Raises:
-        SceneError: it cannot be read.
+    Raises SceneError: it cannot be read.
     """
     try:
         size = path.stat().st_size

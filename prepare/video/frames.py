@@ -60,10 +60,9 @@ def extract_frames(
     Returns:
         The files, in the order of the video.
 
-    Raises:
-        InputError: the video is missing, damaged, not 2:1 or still two fisheye circles; it does not move;
-            `folder` has frames of another video with this name; an option is out of its bounds.
-        OSError: `folder` cannot be written.
+    Raises InputError: the video is missing, damaged, not 2:1 or still two fisheye circles; it does not move;
+    `folder` has frames of another video with this name; an option is out of its bounds; OSError: `folder`
+    cannot be written.
     """
     if not 0 < parallax <= _WIDEST:
         raise ConfigError(f"parallax {parallax:g}: give an angle above 0 and up to {_WIDEST:g} degrees")

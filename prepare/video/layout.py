@@ -96,11 +96,9 @@ def layout_of(
     Args:
         width, height: of the decoded pictures, in pixels.
         matrix: the display matrix, as FFmpeg gives it: nine native integers, row by row, 16.16.
-        spherical: the metadata, if there is some; without, pictures must be 2:1.
         widest: the maximum width of a panorama, in pixels.
 
-    Raises:
-        LayoutError: the pictures are no panoramas, or too large.
+    Raises LayoutError: the pictures are no panoramas, or too large.
     """
     turn = _turn(matrix, width, height)
     if turn[0] == 0:

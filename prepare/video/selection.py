@@ -48,15 +48,11 @@ def _divide(piece: Piece, step: float, keys: Sequence[float]) -> list[int]:
     if count == 0:
         return [piece.frames[int(sharpness.argmax())]]
     even = positions.max() / count
-    late = _seconds_after(np.array(piece.times), keys)
+    times, late = np.array(piece.times), np.zeros(len(piece.times))  # seconds after the last of the keys
+    if len(keys):
+        late = times - np.array(keys)[np.maximum(np.searchsorted(keys, times, side="right") - 1, 0)]
     rows = [_best(np.abs(positions / even - place), sharpness, late) for place in range(count + 1)]
     return [piece.frames[row] for row in rows]
-
-
-def _seconds_after(times: NDArray[np.float64], keys: Sequence[float]) -> NDArray[np.float64]:
-    """(N,) how long after the last of `keys` the `times` (N,) are; 0 without any."""
-    begun = np.searchsorted(keys, times, side="right") - 1
-    return times - np.array(keys)[np.maximum(begun, 0)] if len(keys) else np.zeros(len(times))
 
 
 def _best(away: NDArray[np.float64], sharpness: NDArray[np.float64], late: NDArray[np.float64]) -> int:

@@ -55,8 +55,7 @@ class Spherical:
 def read_spherical(path: Path) -> Spherical | None:
     """The metadata of the first video track that has some; None without, also if it is damaged.
 
-    Raises:
-        OSError: the file cannot be read.
+    Raises OSError: the file cannot be read.
     """
     with path.open("rb") as file:
         reader = BoxReader(file, path.stat().st_size)

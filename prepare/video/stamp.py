@@ -26,8 +26,6 @@ def stamped(
 
     Args:
         jpeg: as OpenCV writes it, with a JFIF segment at its beginning.
-        fix: the position of the camera.
-        attitude: that of the picture.
         taken: when it was taken, in UTC.
         exposure: seconds and ISO.
     """

@@ -94,8 +94,7 @@ def read_telemetry(path: Path) -> tuple[Telemetry | None, list[str]]:
 
     Reads the packets of those tracks alone.
 
-    Raises:
-        SceneError: the file cannot be opened as a video.
+    Raises SceneError: the file cannot be opened as a video.
     """
     found = _Collected()
     notes = []

@@ -41,9 +41,8 @@ def complete_panoramas(
 
     What an earlier call has completed is not done again.
 
-    Raises:
-        SceneError: a picture is to be turned by its EXIF orientation, or its crop does not fit it.
-        OSError: a file cannot be read or written.
+    Raises SceneError: a picture is to be turned by its EXIF orientation, or its crop does not fit it;
+    OSError: a file cannot be read or written.
     """
     exifs = [read_exif(panorama.path) for panorama in panoramas]  # not in threads, see there
     for panorama, exif in zip(panoramas, exifs, strict=True):

@@ -119,9 +119,7 @@ def read_exif(path: Path) -> Exif:
     Reads the parts that it needs, never a pixel. Pillow's warnings about damaged EXIF are suppressed by a
     filter that all threads share, so call this in one thread at a time.
 
-    Raises:
-        SceneError: there is no such file.
-        OSError: it cannot be opened.
+    Raises SceneError: there is no such file; OSError: it cannot be opened.
     """
     if not path.is_file():
         raise SceneError(f"{path}: there is no such image")

@@ -56,8 +56,6 @@ def georeference(
     Args:
         rotations: (K, 3, 3) world-to-camera, x right, y down, z forward.
         centers: (K, 3) the cameras' positions.
-        attitudes: K, from the files.
-        fixes: K, from the files.
         scale: metres per unit, if it is known; it then takes precedence over GPS.
     """
     up, up_notes = find_up(rotations, attitudes)
@@ -89,13 +87,10 @@ def scale_from_distance(
     """Metres per unit, from the distance between the cameras of two panoramas.
 
     Args:
-        names: K, of the panoramas.
         centers: (K, 3) their positions.
-        first, second: the two names.
         metres: between them.
 
-    Raises:
-        ConfigError: a panorama is not among them, they are at one place, or the distance is not positive.
+    Raises ConfigError: a panorama is not among them, they are at one place, or the distance is not positive.
     """
     for name in (first, second):
         if name not in names:

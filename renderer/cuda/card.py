@@ -24,13 +24,13 @@ MIN_CAPABILITY = (7, 5)  # the oldest compute capability of NVRTC 13
 DEFAULT_STREAM = 1  # CU_STREAM_LEGACY: torch writes its default stream as 0
 
 
-def run(op: str, *arguments: Any) -> Any:
-    """Run one of `ops` on the device of its first tensor."""
-    first = arguments[0][0] if isinstance(arguments[0], list) else arguments[0]
-    with torch.cuda.device(first.device):
-        card = Card.of(first.device.index)
+def run(op: str, given: Mapping[str, Any]) -> Any:
+    """Run one of `ops`, with its arguments by name, on the device of the first, a tensor."""
+    device = next(iter(given.values())).device
+    with torch.cuda.device(device):
+        card = Card.of(device.index)
         card.device.set_current()  # a thread of autograd may have no context yet
-        return getattr(launches, op)(card.launch, *arguments)
+        return getattr(launches, op)(card.launch, **given)
 
 
 class Card:

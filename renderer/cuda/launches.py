@@ -1,4 +1,6 @@
-"""The ops on CUDA: each as a sequence of the parts, with the arguments that torch's dispatcher passes."""
+"""The ops on CUDA: each as a sequence of the parts, with the arguments of the op by their names."""
+
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,26 +23,20 @@ from panolog.renderer.cuda.parts import (
     project_backward,
 )
 
+_PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+_IMAGES = ("color", "alpha", "inverse_depth", "grad_color", "grad_alpha", "grad_inverse_depth")
 
-def rasterize(
-    launch: Launch,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh0: Tensor,
-    shN: Tensor,
-    screen: Tensor,
-    rotation: Tensor,
-    translation: Tensor,
-    width: int,
-    height: int,
-    sh_degree: int,
-    near: float,
-    exact: bool,
-    exterior: list[Tensor],
-    motion: Tensor | None = None,  # noqa: ARG001  # receives a gradient
-) -> tuple[Tensor, ...]:
+
+def _problem(given: dict[str, Any]) -> tuple[dict[str, Tensor], bytes, Exterior | None]:
+    """The parameters, the camera, and what is around. The host waits for a pose that is on the card."""
+    size, exact = (given["width"], given["height"]), given["exact"]
+    rotation, translation = (given[name].detach().cpu() for name in ("rotation", "translation"))
+    camera = camera_struct(rotation, translation, *size, given["near"], exact)
+    parameters = contiguous(**{name: given[name] for name in _PARAMETERS})
+    return parameters, camera, Exterior.of(given["exterior"], *size, exact)
+
+
+def rasterize(launch: Launch, **given: Any) -> tuple[Tensor, ...]:
     """`ops.rasterize`: color, alpha, inverse depth, state and the frame for the backward pass.
 
     The frame is splats (16 (N + M),) with the M of the exterior, rays likewise or, without `exact`, (0,), the
@@ -50,89 +46,52 @@ def rasterize(
     Raises:
         RunError: more than 2³¹ pairs of splats and tiles.
     """
-    parameters = contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
-    camera = camera_struct(*_here(rotation, translation), width, height, near, exact)
-    angles = half_pixels(width, height, means.device) if exact else None
-    around = Exterior.of(exterior, width, height, exact)
-    projected = project(launch, parameters, screen[:, :2].contiguous(), camera, sh_degree, angles, around)
+    parameters, camera, around = _problem(given)
+    size, screen = (given["width"], given["height"]), given["screen"][:, :2].contiguous()
+    angles = half_pixels(*size, screen.device) if given["exact"] else None
+    projected = project(launch, parameters, screen, camera, given["sh_degree"], angles, around)
     splats, seen, state, _, tile_counts = projected
-    listed = list_pairs(launch, projected, width, height, exterior=around)
-    images = composite(launch, splats, seen, listed, width, height, around)
+    listed = list_pairs(launch, projected, *size, exterior=around)
+    images = composite(launch, splats, seen, listed, *size, around)
     rays = splats.new_empty(0) if seen is None else seen.rays
     return *images, state, splats, rays, tile_counts, listed.entries, listed.starts
 
 
-def rasterize_backward(
-    launch: Launch,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh0: Tensor,
-    shN: Tensor,
-    screen: Tensor,
-    rotation: Tensor,
-    translation: Tensor,
-    width: int,
-    height: int,
-    sh_degree: int,
-    near: float,
-    exact: bool,
-    exterior: list[Tensor],
-    color: Tensor,
-    alpha: Tensor,
-    inverse_depth: Tensor,
-    frame: list[Tensor],
-    grad_color: Tensor,
-    grad_alpha: Tensor,
-    grad_inverse_depth: Tensor,
-    moving: bool = False,
-) -> tuple[Tensor, ...]:
+def rasterize_backward(launch: Launch, **given: Any) -> tuple[Tensor, ...]:
     """`ops.rasterize_backward`: gradients of means, quats, scales, opacities, sh0, shN, screen; motion."""
-    splats, rays, tile_counts, entries, starts = frame
+    parameters, camera, around = _problem(given)
+    splats, rays, tile_counts, entries, starts = given["frame"]
+    means, size, absolute = given["means"], (given["width"], given["height"]), given["screen"].shape[1] == 4
+    images: dict[str, Any] = {name: given[name].contiguous() for name in _IMAGES}
     sums = composite_backward(
         launch,
         splats,
-        Rays(rays, *half_pixels(width, height, splats.device)) if exact else None,
+        Rays(rays, *half_pixels(*size, splats.device)) if given["exact"] else None,
         entries,
         starts,
-        width,
-        height,
+        *size,
         len(means),
-        Exterior.of(exterior, width, height, exact),
-        absolute=screen.shape[1] == 4,
-        **contiguous(color=color, alpha=alpha, inverse_depth=inverse_depth, grad_color=grad_color),
-        **contiguous(grad_alpha=grad_alpha, grad_inverse_depth=grad_inverse_depth),
+        around,
+        absolute=absolute,
+        **images,
     )
-    parameters = contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
-    camera = camera_struct(*_here(rotation, translation), width, height, near, exact)
-    motion = room_for(means, moving)
-    out = project_backward(launch, parameters, camera, sh_degree, splats, tile_counts, sums, motion=motion)
-    if screen.shape[1] == 4:
+    motion = room_for(means, given.get("moving", False))
+    seen = parameters, camera, given["sh_degree"], splats, tile_counts
+    out = project_backward(launch, *seen, sums, motion=motion)
+    if absolute:
         out["screen"] = torch.cat([out["screen"], out.pop("absolute")], 1)
     found = means.new_empty(0, dtype=torch.float64) if motion is None else motion_sums(launch, motion)
     return *out.values(), found
 
 
-def photometric(
-    launch: Launch,
-    color: Tensor,
-    target: Tensor,
-    mask: Tensor | None,
-    lambda_ssim: float,
-    rows: Tensor | None = None,
-    exposure: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+def photometric(launch: Launch, **given: Any) -> tuple[Tensor, Tensor, Tensor]:
     """`ops.photometric`."""
-    images = color, target, mask, lambda_ssim, rows, exposure
-    sums, samples, gradient, normal = photometric_sums(launch, *images)
+    sums, samples, gradient, normal = photometric_sums(launch, **given)
     l1, ssim, squared = (sums / samples).unbind()
-    loss = (1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim)
-    return (
-        torch.stack([loss, l1, ssim, squared]),
-        gradient,
-        sums.new_empty(0, 5) if normal is None else normal,
-    )
+    weight = given["lambda_ssim"]
+    loss = (1 - weight) * l1 + weight * (1 - ssim)
+    normal = sums.new_empty(0, 5) if normal is None else normal
+    return torch.stack([loss, l1, ssim, squared]), gradient, normal
 
 
 def absolute_difference(
@@ -143,25 +102,8 @@ def absolute_difference(
     return total / samples, gradient
 
 
-def adam(
-    launch: Launch,
-    parameter: Tensor,
-    gradient: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    count: int,
-    lr: float,
-    beta1: float,
-    beta2: float,
-    eps: float,
-    step: int,
-    units: Tensor | None = None,
-) -> None:
+def adam(launch: Launch, **given: Any) -> None:
     """`ops.adam`: one step on the first `count` values, in place."""
-    update = Update(gradient.contiguous(), parameter, exp_avg, exp_avg_sq, count, lr, units)
-    adam_step(launch, [update], beta1, beta2, eps, step)
-
-
-def _here(rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-    """A pose on the CPU: the host waits for one that is on the card."""
-    return rotation.detach().cpu(), translation.detach().cpu()
+    tensors = given["gradient"].contiguous(), given["parameter"], given["exp_avg"], given["exp_avg_sq"]
+    update = Update(*tensors, given["count"], given["lr"], given.get("units"))
+    adam_step(launch, [update], *(given[name] for name in ("beta1", "beta2", "eps", "step")))

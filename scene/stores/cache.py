@@ -20,7 +20,7 @@ from pathlib import Path
 
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import SUFFIX, user_folder
-from panolog.scene.stores.store import PATIENCE_S, Store, Version, open_store
+from panolog.scene.stores.store import PATIENCE_S, Version, open_store
 
 FOLDER, BOUND = "PANOLOG_STORE_CACHE", "PANOLOG_STORE_CACHE_GIB"
 _GIB = 20.0
@@ -123,9 +123,7 @@ def variables(environment: Mapping[str, str]) -> dict[str, str]:
     return {name: environment[name] for name in (FOLDER, BOUND) if environment.get(name)}
 
 
-@lru_cache(maxsize=4)
-def _store(url: str, patience: float) -> Store:
-    return open_store(url, patience)
+_store = lru_cache(maxsize=4)(open_store)
 
 
 def _digest(stored: Stored) -> str:

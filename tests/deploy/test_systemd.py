@@ -39,15 +39,6 @@ def test_systemd_accepts_it(tmp_path: Path, unit: Path, name: str) -> None:
     assert (ended.returncode, about_it) == (0, []), ended.stderr
 
 
-def test_it_restarts_what_a_restart_can_help() -> None:
-    service = fields()["Service"]
-    assert service["Restart"] == "on-failure"
-    assert set(service["RestartPreventExitStatus"].split()) == {"1", "2"}
-    assert service["SuccessExitStatus"] == "130"
-    assert (service["KillMode"], service["OOMPolicy"]) == ("mixed", "continue")
-    assert {"StartLimitIntervalSec", "StartLimitBurst"} <= set(fields()["Unit"])
-
-
 @pytest.mark.parametrize("made", [False, True])
 def test_its_command_begins_or_resumes_the_run(tmp_path: Path, made: bool) -> None:
     shell = fields()["Service"]["ExecStart"].replace("$$", "$")

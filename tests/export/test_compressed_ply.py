@@ -88,23 +88,15 @@ GOOD = header(1) + "\0" * 88
 LONG = "ply\n" + "comment a\n" * 500
 PLAIN = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n1234"
 WRONG = {
-    "empty": ("", "header is damaged"),
     "a picture": ("\x89PNG\r\n\x1a\n", "is no compressed PLY"),
     "no end": (LONG, "header is damaged"),
-    "a long line": ("ply\n" + "a" * 10_000, "header is damaged"),
     "a plain PLY": (PLAIN, "as PlayCanvas"),
     "ascii": (GOOD.replace("binary_little_endian", "ascii"), "binary"),
     "doubles": (GOOD.replace("property float min_x", "property double min_x"), "its header has"),
-    "another type": (
-        GOOD.replace("property uint packed_scale", "property float packed_scale"),
-        "as PlayCanvas",
-    ),
-    "twice": (GOOD.replace("min_y", "min_x"), "as PlayCanvas"),
-    "no chunk": (header(1, chunks=0) + "\0" * 88, "as PlayCanvas"),
+    "another type": (GOOD.replace("uint packed_scale", "float packed_scale"), "as PlayCanvas"),
     "too many chunks": (header(256, chunks=2) + "\0" * 9000, "as PlayCanvas"),
     "truncated": (GOOD[:-1], "truncated, 1 bytes are missing"),
     "a billion": (header(999_999_999, chunks=3_906_250) + "\0" * 88, "truncated"),
-    "ten billions": (header(9_999_999_999) + "\0" * 88, "its header has"),
     "degree 4": (header(1, rest=72) + "\0" * 500, "as PlayCanvas"),
     "no numbers": (header(1) + "\xff" * 88, "no numbers"),
 }

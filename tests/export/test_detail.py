@@ -4,10 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from panolog.export.detail import Detail, Node
-from panolog.export.order import morton_order
+from panolog.export.detail import Detail
 from panolog.export.splats import InMemory, Splats
 
 
@@ -24,38 +22,6 @@ def wall(count: int, degree: int = 1, size: float = 0.05) -> Splats:
         sh0=colours.astype(np.float32),
         shN=np.zeros((count, (0, 3, 8, 15)[degree], 3), np.float32),
     )
-
-
-def rows(means: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(N, 3) the same points in one order."""
-    return np.asarray(means[np.lexsort(means.T)])
-
-
-def numbers(node: Node) -> list[int]:
-    """The leaves below a node, which contains its children."""
-    if node.children is None:
-        assert node.leaf is not None
-        return [node.leaf]
-    assert node.count == sum(child.count for child in node.children)
-    assert all((child.lower >= node.lower).all() for child in node.children)
-    return [number for child in node.children for number in numbers(child)]
-
-
-def test_every_gaussian_is_in_one_leaf(tmp_path: Path) -> None:
-    model = wall(20_000)
-    detail = Detail(InMemory(model), tmp_path, side=8, most=3000, levels=1)
-    leaves = list(detail.leaves())
-    assert detail.leaf_count == len(leaves) > 7
-    assert all(len(leaf.levels) == 1 and len(leaf.levels[0]) == leaf.node.count <= 3000 for leaf in leaves)
-    together = np.concatenate([leaf.levels[0].means for leaf in leaves])
-    np.testing.assert_array_equal(rows(together), rows(model.means))
-    for leaf in leaves:
-        own = leaf.levels[0].means
-        np.testing.assert_array_equal(own.min(axis=0), leaf.node.lower)
-        np.testing.assert_array_equal(own.max(axis=0), leaf.node.upper)
-        np.testing.assert_array_equal(morton_order(own), np.arange(len(own)))
-    assert numbers(detail.tree) == list(range(detail.leaf_count))
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("degree", [0, 3])

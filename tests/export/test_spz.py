@@ -135,23 +135,14 @@ def frames(count: int, *streams: bytes, sizes: tuple[int, ...] | None = None) ->
 
 WRONG = {
     "empty": (b"", "is no SPZ"),
-    "a picture": (b"\x89PNG\r\n\x1a\n" + bytes(100), "is no SPZ"),
-    "another gzip": (gzip.compress(bytes(100)), "is no SPZ of version"),
     "a newer version": (gzip.compress(header(5, 1) + bytes(100)), "is no SPZ of version"),
     "only a header": (gzip.compress(header(3, 1)), "truncated"),
-    "no header": (gzip.compress(b"NGSP"), "truncated"),
     "degree 5": (gzip.compress(header(3, 1, 5) + bytes(500)), "header of the SPZ is damaged"),
     "99 bits": (gzip.compress(header(3, 1, 0, 99) + bytes(500)), "header of the SPZ is damaged"),
     "4 billion": (gzip.compress(header(3, 2**32 - 1) + bytes(100)), "cannot be in an SPZ of"),
-    "a million": (gzip.compress(header(3, 1_000_000) + bytes(20_000_000)), "cannot be in an SPZ of"),
     "more": (gzip.compress(header(3, 1) + bytes(21)), "more than its header says"),
-    "half a gzip": (
-        gzip.compress(header(3, 1000) + np.random.default_rng(0).bytes(20_000))[:9000],
-        "truncated",
-    ),
     "a damaged gzip": (gzip.compress(header(3, 1))[:12] + bytes(100), "damaged"),
     "a wrong checksum": (gzip.compress(header(3, 1) + bytes(20))[:-8] + bytes(8), "damaged"),
-    "only a header of version 4": (header(4, 1, streams=5), "truncated"),
     "no streams": (header(4, 1) + struct.pack("<I12x", 32), "streams"),
     "a table behind": (header(4, 1, streams=5) + struct.pack("<I12x", 2**32 - 1), "truncated"),
     "wrong sizes": (frames(1, *[bytes(9)] * 5), "sizes of the SPZ's streams"),

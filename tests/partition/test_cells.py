@@ -80,18 +80,6 @@ def test_block_of_agrees_with_bounds(grid: Cells, contracted: NDArray[np.float64
         assert ((lower <= point) & ((point < upper) | (upper == 1.0))).all()
 
 
-@settings(max_examples=30, deadline=None)
-@given(cells)
-def test_cells_are_half_open_and_fill_the_cube(grid: Cells) -> None:
-    volume = 0.0
-    for block in range(grid.count):
-        lower, upper = grid.bounds(block)
-        assert grid.block_of(lower[None]) == [block] == grid.block_of(np.nextafter(upper, 0)[None])
-        assert (lower >= 0.0).all() and (upper <= 1.0).all()
-        volume += float(np.prod(upper - lower))
-    assert volume == pytest.approx(1.0)
-
-
 @given(grids)
 def test_blocks_of_a_grid_are_numbered_along_x_then_y_then_z(grid: Grid) -> None:
     corners = [grid.bounds(block)[0].tolist() for block in range(grid.count)]

@@ -143,8 +143,8 @@ def test_where_a_side_has_no_cameras_or_was_not_trained_there_is_no_seam() -> No
 def places(seed: int = 0) -> NDArray[np.float64]:
     """Within the box, and far outside of it."""
     random = np.random.default_rng(seed)
-    inside = random.uniform(BOX.lower, BOX.upper, (2000, 3))
-    return np.concatenate([inside, random.normal(scale=60.0, size=(500, 3))])
+    inside = random.uniform(BOX.lower, BOX.upper, (600, 3))
+    return np.concatenate([inside, random.normal(scale=60.0, size=(150, 3))])
 
 
 @pytest.mark.parametrize("cells", PARTITIONS, ids=str)

@@ -141,28 +141,6 @@ def test_poses_get_the_gradients_of_motions(few: Gaussians, exact: bool) -> None
     np.testing.assert_allclose(motion.grad.numpy(), sums.grad[:MOTION].numpy(), rtol=1e-4, atol=1e-4)
 
 
-def test_a_pose_is_found_by_an_optimizer() -> None:
-    """As a quaternion and a position: neither is the motion that the kernels know."""
-    scene, at = cloud(200), camera(64)
-    with torch.no_grad():
-        target = drawn(scene, at, sh=harmonics(scene)).color
-    start = turned(torch.tensor([0.03, -0.02, 0.04])) @ at.rotation
-    rows = start.clone().requires_grad_()  # its first two rows, made orthonormal, are the rotation
-    shift = (at.translation + torch.tensor([0.03, 0.02, -0.03])).requires_grad_()
-    optimizer = torch.optim.Adam([rows, shift], lr=3e-3)
-    losses = []
-    for _ in range(60):
-        x = torch.nn.functional.normalize(rows[0], dim=0)
-        y = torch.nn.functional.normalize(rows[1] - (rows[1] @ x) * x, dim=0)
-        place = Camera(torch.stack([x, y, torch.linalg.cross(x, y)]), shift, at.width, at.height)
-        loss = (drawn(scene, place, sh=harmonics(scene)).color - target).square().mean()
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[-1] < losses[0] / 20
-
-
 def test_wrong_arguments_are_errors(few: Gaussians) -> None:
     place, colors = camera(64), torch.ones(len(few), 3)
     with pytest.raises(ValueError, match="either colors or sh"):

@@ -9,16 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from panolog.renderer import _core
+from panolog.renderer import _core, ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.motion import MOTION_SUMS
 from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians
 from tests.on_device import needs_a_card, on_all_devices
-from tests.renderer.agreement import IMAGES, NEAR, Truth, certain, check_definition, random_weights, truth_of
-from tests.renderer.hard_scenes import as_leaves, camera, cloud, placed, scenes, wide
+from tests.renderer.agreement import NEAR, Truth, check_definition, random_weights, truth_of
+from tests.renderer.cuda.machine import arguments
+from tests.renderer.hard_scenes import as_leaves, camera, cloud, directions, placed, scenes, wide
 from tests.renderer.reference import render_reference, rows_of
-from tests.renderer.reference_rays import pixel_rays
 
 SCENES = [(name, exact) for exact in (False, True) for name in scenes(camera(), exact)]
 both = pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
@@ -117,22 +117,6 @@ def test_any_width_agrees_with_the_definition(width: int, exact: bool) -> None:
     check_definition(replace(cloud(60), exact=exact), camera(width), 3)
 
 
-@on_all_devices
-@both
-def test_an_eighth_turn_about_the_vertical_shifts_the_image_by_an_eighth(exact: bool, device: str) -> None:
-    at = Camera(torch.eye(3), torch.tensor([0.1, -0.2, 0.05]), 128, 64)
-    c = math.sqrt(0.5)
-    turn = torch.tensor([[c, 0.0, c], [0.0, 1.0, 0.0], [-c, 0.0, c]])  # camera axes: y is vertical
-    turned = Camera(turn @ at.rotation, turn @ at.translation, 128, 64)
-    for name in ("cloud", "seam", "poles", "huge"):
-        scene = scenes(at, exact)[name]
-        keep = certain(scene, at).roll(16, 1)
-        before, after = (render(scene.to(device), view.to(device), near=NEAR) for view in (at, turned))
-        for image in IMAGES:
-            difference = (getattr(before, image).roll(16, 1) - getattr(after, image)).abs().cpu()
-            assert difference[keep].max() < 1e-4 * max(1, float(before.inverse_depth.max())), name
-
-
 @pytest.mark.parametrize("tilt", [0.2, 0.6, 1.2])
 def test_a_needle_across_the_image_is_as_exact_as_a_ball(tilt: float) -> None:
     at = Camera(torch.eye(3), torch.zeros(3), 1024, 512)
@@ -147,20 +131,6 @@ def test_a_needle_across_the_image_is_as_exact_as_a_ball(tilt: float) -> None:
     )
     assert render(needle, at, near=NEAR).alpha.max() > 0.8
     check_definition(needle, at, 3)
-
-
-def test_a_round_gaussian_is_a_circle_on_the_sphere_wherever_it_is_seen() -> None:
-    """Also at the pole, where an affine splat is not: the response depends on the angle alone."""
-    at = Camera(torch.eye(3), torch.zeros(3), 256, 128)
-    middle = torch.tensor([[0.1, 2.0, 0.05]])  # near the nadir
-    ball = placed(1, middle, at, -0.5)
-    ball = ball.with_tensors(ball.tensors() | {"scales": torch.full((1, 3), -0.5)})
-    alpha = render(replace(ball, exact=True), at, near=NEAR).alpha
-    angle = torch.acos((pixel_rays(at).float() @ (middle[0] / middle.norm())).clamp(max=1))
-    order = angle.flatten().argsort()
-    falling = alpha.flatten()[order]
-    assert falling[0] > 0.1
-    assert (falling[1:] - falling[:-1]).max() < 1e-3
 
 
 def test_a_gaussian_overhead_is_a_cap_not_a_sliver() -> None:
@@ -221,7 +191,7 @@ def test_gradients_of_many_are_those_of_the_few_that_are_seen(exact: bool, instr
 
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-BROKEN = [(name, value) for name in PARAMETERS for value in (math.nan, math.inf, -math.inf)]
+BROKEN = [(name, value) for name in PARAMETERS for value in (math.nan, math.inf)]
 
 
 @both
@@ -241,12 +211,20 @@ def test_a_broken_gaussian_is_reported_and_harms_no_other(parameter: str, value:
         assert not leaf.grad[7].any(), name
 
 
-def test_the_near_cut_hides_what_is_closer() -> None:
-    at = Camera(torch.eye(3), torch.zeros(3), 64, 32)
-    scene = cloud(1)
-    at_distance_two = scene.with_tensors(scene.tensors() | {"means": torch.tensor([[0.0, 0.0, 2.0]])})
-    assert render(at_distance_two, at, near=1.9).visible.all()
-    assert not render(at_distance_two, at, near=2.1).visible.any()
+def test_an_exact_gaussian_that_reaches_a_pole_is_tested_in_few_rows() -> None:
+    at, count = camera(256), 400
+    rng = torch.Generator().manual_seed(3)
+    below, sign = (
+        0.01 * torch.rand(count, generator=rng),
+        torch.where(torch.arange(count) % 2 == 0, 1.0, -1.0),
+    )
+    where = directions(torch.rand(count, generator=rng) * 6.28, sign * (math.pi / 2 - below))
+    scene = replace(placed(count, where, at, -4.5), exact=True)
+    splats = ops.rasterize(**arguments(scene, at))[4].view(-1, 16)
+    rows, columns = splats[:, 12], splats[:, 15]  # half of each: SplatOf in csrc/formulas.h
+    around = columns >= at.width
+    assert around.sum() > count / 4
+    assert float(rows[around].max()) < at.height / 8
 
 
 @pytest.mark.system

@@ -71,6 +71,7 @@ def set_image(text: str) -> Callable[[Path], None]:
         as_sphere,
         set_camera("# SphereSfM\n1 SPHERE 64 32 1 32 16"),
         set_camera("1 PINHOLE 64 32 64 32 32 16"),
+        *map(set_camera, ["1 SPHERICAL 64 32 64 32", "1 SPHERICAL 64 32", "1 EQUIRECTANGULAR 64 32"]),
     ],
 )
 def test_every_form_of_a_model_is_what_colmap_reads(folder: Path, change: Callable[[Path], None]) -> None:
@@ -190,21 +191,6 @@ def test_colours_from_0_to_1_are_as_bright_as_bytes(folder: Path) -> None:
     assert colors == {n: expected.colors[3 * i : 3 * i + 3] for i, n in enumerate(expected.ids)}
 
 
-@pytest.mark.parametrize(
-    "line", ["SPHERICAL {w} {h} {w} {h}", "SPHERICAL {w} {h}", "EQUIRECTANGULAR {w} {h}"]
-)
-def test_cameras_of_panoramas_as_others_write_them(folder: Path, line: str) -> None:
-    expected = read_panoramas(folder)
-    camera = expected.images[0].camera
-    as_text(folder)
-    (folder / "cameras.txt").write_text(f"{camera.id} {line.format(w=camera.width, h=camera.height)}\n")
-    found = read_panoramas(folder)
-    assert [image.camera for image in found.images] == [image.camera for image in expected.images]
-    (folder / "cameras.txt").write_text(f"{camera.id} SPHERICAL {camera.width} {camera.height} 7\n")
-    with pytest.raises(InputError, match="camera model SPHERICAL is not supported"):
-        read_panoramas(folder)
-
-
 def test_a_byte_order_mark_is_no_part_of_a_model(folder: Path) -> None:
     expected = [image.name for image in read_image_records(folder, observations=False)]
     as_text(folder)
@@ -241,11 +227,10 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda f: (f / "cameras.bin").write_bytes(struct.pack("<QIiQQ16d", 1, 1, 11, 64, 32, *range(16))),
         "RAD_TAN_THIN_PRISM_FISHEYE",
     ),
-    "garbage": (lambda f: (f / "images.bin").write_bytes(b"hello"), "truncated"),
     "huge count": (lambda f: patch(f, "points3D.bin", 51, b"\xff" * 8), "truncated"),
     "empty": (lambda f: (f / "points3D.bin").write_bytes(b""), "empty"),
     "trailing bytes": (lambda f: (f / "points3D.bin").open("ab").write(b"1234"), "4 bytes more"),
-    "text OPENCV": (set_camera("1 OPENCV 64 32 1 1 1 1 0 0 0 0"), "camera model OPENCV"),
+    "text SPHERICAL": (set_camera("1 SPHERICAL 64 32 7"), "camera model SPHERICAL"),
     "text nonsense": (set_camera("1 PINHOLE wide 32 1"), "number was expected"),
     "text NaN": (set_camera("1 EQUIRECTANGULAR nan 32 64 32"), "not finite"),
     "text short": (set_camera("1 PINHOLE 64 32 64 32"), "4 parameters, not 2"),
@@ -257,11 +242,8 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "an image twice": (lambda f: repeat_record(f, "images.txt", 2), "two images have one id"),
     "a point twice": (lambda f: repeat_record(f, "points3D.txt", 1), "point 1 occurs twice"),
     "half a track": (lambda f: append(f, "points3D.txt", "99 1 2 3 4 5 6 0.5 1 0 2\n"), "track of point 99"),
-    "infinite point": (lambda f: append(f, "points3D.txt", "99 1 inf 3 4 5 6 0.5\n"), "not finite"),
     "other camera id": (set_camera("7 EQUIRECTANGULAR 64 32 64 32"), "COLMAP cannot read"),
-    "text image NaN": (set_image("1 nan 0 0 0 0 0 0 1 a.jpg"), "not finite"),
     "text image short": (set_image("1 1 0 0"), "image line"),
-    "text image nonsense": (set_image("1 1 0 0 zero 0 0 0 1 a.jpg"), "number"),
     "text half a point": (set_image("1 1 0 0 0 0 0 0 1 a.jpg\n3.5 4.5"), "triples"),
 }
 

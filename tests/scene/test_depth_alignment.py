@@ -80,13 +80,6 @@ def test_a_crowd_of_points_in_one_place_does_not_decide() -> None:
     assert fit_affine(prior, inverse, 0).scale < 0.6 * 0.99
 
 
-def test_cells_of_equal_solid_angle_count_the_same_and_reach_the_poles_and_the_seam() -> None:
-    v, u = (grid.ravel() for grid in np.meshgrid(np.arange(64), np.arange(128), indexing="ij"))
-    share = even_shares(v, u, 64, 128)
-    assert share.sum() == pytest.approx(12 * 24)
-    assert (share > 0).all()
-
-
 @pytest.mark.parametrize("least", [0.1, -0.5])
 def test_fit_is_exact_without_noise_also_where_inverse_depths_are_not_positive(least: float) -> None:
     """As those are of an estimator that leaves the offset open, of which two answers are brought together."""
@@ -172,18 +165,6 @@ def test_an_affine_with_too_few_points_for_a_fit_is_compared_as_far_as_there_are
     assert (unseen.scale, unseen.offset, unseen.residual, unseen.points) == (3.0, 0.25, None, 0)
     with pytest.raises(AlignmentError, match="only 0 sparse points"):
         align_depth(with_affine(scene, (0.0, 0.25), 0), view_of(scene), 0)
-
-
-def test_without_tracks_points_that_are_hidden_do_not_count(scene: Scene) -> None:
-    """The small scene is a sphere; of a second, larger one behind it nothing can be seen."""
-    hidden = 3 * scene.points + 0.1
-    both = without_tracks(scene)
-    both = replace(both, points=np.concatenate([hidden, scene.points]), colors=np.tile(scene.colors, (2, 1)))
-    rows, first = likely_visible(both.panoramas[1], both.points)
-    assert (rows[first] >= len(hidden)).mean() > 0.7
-    found = align_depth(both, view_of(scene), 0)
-    assert (found.scale, found.offset) == pytest.approx(AFFINE, rel=0.06)
-    assert found == align_depth(both, view_of(scene), 0)
 
 
 def test_without_tracks_a_map_of_another_place_is_refused() -> None:

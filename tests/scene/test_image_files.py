@@ -15,14 +15,13 @@ from panolog.scene.pictures.headers import ImageInfo, read_header
 PIXELS = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tiff"])
-def test_size_and_depth_come_from_the_header(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a.{suffix}"
-    cv2.imwrite(str(path), PIXELS)
-    assert read_info(path) == ImageInfo(64, 32, 8, 3)
-    if suffix == "png":
-        cv2.imwrite(str(path), np.zeros((16, 32), np.uint16))
-        assert read_info(path) == ImageInfo(32, 16, 16, 1)
+def test_size_and_depth_come_from_the_header(tmp_path: Path) -> None:
+    for name, pixels, info in (
+        ("a.jpg", PIXELS, ImageInfo(64, 32, 8, 3)),
+        ("a.png", np.zeros((16, 32), np.uint16), ImageInfo(32, 16, 16, 1)),
+    ):
+        cv2.imwrite(str(tmp_path / name), pixels)
+        assert read_info(tmp_path / name) == info
 
 
 HEADERS: dict[str, Callable[[Path], object]] = {
@@ -90,13 +89,6 @@ def test_the_end_of_a_thumbnail_is_not_the_end_of_the_image(tmp_path: Path) -> N
     path.write_bytes(whole[:-200])
     with pytest.raises(InputError, match="truncated"):
         read_info(path)
-
-
-def test_what_is_no_image_is_refused(tmp_path: Path) -> None:
-    for content in (b"", b"hello, this is text"):
-        (tmp_path / "a.jpg").write_bytes(content)
-        with pytest.raises(InputError):
-            read_info(tmp_path / "a.jpg")
 
 
 @pytest.mark.parametrize("suffix", ["png", "tiff", "webp", "bmp"])

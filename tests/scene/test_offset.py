@@ -62,14 +62,6 @@ def test_a_far_world_is_moved_to_its_origin_in_full_precision(
     np.testing.assert_allclose(far.points + far.offset, original.points, atol=1e-8)
 
 
-def test_a_world_near_its_origin_stays_as_it_is(near: Scene) -> None:
-    model = read_panoramas(model_of(near.root))
-    assert near.offset == NO_OFFSET
-    assert near.points.tobytes() == model.points.tobytes()
-    for panorama, image in zip(near.panoramas, model.images, strict=True):
-        assert panorama.translation.tobytes() == image.translation.tobytes()
-
-
 @pytest.mark.parametrize("times, expected", [(0.9, None), (1.1, (44.0, 0.0, 0.0))])
 def test_the_criterion(times: float, expected: tuple[float, float, float] | None) -> None:
     centers = np.array([[4.0, 0, 0], [-4.0, 0, 0], [0, 4, 0], [0, -4, 0]])

@@ -1,10 +1,8 @@
 """How views get to a GPU: which threads, in which order, how many of them. The GPU is CPU tensors."""
 
-import os
 import threading
 import weakref
 from collections import Counter
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.scene import image_files, images
-from panolog.scene.errors import ImageError, SceneError
-from panolog.scene.image_files import decode
-from panolog.scene.images import CudaUpload, PanoramaCache, Staged, Upload, View, load_view, passing_views
+from panolog.scene.errors import ImageError
+from panolog.scene.images import PanoramaCache, Staged, Upload, View, load_view, passing_views
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.scene.tensors import transfer
-from panolog.scene.tensors.decoded import DecodedLayers
 from tests.on_device import needs_a_card
 from tests.renderer.cuda.fake_cuda import Torch
 from tests.scenes import HEIGHT, WIDTH, write_scene
@@ -79,7 +75,7 @@ class Recorder(Upload):
             self.here -= 1
 
 
-def run(scene: Scene, recorder: Recorder, *, budget: int, room: int, threads: int = 2) -> None:
+def run(scene: Scene, recorder: Recorder, *, budget: int, room: int, threads: int) -> None:
     """Three epochs, requested ahead as training does."""
     order = [row for epoch in EPOCHS for row in epoch]
     with PanoramaCache(
@@ -93,8 +89,7 @@ def run(scene: Scene, recorder: Recorder, *, budget: int, room: int, threads: in
 
 
 def test_views_are_moved_by_the_threads_that_decode_and_taken_by_the_one_that_computes(scene: Scene) -> None:
-    recorder = Recorder()
-    run(scene, recorder, budget=10 * VIEW, room=0, threads=3)
+    run(scene, recorder := Recorder(), budget=10 * VIEW, room=0, threads=3)
     assert recorder.threads <= {f"decode_{i}" for i in range(3)}
 
 
@@ -148,34 +143,6 @@ def test_layers_are_decoded_once_although_views_have_no_room(
     assert sum(every) < sum(some) < sum(none)
 
 
-def test_pixels_that_are_kept_are_those_of_the_file(tmp_path: Path) -> None:
-    random = np.random.default_rng(2)
-    wide = random.integers(0, 2**16, (7, 11), np.uint16)
-    wide[0, :3] = 0, 255, 65535
-    unchanged = partial(decode, flags=cv2.IMREAD_UNCHANGED)
-    for name, pixels in (("wide", wide), ("narrow", wide.astype(np.uint8))):
-        path = tmp_path / f"{name}.png"
-        cv2.imwrite(str(path), pixels)
-        layers = DecodedLayers(10_000)
-        first = layers.pixels(path, unchanged)
-        path.unlink()
-        again = layers.pixels(path, unchanged)
-        assert again.dtype == first.dtype == pixels.dtype
-        assert np.array_equal(again, pixels) and np.array_equal(first, pixels)
-    with pytest.raises(SceneError, match="wide"):
-        DecodedLayers(10_000).pixels(tmp_path / "wide.png", unchanged)
-
-
-def test_cores_decide_how_many_threads_decode_for_a_gpu(scene: Scene) -> None:
-    for threads, expected in ((0, 1), (3, 3), (64, images.MOST_THREADS)):
-        with PanoramaCache(
-            scene, ROWS, WIDTH, VIEW, device="cuda", threads=threads, upload=Recorder()
-        ) as cache:
-            assert (cache.threads, cache.ahead(1)) == (expected, expected)
-    with PanoramaCache(scene, ROWS, WIDTH, VIEW, room=100 * VIEW, threads=64) as cache:
-        assert (cache.threads, cache.ahead(3)) == (min(4, os.cpu_count() or 1), 3)
-
-
 def test_a_damaged_image_is_named_by_get_although_it_never_gets_to_the_device(scene: Scene) -> None:
     scene.panoramas[1].image.write_bytes(b"\x89PNG\r\n\x1a\n and no more")
     for room in (0, 6 * VIEW):
@@ -214,14 +181,6 @@ def test_a_view_is_copied_on_a_stream_of_its_own_and_only_the_device_waits(
     assert log[:5] == one + taken
     assert log[5:] == 5 * ["decode_0 waits", *one, *taken]  # before it fills its buffer again
     assert len(cuda.pinned) == 1  # one buffer of one thread
-
-
-def test_a_larger_view_gets_a_larger_buffer(scene: Scene, cuda: Torch) -> None:
-    upload, view = CudaUpload("cuda"), load_view(scene.panoramas[0], 0, WIDTH)
-    small = View(0, view.image[:4], None, None, None)
-    for each in (small, view, small):
-        assert torch.equal(upload.finish(upload.stage(each)).image, each.image)
-    assert cuda.pinned == [small.image.nbytes, view.image.nbytes]
 
 
 @needs_a_card

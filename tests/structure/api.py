@@ -13,48 +13,19 @@ from tests.structure.rules import ROOT
 
 PAGE = ROOT / "docs/api.md"
 WIDTH = 100  # of a signature in one line
-SECTIONS = {
-    "Rendering": ("rasterize", "Raster", "render", "Render", "Camera", "smooth_path"),
-    "Losses": ("photometric_loss", "PhotometricLoss", "inverse_depth_loss", "sphere_rows", "ssim_map"),
-    "A training loop of your own": (
-        "initial_gaussians",
-        "load_views",
-        "TrainingView",
-        "Clone3DGS",
-        "Relocate",
-    ),
-    "Training and its events": (
-        "train",
-        "evaluate",
-        "Progress",
-        "Preview",
-        "Notice",
-        "LeftOut",
-        "Checkpoint",
-        "Trained",
-    ),
-    "Runs": ("run", "resume", "RunConfig", "load_config", "RunState", "local_pool"),
-    "Scenes and models": ("read_scene", "Scene", "Gaussians", "read_ply", "write_ply"),
-    "Importers": (
-        "import_scene",
-        "register_format",
-        "ImportFormat",
-        "ImportSource",
-        "ImportedScene",
-        "PosedImage",
-        "find_panorama",
-    ),
-    "Errors": (
-        "PanologError",
-        "InputError",
-        "SceneError",
-        "ConfigError",
-        "DeviceError",
-        "MissingPackageError",
-        "RunLockedError",
-        "RunError",
-    ),
+_NAMES = {
+    "Rendering": "rasterize Raster render Render Camera smooth_path",
+    "Losses": "photometric_loss PhotometricLoss inverse_depth_loss sphere_rows ssim_map",
+    "A training loop of your own": "initial_gaussians load_views TrainingView Clone3DGS Relocate",
+    "Training and its events": "train evaluate Progress Preview Notice LeftOut Checkpoint Trained",
+    "Runs": "run resume RunConfig load_config RunState local_pool",
+    "Scenes and models": "read_scene Scene Gaussians read_ply write_ply",
+    "Importers": "import_scene register_format ImportFormat ImportSource ImportedScene PosedImage"
+    " find_panorama",
+    "Errors": "PanologError InputError SceneError ConfigError DeviceError MissingPackageError RunLockedError"
+    " RunError",
 }
+SECTIONS = {title: names.split() for title, names in _NAMES.items()}
 HEAD = """\
 # The Python API
 

@@ -27,18 +27,12 @@ DIALECT = re.compile(
     re.IGNORECASE,
 )
 
-# File -> why it is longer than MAX_LINES.
-LONG_FILES: dict[str, str] = {}
-# "file:function" -> why it is longer than MAX_FUNCTION.
-LONG_FUNCTIONS: dict[str, str] = {}
 # File -> the words it may use, each as often as it stands there, and the technical meaning.
 ALLOWED_WORDS: dict[str, tuple[dict[str, int], str]] = {
     "orchestrator/cli/commands/doctor.py": ({"mend": 1}, "the former name of a key in JSON, kept"),
     "orchestrator/cli/results.py": ({"--most": 1}, "the former name of an option, kept"),
     "tests/orchestrator/cli/commands/test_view.py": ({"--most": 1}, "tests the former name"),
 }
-# These list the words themselves.
-WORD_LISTS = ("tests/structure/rules.py",)
 
 
 @cache
@@ -79,27 +73,21 @@ def full_folders() -> Iterator[str]:
 
 
 def long_files() -> Iterator[str]:
-    """Files longer than `MAX_LINES`, except those with a reason; and reasons that are no longer needed."""
-    lengths = {str(file): len(text(file).splitlines()) for file in tracked() if file.suffix in CODE}
-    long = {file: lines for file, lines in lengths.items() if lines > MAX_LINES}
-    yield from (f"{file}: {lines} lines" for file, lines in long.items() if file not in LONG_FILES)
-    yield from (f"{file}: no longer long, drop its exception" for file in LONG_FILES if file not in long)
+    """Files longer than `MAX_LINES`."""
+    for file in tracked():
+        if file.suffix in CODE and (lines := len(text(file).splitlines())) > MAX_LINES:
+            yield f"{file}: {lines} lines"
 
 
 def long_functions() -> Iterator[str]:
-    """Python functions longer than `MAX_FUNCTION` lines, as `long_files`."""
-    found = {}
+    """Python functions longer than `MAX_FUNCTION` lines."""
     for file in tracked():
         if file.suffix == ".py":
             for node in ast.walk(ast.parse(text(file))):
                 if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
                     lines = (node.end_lineno or node.lineno) - node.lineno + 1
                     if lines > MAX_FUNCTION:
-                        found[f"{file}:{node.name}"] = lines
-    yield from (f"{name}: {lines} lines" for name, lines in found.items() if name not in LONG_FUNCTIONS)
-    yield from (
-        f"{name}: is no longer long, drop its exception" for name in LONG_FUNCTIONS if name not in found
-    )
+                        yield f"{file}:{node.name}: {lines} lines"
 
 
 def long_functions_of_others() -> Iterator[str]:
@@ -194,9 +182,8 @@ def _marks(file: Path) -> Iterator[set[str]]:
 def dialect() -> Iterator[str]:
     """Words of private style where plain technical English has its own, outside of `ALLOWED_WORDS`."""
     for file in tracked():
-        if str(file) in WORD_LISTS or not (
-            file.suffix in TEXT or file.name in ("Makefile", "Dockerfile", "run")
-        ):
+        listed = str(file) == "tests/structure/rules.py"  # which has the words themselves
+        if listed or not (file.suffix in TEXT or file.name in ("Makefile", "Dockerfile", "run")):
             continue
         allowed, _ = ALLOWED_WORDS.get(str(file), ({}, ""))
         lines = text(file).splitlines()

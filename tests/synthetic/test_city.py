@@ -12,27 +12,13 @@ from scipy.spatial.transform import Rotation
 from panolog.scene.read import read_scene
 from panolog.synthetic.city import OVER_TOWERS, STEP, city, drive, plan
 from panolog.synthetic.district import PITCH, flight_path
-from panolog.synthetic.layout import sun
 from panolog.synthetic.make import make_city
-from panolog.synthetic.noise import Floats
 from panolog.synthetic.shapes import Convex
-from panolog.synthetic.trace import CitySun, PanoramaRays, PointRays, Scenery, cast
+from panolog.synthetic.trace import PanoramaRays, PointRays, Scenery, cast
 
 pytestmark = pytest.mark.system
 
 STREETS = plan(300)
-UP = np.array([[0.0], [0.0], [1.0]], np.float32)
-
-
-class Given:
-    """Rays that all may meet everything."""
-
-    def __init__(self, origins: NDArray[np.float64], direction: Floats):
-        self.origins: Floats = origins.astype(np.float32)
-        self.directions: Floats = np.broadcast_to(direction.astype(np.float32), origins.shape)
-
-    def near(self, _center: Floats, _radius: float) -> slice:
-        return slice(None)
 
 
 @pytest.fixture(scope="module")
@@ -98,22 +84,7 @@ def test_nothing_is_around_a_camera(scenery: Scenery, centers: NDArray[np.float6
         assert not inside
 
 
-def test_a_river_lies_below_its_banks_and_is_bridged(scenery: Scenery) -> None:
-    def level(x: float, y: float) -> float:
-        above = np.array([x, y, 50.0])
-        return 50 - float(cast(scenery.shapes, PointRays(above[None] - [0, 0, 1], above)).distance[0])
-
-    middle = PITCH / 2
-    assert level(PITCH / 2, middle + 3) == pytest.approx(-2.4, abs=0.01)
-    assert level(PITCH / 2, middle + 15) == pytest.approx(0, abs=0.01)
-    assert all(level(column * PITCH, middle) == pytest.approx(0, abs=0.01) for column in (-1, 0, 1, 2))
-    houses = [s for s in scenery.shapes if isinstance(s, Convex) and 3.5 < s.radius < 30 and s.center[2] > 1]
-    away = [abs(float(house.center[1]) - middle) for house in houses]
-    assert min(away) > middle  # the bridges' parapets are low
-
-
-@pytest.mark.parametrize("index", [0, 61, 130, 244])
-@pytest.mark.parametrize("width", [64, 100])
+@pytest.mark.parametrize(("index", "width"), [(0, 64), (61, 100), (130, 64), (244, 100)])
 def test_leaving_out_what_is_hidden_changes_no_ray(
     scenery: Scenery, centers: NDArray[np.float64], index: int, width: int
 ) -> None:
@@ -122,36 +93,6 @@ def test_leaving_out_what_is_hidden_changes_no_ray(
     every, culled = cast(scenery.shapes, rays), scenery.cast(rays)
     np.testing.assert_array_equal(culled.distance, every.distance)
     np.testing.assert_array_equal(culled.shape, every.shape)
-
-
-def test_leaving_out_what_is_small_changes_few_rays(scenery: Scenery, centers: NDArray[np.float64]) -> None:
-    """Those that met a shape of less than half a pixel, which are scattered: here 0.2 %."""
-    rays = PanoramaRays(np.eye(3), centers[130], 128, 3)
-    smallest = np.pi / 128
-    every, coarse = scenery.cast(rays), scenery.cast(rays, smallest)
-    other = np.flatnonzero(coarse.shape != every.shape)
-    assert 0 < len(other) < 0.004 * len(every.shape)
-    away = np.array([np.linalg.norm(scenery.shapes[i].center - centers[130]) for i in every.shape[other]])
-    assert (2 * np.array([scenery.shapes[i].radius for i in every.shape[other]]) < smallest * away).all()
-
-
-@pytest.mark.parametrize(("near", "far", "agree"), [(0, 40, 0.97), (100, 200, 0.9)])
-def test_shadows_are_where_the_sun_is_hidden(
-    scenery: Scenery, centers: NDArray[np.float64], near: float, far: float, agree: float
-) -> None:
-    """Of points on the ground, by a ray from each to the sun: fine shadows near, coarse ones beyond."""
-    random, center = np.random.default_rng(0), centers[130]
-    light = CitySun(scenery, sun(), np.array([*STREETS.middle, 0.0]), STREETS.reach)
-    angle, away = random.uniform(0, 2 * np.pi, 2000), random.uniform(near, far, 2000)
-    above = np.stack(
-        [center[0] + away * np.cos(angle), center[1] + away * np.sin(angle), np.full(2000, 60.0)]
-    )
-    open_ = cast(scenery.shapes, Given(above, -UP)).distance
-    points = above[:, np.abs(open_ - 60) < 1e-3] * [[1], [1], [0]]
-    share = light.around(center).on(points.astype(np.float32), np.broadcast_to(UP, points.shape))
-    lit = np.isinf(cast(scenery.shapes, Given(points, sun()[:, None])).distance)
-    assert len(lit) > 1000 and 0.3 < lit.mean() < 0.9
-    assert ((share > 0.5) == lit).mean() > agree
 
 
 def test_a_city_is_a_scene_with_the_same_bytes_for_any_number_of_threads(

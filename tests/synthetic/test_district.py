@@ -9,32 +9,7 @@ from panolog.scene.read import read_scene
 from panolog.synthetic.__main__ import main
 from panolog.synthetic.district import PITCH, district, flight_path
 from panolog.synthetic.layout import ROAD
-from panolog.synthetic.paint import Plain
-from panolog.synthetic.shapes import Convex, Shape, box, ellipsoid, moved
-from panolog.synthetic.trace import PanoramaRays, cast
-
-GREY = Plain((0.5, 0.5, 0.5))
-
-
-@pytest.mark.parametrize("quarters", range(4))
-def test_moved_shapes_are_met_where_they_are(quarters: int) -> None:
-    """Turning and moving the camera alike changes nothing."""
-    shapes: list[Shape] = [box((1, 2, 0), (3, 5, 2), GREY), ellipsoid((-2, 1, 1), (0.5, 1.5, 1), GREY)]
-    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters]
-    turn, center = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]), np.array([0.3, -0.2, 1.6])
-    shift = np.array([7.0, -4.0, 0.0])
-    before, after = PanoramaRays(np.eye(3), center, 64, 1), PanoramaRays(turn.T, turn @ center + shift, 64, 1)
-    there = moved(shapes, 7.0, -4.0, quarters)
-    one, two = cast(shapes, before), cast(there, after)
-    np.testing.assert_allclose(one.distance, two.distance, rtol=1e-4)
-    np.testing.assert_array_equal(one.shape, two.shape)
-    rows = np.isfinite(one.distance)
-    points = [rays.origins + hits.distance * rays.directions for rays, hits in ((before, one), (after, two))]
-    for old, new in zip(shapes, there, strict=True):
-        normals = old.normal(points[0][:, rows]), new.normal(points[1][:, rows])
-        np.testing.assert_allclose(turn @ normals[0], normals[1], atol=1e-3)
-        paints = old.paint(points[0][:, rows], normals[0]), new.paint(points[1][:, rows], normals[1])
-        np.testing.assert_allclose(*paints, atol=1e-3)
+from panolog.synthetic.shapes import Convex
 
 
 def test_streets_are_free_of_houses() -> None:

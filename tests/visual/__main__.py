@@ -8,9 +8,8 @@ from tempfile import TemporaryDirectory
 import cv2
 
 from tests.visual.browser import fixed_browser, fixed_page, screenshot, wait_until_quiet
-from tests.visual.compare import Picture
+from tests.visual.compare import Picture, path_of, write
 from tests.visual.pages import SHOTS, show, site
-from tests.visual.references import path_of, write
 
 
 def pictures(names: list[str]) -> Iterator[tuple[str, Picture]]:

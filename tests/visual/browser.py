@@ -7,12 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
-import numpy as np
 from playwright.sync_api import Browser, Page
 
 from tests.orchestrator.watch.dashboard.browser import PATIENCE_MS, chromium
-from tests.visual.compare import Picture
+from tests.visual.compare import Picture, expand
 from tests.visual.fixed import NOW, fixed_fonts
 
 Theme = Literal["light", "dark"]
@@ -87,4 +85,4 @@ def screenshot(page: Page, *, whole: bool = True) -> Picture:
     session = page.context.new_cdp_session(page)
     data = base64.b64decode(session.send("Page.captureScreenshot", options)["data"])
     session.detach()
-    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
+    return expand(data)

@@ -1,4 +1,4 @@
-"""Whether two pictures of a page look the same: what a reader would see counts, not a shade of an edge.
+"""The reference pictures, and whether two pictures look the same: a shade of an edge does not count.
 
 References are kept at half the size as WebP, and a picture is reduced in the same way before it is compared.
 Both are blurred a little, and the mean difference of each tile of a grid is compared with a limit. A tile
@@ -8,6 +8,7 @@ do when another version of the browser rounds differently.
 
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -103,3 +104,34 @@ def side_by_side(reference: Picture, actual: Picture, comparison: Comparison) ->
         for part in (reference, actual, marked)
     ]
     return np.concatenate(parts, axis=1)
+
+
+FOLDER = Path(__file__).with_name("references")
+
+
+def path_of(name: str) -> Path:
+    """Where a reference is."""
+    return FOLDER / f"{name}.webp"
+
+
+def write(name: str, picture: Picture) -> None:
+    """Writes a reference."""
+    FOLDER.mkdir(exist_ok=True)
+    path_of(name).write_bytes(reduce(picture))
+
+
+def difference(name: str, picture: Picture, folder: Path) -> str:
+    """How a picture differs from its reference, and where both are shown; empty if it does not.
+
+    Args: folder, for that picture.
+    """
+    renew = f"`python -m tests.visual {name}` makes it anew"
+    if not path_of(name).is_file():
+        return f"there is no {path_of(name)}: {renew}"
+    reference, reduced = expand(path_of(name).read_bytes()), expand(reduce(picture))
+    comparison = compare(reference, reduced)
+    if not comparison.reason:
+        return ""
+    both = folder / f"{name}.png"
+    cv2.imwrite(str(both), side_by_side(reference, reduced, comparison))
+    return f"{comparison.reason}: see {both}; if it is meant to look so, {renew}"

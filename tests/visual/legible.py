@@ -1,7 +1,7 @@
 """What makes a page hard to read: text with too little contrast, text over text, and sideways scrolling."""
 
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import product
 from pathlib import Path
 from typing import Any, get_args
 
@@ -78,19 +78,16 @@ def hard_to_read(page: Page, *widths: int) -> list[str]:
 def overlapping(page: Page) -> list[str]:
     """Pairs of texts of which one covers a part of the other."""
     texts = [Text(*one) for one in page.evaluate(_TEXT, False)[0]]
-    boxes = [(text, box) for text in texts for box in text.boxes if text.element >= 0]
-    pairs = [
-        (one, two)
-        for (one, a), (two, b) in combinations(boxes, 2)
-        if one.element != two.element and _covers(a, b)
-    ]
-    return [f"{one.text!r} and {two.text!r}" for one, two in pairs]
-
-
-def _covers(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
-    width = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
-    height = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
-    return width > 0 and height > 0 and width * height > _OVERLAP * min(a[2] * a[3], b[2] * b[3])
+    lines = [(text, box) for text in texts for box in text.boxes if text.element >= 0]
+    x, y, width, height = np.array([box for _, box in lines]).reshape(-1, 4).T
+    element = np.array([text.element for text, _ in lines])
+    one, other = np.triu_indices(len(lines), 1)
+    wide = np.minimum((x + width)[one], (x + width)[other]) - np.maximum(x[one], x[other])
+    high = np.minimum((y + height)[one], (y + height)[other]) - np.maximum(y[one], y[other])
+    smaller = np.minimum((width * height)[one], (width * height)[other])
+    covers = (wide > 0) & (high > 0) & (wide * high > _OVERLAP * smaller) & (element[one] != element[other])
+    pairs = zip(one[covers], other[covers], strict=True)
+    return [f"{lines[a][0].text!r} and {lines[b][0].text!r}" for a, b in pairs]
 
 
 def _crop(picture: Picture, box: tuple[float, float, float, float]) -> Floats:

@@ -1,60 +1,45 @@
-"""What each page shows, in each state of a run; and that faults which were there once would be found."""
+"""What each page shows, in each state of a run, and that axe finds no fault with it."""
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, Page
 
-from tests.visual import legible, references
+from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
+from tests.export.peers import peer
+from tests.orchestrator.watch.dashboard.browser import opened
+from tests.orchestrator.watch.views.sites import ready, run_with, serving
+from tests.visual import legible
 from tests.visual.browser import fixed_browser, fixed_page, screenshot, wait_until_quiet
-from tests.visual.compare import TILE, Picture, compare, expand, reduce
-from tests.visual.pages import SHOTS, Shot, Site, show, site
+from tests.visual.compare import TILE, Picture, compare, difference, expand, reduce
+from tests.visual.pages import SHOTS, WIDTHS, Shot, Site, show, site
 
 pytestmark = pytest.mark.system
 
-_QUIET_MS = (
-    400,
-    1_200,
-    2_000,
-)  # without a change, after which a page is looked at, and again on a busy machine
+# Without a change, after which a page is looked at, and again on a busy machine.
+_QUIET_MS = (400, 1_200, 2_000)
 _STYLE = """(rules) => {
   const sheet = new CSSStyleSheet();
   sheet.replaceSync(rules);
   document.adoptedStyleSheets = [sheet];
 }"""
-# Faults that can be seen in the page of a finished run: what they are in, and rules that make them there.
+# By what it is in, a fault of the page of a finished run that a reader would see.
 _SEEN = {
-    "a slab over a chart": (
-        "#charts figure:nth-child(1)",
-        "#charts figure:nth-child(1) .svg-container::after { content: ''; position: absolute;"
-        " inset: 0 0 60% 0; background: rgb(68 68 68 / 30%); }",
-    ),
-    "a chart is missing": (
-        "#charts figure:nth-child(2)",
-        "#charts figure:nth-child(2) .plot { visibility: hidden; }",
-    ),
-    "a curve is missing": (
-        "#charts figure:nth-child(3)",
-        "#charts figure:nth-child(3) .scatterlayer .trace:first-child { display: none; }",
-    ),
-    "a map of the wrong width": ("#map-plot", "#map-plot .svg-container { clip-path: inset(0 40% 0 0); }"),
-    "a word in another colour": ("#status", "#status { color: var(--failed); }"),
-    "a translucent smear": ("#stage", "#stage .compare { filter: blur(5px); opacity: 0.8; }"),
-    "text over text": ("#events", "#events li > * { margin-left: -40px; }"),
-    "a row less": ("#block-table tbody", "#block-table tbody tr:nth-child(2) { visibility: hidden; }"),
+    "#charts figure:nth-child(3)": "figure:nth-child(3) .scatterlayer .trace:first-child { display: none; }",
+    "#map-plot": "#map-plot .svg-container { clip-path: inset(0 40% 0 0); }",
+    "#status": "#status { color: var(--failed); }",
+    "#events": "#events li > * { margin-left: -40px; }",
 }
 _UNSEEN = (  # a pixel to the side, a shade darker, softer letters
     "#content { transform: translate(-1px, 1px); }"
     " main { filter: brightness(0.992); -webkit-text-stroke: 0.1px; }"
 )
 _HARD_TO_READ = {  # rules, and a text that is then hard to read
-    "#charts figure:first-child .plot .svg-container { background: #777; }": "10k",  # on a slab
     "#stages { position: relative; } #stages::after { content: ''; position: absolute; inset: 0;"
     " background: rgb(128 128 128 / 85%); }": "Stage I",  # under a slab
-    "#log-text::placeholder { color: #aaa; }": "Search",
     "#view-source { color: #bbb; }": "held_out_000.jpg",  # in a field
-    "#facts { opacity: 0.35; }": "Progress",
     ".tag { background: none !important; color: #999; }": "render",  # on a picture
 }
 
@@ -81,36 +66,44 @@ def page(browser: Browser, here: Site) -> Iterator[Page]:
 def test_a_page_looks_right_and_can_be_read(page: Page, here: Site, shot: Shot, tmp_path: Path) -> None:
     shot.open(here, page)
     wrong: dict[str, list[str]] = {}
+    seen: set[str] = set()  # widths and themes: neither changes what the other decides
     for view in shot.views:
+        new = {*view.split("-")} - seen
+        seen |= new
         show(page, view)
         for quiet in _QUIET_MS:
             wait_until_quiet(page, quiet)
             shown = screenshot(page, whole=shot.whole)
             wrong[view] = [
-                *filter(None, [references.difference(f"{shot.name}-{view}", shown, tmp_path)]),
-                *legible.low_contrast(page, shown, whole=shot.whole),
-                *legible.sideways(page),
-                *legible.overlapping(page),
+                *filter(None, [difference(f"{shot.name}-{view}", shown, tmp_path)]),
+                *(legible.low_contrast(page, shown, whole=shot.whole) if new & {"light", "dark"} else ()),
+                *([*legible.sideways(page), *legible.overlapping(page)] if new & set(WIDTHS) else ()),
             ]
             if not wrong[view]:
                 break
     assert {view: found for view, found in wrong.items() if found} == {}
 
 
-@pytest.fixture(scope="module")
-def finished(browser: Browser, here: Site) -> Iterator[Page]:
-    """A finished run at a desk, for tests that give it rules of their own."""
+def test_what_a_reader_would_see_is_found_and_no_more(browser: Browser, here: Site) -> None:
     (shot,) = (shot for shot in SHOTS if shot.name == "run-finished")
-    with fixed_page(browser, here.root) as opened:
-        shot.open(here, opened)
-        wait_until_quiet(opened, 1_000)
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def right(finished: Page) -> Picture:
-    """The page without a fault, as a reference is kept."""
-    return styled(finished, "")
+    with fixed_page(browser, here.root) as page:
+        shot.open(here, page)
+        wait_until_quiet(page, 1_000)
+        right = styled(page, "")
+        assert compare(right, styled(page, _UNSEEN)).reason == ""
+        tiles = compare(right, styled(page, " ".join(_SEEN.values()))).tiles
+        for place in _SEEN:
+            box = page.locator(place).bounding_box()
+            assert box is not None
+            sides = (box["x"], box["y"], box["x"] + box["width"], box["y"] + box["height"])
+            left, top, right_of, below = (int(side / 2 / TILE) for side in sides)
+            assert tiles[top : below + 1, left : right_of + 1].any(), place
+        page.evaluate(_STYLE, " ".join(_HARD_TO_READ))
+        found = legible.low_contrast(page)
+        assert all(any(f": {text!r}" in line for line in found) for text in _HARD_TO_READ.values())
+        page.evaluate(_STYLE, "#map-plot { min-width: 1500px; } #facts dd { margin-top: -18px; }")
+        assert any("map-plot" in line for line in legible.sideways(page))
+        assert any("Progress" in line for line in legible.overlapping(page))
 
 
 def styled(page: Page, rules: str) -> Picture:
@@ -120,44 +113,29 @@ def styled(page: Page, rules: str) -> Picture:
     return expand(reduce(screenshot(page)))
 
 
-def test_the_fonts_are_those_of_matplotlib_on_every_machine(finished: Page) -> None:
-    session = finished.context.new_cdp_session(finished)
-    session.send("DOM.enable")
-    session.send("CSS.enable")
-    root = session.send("DOM.getDocument")["root"]["nodeId"]
-    for selector, family in (("h1", "DejaVu Sans"), ("#scene", "DejaVu Sans Mono")):
-        node = session.send("DOM.querySelector", {"nodeId": root, "selector": selector})["nodeId"]
-        fonts = session.send("CSS.getPlatformFontsForNode", {"nodeId": node})["fonts"]
-        assert [font["familyName"] for font in fonts] == [family]
+_LOCK = Path(__file__).parent / "axe" / "package-lock.json"
+_RUN = "axe.run(document, {resultTypes: ['violations']}).then(({violations}) => violations)"
 
 
-def test_each_fault_that_can_be_seen_is_a_difference(finished: Page, right: Picture) -> None:
-    comparison = compare(right, styled(finished, " ".join(rules for _, rules in _SEEN.values())))
-    unnoticed = []
-    for fault, (place, _) in _SEEN.items():
-        box = finished.locator(place).bounding_box()
-        assert box is not None
-        left, top = int(box["x"] / 2 / TILE), int(box["y"] / 2 / TILE)
-        right_of, below = (box["x"] + box["width"]) / 2 / TILE + 1, (box["y"] + box["height"]) / 2 / TILE + 1
-        if not comparison.tiles[top : int(below), left : int(right_of)].any():
-            unnoticed.append(fault)
-    assert unnoticed == []
+def findings(page: Page) -> list[str]:
+    """What axe finds: the rule, and the elements."""
+    page.evaluate((peer("axe-core", _LOCK) / "axe.min.js").read_text() + "; undefined")
+    found: list[dict[str, Any]] = page.evaluate(_RUN)
+    return [f"{rule['id']}: {node['html'][:160]}" for rule in found for node in rule["nodes"][:3]]
 
 
-def test_what_cannot_be_seen_is_none(finished: Page, right: Picture) -> None:
-    assert compare(right, styled(finished, _UNSEEN)).reason == ""
+@pytest.mark.nightly
+@pytest.mark.parametrize("shot", SHOTS, ids=lambda shot: shot.name)
+def test_axe_finds_nothing(here: Site, page: Page, shot: Shot) -> None:
+    shot.open(here, page)
+    wait_until_quiet(page, 400)
+    assert findings(page) == []
 
 
-def test_a_page_of_another_size_is_a_difference(right: Picture) -> None:
-    assert "wide" in compare(right, right[:, :-1]).reason
-    assert "high" in compare(right, right[:-3]).reason
-    assert compare(right, right[:-1]).reason == ""
-
-
-def test_text_that_is_hard_to_read_or_out_of_place_is_found(finished: Page) -> None:
-    finished.evaluate(_STYLE, " ".join(_HARD_TO_READ))
-    found = legible.low_contrast(finished)
-    assert [text for text in _HARD_TO_READ.values() if not any(f": {text!r}" in line for line in found)] == []
-    finished.evaluate(_STYLE, "#map-plot { min-width: 1500px; } #facts dd { margin-top: -18px; }")
-    assert any("map-plot" in line for line in legible.sideways(finished))
-    assert any("Progress" in line for line in legible.overlapping(finished))
+@pytest.mark.nightly
+def test_axe_finds_nothing_in_the_3d_page(browser: Browser, tmp_path: Path) -> None:
+    write_folder(site_of_run(run_with(tmp_path), Wanted()), tmp_path / "web")
+    with serving(tmp_path / "web") as url, opened(browser, url) as page:
+        ready(page)
+        page.click("#list")
+        assert findings(page) == []

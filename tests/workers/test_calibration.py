@@ -16,10 +16,8 @@ from tests.workers.small import WIDTH, small_scene
 from tests.workers.trainings import threads
 
 
-def calibrated(
-    folder: Path, *, most: int = 1_000, gradient: float = 2e-4, seconds: float = 10.0
-) -> Calibration:
-    config = TrainConfig(sky=SkyConfig(count=50), densify=DensifyConfig(gradient=gradient))
+def calibrated(folder: Path, *, most: int = 1_000, seconds: float = 10.0, **densify: float) -> Calibration:
+    config = TrainConfig(sky=SkyConfig(count=50), densify=DensifyConfig.model_validate(densify))
     *_, found = calibrate(spec_of(small_scene(folder), config=config, seconds=seconds, most=most))
     assert isinstance(found, Calibration)
     return found
@@ -58,10 +56,7 @@ def test_where_nothing_would_grow_nothing_does(tmp_path: Path) -> None:
 
 def test_growth_does_not_depend_on_who_would_densify(tmp_path: Path) -> None:
     """Opaque ones, or those with large absolute gradients: here none."""
-    densify = DensifyConfig(least_opacity=0.9, split_gradient=1e9)
-    config = TrainConfig(sky=SkyConfig(count=50), densify=densify)
-    *_, found = calibrate(spec_of(small_scene(tmp_path), config=config, seconds=10.0))
-    assert isinstance(found, Calibration) and found.grown.gaussians > 400
+    assert calibrated(tmp_path, least_opacity=0.9, split_gradient=1e9).grown.gaussians > 400
 
 
 def test_without_time_each_model_still_has_an_iteration(tmp_path: Path) -> None:

@@ -67,7 +67,8 @@ class CountedMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
         kwargs = kwargs or {}
         if func.namespace == "panolog":
             with self:
-                return getattr(launches, func.__name__.split(".")[0])(no_launch, *args, **kwargs)
+                op = func.__name__.split(".")[0]
+                return getattr(launches, op)(no_launch, **ops.named(op, args), **kwargs)
         if func in (aten.item.default, aten._local_scalar_dense.default) and args[0].is_meta:
             return 1.0 if args[0].is_floating_point() else self.pairs
         if (

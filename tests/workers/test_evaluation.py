@@ -15,7 +15,7 @@ from panolog.workers.events import Evaluated, LpipsMissing, Progress
 from panolog.workers.tasks import EVAL
 from panolog.workers.training.initialise import scene_gaussians
 from tests.workers.small import HEIGHT, WIDTH, small_scene
-from tests.workers.trainings import evaluation_of, threads
+from tests.workers.trainings import evaluation_of
 
 
 def test_each_view_has_its_metrics_and_its_render(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,12 +87,3 @@ def test_a_pose_is_fitted_whatever_the_exposure_of_its_panorama(tmp_path: Path) 
     event = fitted(*erring(tmp_path / "bright", gain=1.6))
     before, after = psnrs(event, "cc_psnr")
     assert before < 25 and after > 50  # 45 if the exposure is not found first
-
-
-def test_a_fit_has_the_same_bytes_for_any_threads(tmp_path: Path) -> None:
-    scene, model = erring(tmp_path)
-    found = []
-    for count in (1, 3):
-        with threads(count):
-            found.append(fitted(scene, model))
-    assert found[0] == found[1]

@@ -17,13 +17,12 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import load_layers
 from panolog.scene.model import Scene
 from panolog.workers.evaluation import evaluate
-from panolog.workers.events import Evaluated, Scored
-from panolog.workers.scoring import score
+from panolog.workers.events import Evaluated
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
 from tests.workers import trainings
 from tests.workers.small import WIDTH, small_scene
-from tests.workers.trainings import coarse_of, evaluation_of, same, score_of
+from tests.workers.trainings import coarse_of, evaluation_of, same, score_of, scored
 
 IGNORED, SSIM_REACH = 12, 5  # rows
 CONFIG = TrainConfig.model_validate({"sky": {"count": 40}, "depth": {"w0": 0.5, "wT": 0.4}})
@@ -90,9 +89,7 @@ def test_training(clean: Scene, spoilt: Scene) -> None:
 
 def test_scores(clean: Scene, spoilt: Scene) -> None:
     def scores(scene: Scene) -> torch.Tensor:
-        *_, last = score(score_of(scene, scene_gaussians(scene), (0, 1)))
-        assert isinstance(last, Scored)
-        return last.scores
+        return scored(score_of(scene, scene_gaussians(scene), (0, 1)))
 
     assert torch.equal(scores(clean), scores(spoilt))
     assert not torch.equal(scores(without_masks(clean)), scores(without_masks(spoilt)))

@@ -22,7 +22,7 @@ from panolog.workers.training.initialise import scene_gaussians
 from tests.renderer.cuda.stubbed import stubbed, without_pairs
 from tests.renderer.cuda.waits import counted
 from tests.workers.small import WIDTH, small_scene
-from tests.workers.trainings import score_of, threads
+from tests.workers.trainings import score_of, scored, threads
 
 
 def with_sky(scene: Scene) -> Gaussians:
@@ -62,15 +62,14 @@ def test_scores_are_those_of_the_definition(scene: Scene, sphere: bool) -> None:
     spec = replace(spec, config=TrainConfig.model_validate({"loss": {"sphere": sphere}}))
     means = spec.model.load().means
     before = means.clone()
-    *progress, scored = score(spec)
+    *progress, last = score(spec)
     assert torch.equal(means, before) and not means.requires_grad
-    assert isinstance(scored, Scored)
-    assert scored.cameras == (0, 1, 3)
-    assert scored.scores.dtype == torch.float64
-    np.testing.assert_allclose(
-        scored.scores.numpy(), [by_definition(spec, row) for row in (0, 1, 3)], rtol=1e-9
-    )
-    assert (scored.scores[:, [0, 2]] > 0).all()
+    assert isinstance(last, Scored)
+    assert last.cameras == (0, 1, 3)
+    assert last.scores.dtype == torch.float64
+    expected = [by_definition(spec, row) for row in (0, 1, 3)]
+    np.testing.assert_allclose(last.scores.numpy(), expected, rtol=1e-9)
+    assert (last.scores[:, [0, 2]] > 0).all()
     assert isinstance(progress[-1], Progress)
     assert (progress[-1].iteration, progress[-1].iterations) == (3, 3)
 
@@ -78,19 +77,15 @@ def test_scores_are_those_of_the_definition(scene: Scene, sphere: bool) -> None:
 def test_of_merged_gaussians_the_number_that_they_stand_for_counts(scene: Scene) -> None:
     spec = spec_of(scene)
     held = np.bincount(spec.labels.load(), minlength=3)
-    *_, alone = score(spec)
-    *_, merged = score(replace(spec, sizes=(2 * int(held[0]), 0, 4 * int(held[2]))))
-    assert isinstance(alone, Scored) and isinstance(merged, Scored)
-    torch.testing.assert_close(merged.scores * torch.tensor([2.0, 1.0, 4.0]), alone.scores)
+    merged = scored(replace(spec, sizes=(2 * int(held[0]), 0, 4 * int(held[2]))))
+    torch.testing.assert_close(merged * torch.tensor([2.0, 1.0, 4.0]), scored(spec))
 
 
 def test_shards_score_as_the_whole_does_whatever_the_threads(scene: Scene) -> None:
     found = []
     for count, views, row in ((1, (0, 1, 3), 1), (2, (0, 1, 3), 1), (1, (1,), 0)):
         with threads(count):
-            *_, scored = score(spec_of(scene, views))
-        assert isinstance(scored, Scored)
-        found.append(scored.scores[row])
+            found.append(scored(spec_of(scene, views))[row])
     assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
 
 
@@ -99,9 +94,7 @@ def test_a_view_that_is_masked_altogether_scores_zero(tmp_path: Path) -> None:
     mask = scene.panoramas[1].mask
     assert mask is not None
     cv2.imwrite(str(mask), np.zeros((WIDTH // 2, WIDTH), np.uint8))
-    *_, scored = score(spec_of(scene, views=(1,)))
-    assert isinstance(scored, Scored)
-    assert not scored.scores.any()
+    assert not scored(spec_of(scene, views=(1,))).any()
 
 
 def test_labels_must_fit(scene: Scene) -> None:
@@ -139,8 +132,8 @@ def test_on_a_card_nothing_waits_but_the_rasterizer(tmp_path: Path, monkeypatch:
     monkeypatch.setattr("panolog.workers.meter.INTERVAL", np.inf)
     spec = spec_of(small_scene(tmp_path, layers=False))
     with stubbed(without_pairs), counted() as found:
-        *_, scored = score(spec)
-    assert isinstance(scored, Scored) and not scored.scores.any()
+        scores = scored(spec)
+    assert not scores.any()
     del found["cpu"]  # of poses, which are there, and once of the scores
     assert found == {"tolist": 1, "to": 8}  # once: the model's six tensors, labels and sizes
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
@@ -13,8 +14,8 @@ from panolog.renderer import ops
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import Checkpoint, Event, Notice, Progress, Trained
-from panolog.workers.scoring import ScoreSpec
+from panolog.workers.events import Checkpoint, Event, Notice, Progress, Scored, Trained
+from panolog.workers.scoring import ScoreSpec, score
 from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE, TaskId
@@ -74,6 +75,13 @@ def score_of(scene: Scene, model: Gaussians, views: tuple[int, ...], **fields: A
         config=TrainConfig(),
     )
     return replace(spec, **fields)
+
+
+def scored(spec: ScoreSpec) -> Tensor:
+    """(views, blocks) the scores at the end of a task."""
+    *_, last = score(spec)
+    assert isinstance(last, Scored)
+    return last.scores
 
 
 def evaluation_of(

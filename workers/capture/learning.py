@@ -1,7 +1,7 @@
 """What a task of Stage I learns about how its panoramas were captured, between two iterations."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,20 +15,6 @@ from panolog.workers.capture.config import CaptureConfig
 from panolog.workers.capture.exposure import Exposures
 from panolog.workers.capture.movers import Movers, Visit
 from panolog.workers.capture.poses import Poses
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Observed:
-    """What an iteration has found about its view, on the device of the training."""
-
-    view: int  # row of scene.panoramas
-    iteration: int
-    image: Tensor  # (H, W, 3) uint8, the photograph
-    color: Tensor  # (H, W, 3) rendered, before the exposure
-    inverse_depth: Tensor  # (H, W) rendered
-    exposure: Tensor | None  # (3, 5) float64, `ops.photometric`
-    affine: Tensor | None  # (2, 3) float32, `View.exposure` in this iteration
-    status: Tensor | None  # (1,) int32, on a card: not 0 where the iteration did not take place
 
 
 class Learning:
@@ -80,23 +66,13 @@ class Learning:
             view = replace(view, mask=still if view.mask is None else view.mask & still)
         return view
 
-    def step(self, observed: Observed) -> None:
+    def step(self, visit: Visit) -> None:
         """Learns from an iteration. On a card nothing here waits for it."""
-        done = observed.iteration / self._iterations
-        if self.exposure is not None and observed.exposure is not None and done > self._config.exposure.begin:
-            self.exposure.step(observed.view, observed.exposure, observed.status)
+        done = visit.iteration / self._iterations
+        if self.exposure is not None and visit.exposure is not None and done > self._config.exposure.begin:
+            self.exposure.step(visit.row, visit.exposure, visit.status)
         if self.movers is not None:
-            self.movers.step(
-                Visit(
-                    row=observed.view,
-                    iteration=observed.iteration,
-                    image=observed.image,
-                    color=observed.color,
-                    affine=observed.affine,
-                    inverse_depth=observed.inverse_depth,
-                    status=observed.status,
-                )
-            )
+            self.movers.step(visit)
 
     @property
     def _parts(self) -> tuple[Exposures | Poses | Movers, ...]:

@@ -120,15 +120,16 @@ def _turn(x: Array, z: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Visit:
-    """What an iteration has found in its view."""
+    """What an iteration has found in its view, on the device of the training."""
 
     row: int  # of scene.panoramas
     iteration: int
     image: Tensor  # (H, W, 3) uint8, the photograph
     color: Tensor  # (H, W, 3) float32 rendered, before the exposure
-    affine: Tensor | None  # (2, 3) float32, `View.exposure`
+    affine: Tensor | None  # (2, 3) float32, `View.exposure` in this iteration
     inverse_depth: Tensor  # (H, W) float32 rendered, 1 / world units
     status: Tensor | None  # (1,) int32, on a card: not 0 where the iteration did not take place
+    exposure: Tensor | None = None  # (3, 5) float64, `ops.photometric`
 
 
 class Movers:

@@ -17,14 +17,14 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias, TypeVar
 
-import torch
 from torch import Tensor
 
-from panolog.partition.cells import Cell
 from panolog.partition.faces import Plane
 from panolog.partition.plan import Plan
-from panolog.scene.gaussians import Gaussians, concatenate
+from panolog.scene.gaussians import Gaussians
+from panolog.workers.comparison import with_block
 from panolog.workers.events import Event, Progress, SeamMeasured
+from panolog.workers.merge import retained
 from panolog.workers.seams import schema
 from panolog.workers.seams.looks import Looks
 from panolog.workers.seams.pictures import Picture
@@ -157,7 +157,8 @@ class SeamMeasurement:
         """How far what the two blocks of a face show differs; each picture gets both."""
         shown: list[list[Seen]] = []
         for block in (face.below, face.above):
-            model = block_in_coarse(self._plan.cell(block), merged, coarse).to(self._spec.device)
+            cell = self._plan.cell(block)
+            model = with_block(coarse, cell, retained(merged, cell, 0.0)).to(self._spec.device)
             shown.append([])
             for shot in shots:
                 seen = self._see(model, shot.look, shot.exposure)
@@ -195,14 +196,6 @@ class SeamMeasurement:
             coarse=coarse,
             difference=schema.Difference(**difference.means),
         )
-
-
-def block_in_coarse(cell: Cell, merged: Gaussians, coarse: Gaussians) -> Gaussians:
-    """What a block shows by itself: the merged model in its cell, and that of Stage I outside of it."""
-    own, others = (torch.zeros(len(model), dtype=torch.bool) for model in (merged, coarse))
-    own[merged.scene] = torch.from_numpy(cell.contains(merged.means[merged.scene].numpy()))
-    others[coarse.scene] = torch.from_numpy(cell.contains(coarse.means[coarse.scene].numpy()))
-    return concatenate(merged.select(own), coarse.select(~others))
 
 
 def _with_floor(errors: Errors, floors: Sequence[Errors]) -> schema.Ratios:

@@ -3,7 +3,7 @@
 A pixel's point is where the model's depth says. Pixels count by their area on the sphere.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -169,10 +169,7 @@ class Difference:
     """Sums over strips of how far what two blocks show differs."""
 
     area: float = 0.0
-    color: float = 0.0
-    squared: float = 0.0
-    depth: float = 0.0
-    opacity: float = 0.0
+    sums: Array = field(default_factory=lambda: np.zeros(4))  # colours, their squares, depths, opacities
 
     def add(self, strip: Strip, below: Seen, above: Seen) -> None:
         """Adds a strip. Args: what both blocks show in it; depths are relative to those of the strip."""
@@ -182,20 +179,14 @@ class Difference:
         opacity = np.abs(below.alpha.astype(np.float64) - above.alpha)
         apart = np.abs(colors[0] - colors[1])
         depth = np.abs(distances[0] - distances[1]) / distances[2]
+        values = apart.mean(axis=1), (apart**2).mean(axis=1), depth.clip(0, 1), opacity
         self.area += float(area.sum())
-        self.color += float((area * apart.mean(axis=1)).sum())
-        self.squared += float((area * (apart**2).mean(axis=1)).sum())
-        self.depth += float((area * depth.clip(0, 1)).sum())
-        self.opacity += float((area * opacity).sum())
+        self.sums += [float((area * value).sum()) for value in values]
 
     @property
     def means(self) -> dict[str, float | None]:
         """The means; None where nothing was seen."""
         if not self.area:
             return dict.fromkeys(("color", "psnr", "depth", "opacity"))
-        return {
-            "color": self.color / self.area,
-            "psnr": decibel(self.squared / self.area),
-            "depth": self.depth / self.area,
-            "opacity": self.opacity / self.area,
-        }
+        color, squared, depth, opacity = (self.sums / self.area).tolist()
+        return {"color": color, "psnr": decibel(squared), "depth": depth, "opacity": opacity}

@@ -171,6 +171,13 @@ class DensifyConfig(Group):
         " n · (1 + growth · (0.85 + 0.5 ln(p / n))), the law that clone-split follows (workers/growth.py);"
         " 0.8 gives a street about as many as clone-split",
     )
+    long_runs: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="exponent p: in a Stage I of more than 1,500 iterations `growth` is multiplied by"
+        " (iterations / 1,500)^p: what trains longer can teach more of them; 0 = as it is",
+    )
     filled: float = Field(
         default=0.5, gt=0, le=1, description="part of the densifications after which the budget is reached"
     )

@@ -24,7 +24,8 @@ from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.tensors.transfer import sleeping_event
-from panolog.workers.capture.learning import Learning, Observed
+from panolog.workers.capture.learning import Learning
+from panolog.workers.capture.movers import Visit
 from panolog.workers.training.densify import Statistics
 from panolog.workers.training.loss import loss_of
 from panolog.workers.training.optimizer import ModelState, finite_loss
@@ -47,6 +48,21 @@ class Plan:
     rows: dict[str, int]  # how many of each parameter move; parameters that are not in it do not
     statistics: Statistics | None  # where its screen gradients count
     learning: Learning | None  # of how the view was captured, in Stage I
+
+    def visit(
+        self, color: Tensor, inverse_depth: Tensor, exposure: Tensor | None, status: Tensor | None
+    ) -> Visit:
+        """What it has found."""
+        return Visit(
+            row=self.view,
+            iteration=self.iteration,
+            image=self.problem.image,
+            color=color,
+            affine=self.problem.exposure,
+            inverse_depth=inverse_depth,
+            status=status,
+            exposure=exposure,
+        )
 
 
 class Direct:
@@ -87,17 +103,8 @@ class Direct:
         if plan.statistics is not None and screen is not None and screen.grad is not None:
             plan.statistics.add(screen.grad, rendered.visible, leaves.means.detach(), problem.camera)
         if plan.learning is not None:
-            observed = Observed(
-                view=plan.view,
-                iteration=plan.iteration,
-                image=plan.problem.image,
-                color=rendered.color.detach(),
-                inverse_depth=rendered.inverse_depth.detach(),
-                exposure=found.exposure,
-                affine=plan.problem.exposure,
-                status=None,
-            )
-            plan.learning.step(observed)
+            images = rendered.color.detach(), rendered.inverse_depth.detach()
+            plan.learning.step(plan.visit(*images, found.exposure, None))
             if motion is not None and motion.grad is not None:
                 plan.learning.learn_motion(plan.view, plan.iteration, motion.grad.numpy())
         self._finished(value, float(found.mse))
@@ -189,17 +196,8 @@ class Pipeline:
                 contribution=into.config.views == "contribution",
             )
         if plan.learning is not None:
-            observed = Observed(
-                view=plan.view,
-                iteration=plan.iteration,
-                image=plan.problem.image,
-                color=found.color,
-                inverse_depth=found.inverse_depth,
-                exposure=found.exposure,
-                affine=plan.problem.exposure,
-                status=self._status,
-            )
-            plan.learning.step(observed)
+            visit = plan.visit(found.color, found.inverse_depth, found.exposure, self._status)
+            plan.learning.step(visit)
         report = self._reports[plan.iteration % AHEAD, : len(found.report)]
         report.copy_(found.report, non_blocking=True)
         event = sleeping_event() if self._cuda else None

@@ -40,6 +40,7 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "loss.sphere": True,  # a pole has many pixels, and little of what is seen
         "densify.method": "relocate",  # as many Gaussians as the paper, where they are needed; no resets
         "densify.growth": 0.75,  # so that a street has no more than in the paper's recipe
+        "densify.long_runs": 0.5,  # what trains longer can teach more of them
         "densify.filled": 0.25,  # early: a Gaussian needs time to learn
         "densify.weight": "gradient",  # where the error is, not where opacity is
         "densify.measure": "angle",  # no more at the poles than elsewhere

@@ -14,6 +14,7 @@ from panolog.scene.random_streams import generator
 from panolog.workers.training.config import DensifyConfig, TrainConfig
 
 FULL_RUN = 30_000  # iterations that the config's schedules are stated for
+SHORT_RUN = 1_500  # iterations up to which the budget of Gaussians is `densify.growth`'s
 AVERAGED = 32  # models in an average, about: 13 were as good as 62
 GROWTH_OFFSET, GROWTH_SLOPE = 0.85, 0.5  # by the pixels of each Gaussian, measured: workers/growth.py
 
@@ -124,7 +125,9 @@ class Schedule:
         Args: start, how many there were before the first iteration; pixels of one panorama.
         """
         densify = self.densify
-        factor = densify.growth * (GROWTH_OFFSET + GROWTH_SLOPE * math.log(max(1.0, pixels / max(start, 1))))
+        longer = 1.0 if self.refine else max(1.0, self.iterations / SHORT_RUN) ** densify.long_runs
+        factor = GROWTH_OFFSET + GROWTH_SLOPE * math.log(max(1.0, pixels / max(start, 1)))
+        factor *= densify.growth * longer
         first, last = self.point(densify.start), min(self.point(densify.until), self.iterations)
         ends = first + densify.filled * (last - first)
         share = min(max((iteration - first) / max(ends - first, 1.0), 0.0), 1.0)

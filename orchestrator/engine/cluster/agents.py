@@ -1,9 +1,8 @@
 """An agent on each node that works for the run: it reports what its node knows of its end, and stops tasks.
 
-It is an actor without resources. A task of Ray would not do: Ray starts none on a node that drains, where
-workers have to be requested to save and end. An actor keeps a node from being idle, so that an autoscaler
-would not remove it and one that drains would not end; therefore agents end when no task of the run has been
-on their node for a while, at once if it drains. On the driver's own machine a thread of the driver does it.
+It is an actor without resources: Ray starts no task on a node that drains. An actor keeps a node from being
+idle, so agents end when no task of the run has been on their node for a while, at once if it drains. On the
+driver's own machine a thread of the driver does it.
 """
 
 import time
@@ -42,8 +41,6 @@ class Agent:
 
 @dataclass
 class _Known:
-    """An agent as the driver sees it."""
-
     actor: Any  # ray.actor.ActorHandle
     answer: Any  # ray.ObjectRef of the next notice
     notice: LeaveNotice | None = None
@@ -105,7 +102,6 @@ class Agents:
                 del self._known[id]
 
     def close(self) -> None:
-        """Ends all of them."""
         self._watch.close()
         for known in self._known.values():
             ray.kill(known.actor)

@@ -1,9 +1,7 @@
 """Ray's autoscaler: which machines it can start, requests for some, and why they do not come.
 
 A request is a task that takes a whole machine and does nothing, and that no machine which is there may run.
-While it waits, the autoscaler starts a machine for it. Unlike `ray.autoscaler.sdk.request_resources`, of
-which a cluster has one, it is of this driver alone, and ends with it
-(docs/decisions/0013-requests-for-machines.md).
+While it waits, the autoscaler starts a machine for it (docs/decisions/0013-requests-for-machines.md).
 """
 
 import json

@@ -1,9 +1,8 @@
-"""Clears up after a session of Ray whose driver has ended, however it ended: `python -m … FOLDER`.
+"""Clears up after a session of Ray whose driver has ended. Separate: it is a process, `python -m … FOLDER`.
 
-It is separate because it runs as a process of its own. It waits for the end of its standard input,
-which only the driver has open. A driver that ends by itself writes to it first, and only the folder is left
-to remove. If the driver was killed, Ray's processes notice one by one, some after a minute: every process
-that has a file of the session open, such as its log, is killed first.
+It waits for the end of its standard input, which only the driver has open. A driver that ends by itself
+writes to it first. If the driver was killed, Ray's processes notice one by one, some after a minute: every
+process that has a file of the session open, such as its log, is killed.
 """
 
 import shutil

@@ -24,6 +24,7 @@ from panolog.scene.errors import ClusterError, ConfigError
 
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _TIMEOUT_S = 10.0  # in which a cluster must answer, and Ray's own processes must end
+_STARTS = 3  # of Ray on this machine, before it counts as broken
 _STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
 
 
@@ -57,7 +58,6 @@ def connect(address: str | None, root: Path, nice: int | None = None) -> Iterato
 
 @contextmanager
 def _joined(address: str) -> Iterator[None]:
-    """A cluster's Ray."""
     try:
         _join(address)
         yield
@@ -97,6 +97,24 @@ def _own(nice: int | None) -> Iterator[None]:
 
 
 def _start(folder: str, nice: int | None) -> None:
+    """Starts Ray, once more if its 30 s were too short on a busy machine. Raises ClusterError."""
+    for left in reversed(range(_STARTS)):
+        try:
+            _init(folder, nice)
+        except Exception as error:
+            if type(error) is not Exception:  # what Ray raises for it has no class of its own
+                raise
+            ray.shutdown()
+            if not left:
+                raise ClusterError(
+                    f"Ray does not start on this machine ({first_line(str(error))}); end other programs, and"
+                    " repeat the command: nothing is lost"
+                ) from error
+        else:
+            return
+
+
+def _init(folder: str, nice: int | None) -> None:
     ray.init(
         address="local",  # also if RAY_ADDRESS is set
         num_cpus=cores(),

@@ -2,8 +2,7 @@
 
 A worker that sees a file at its own path reads it there. Any other requests it from the file server, an actor
 on the driver's machine, once for each machine: the bytes travel through Ray's object store and are kept in
-Ray's temporary folder, where later tasks and attempts find them. Nothing is sent ahead, so each machine gets
-what its own cameras need, and no object has to outlive the call that moves it: a lost one is requested again.
+Ray's temporary folder. No object has to outlive the call that moves it: a lost one is requested again.
 """
 
 import errno
@@ -65,7 +64,6 @@ class Stamp:
         return cls(stat.st_size, stat.st_mtime_ns if dated else None)
 
     def fits(self, path: Path) -> bool:
-        """Whether `path` is that file."""
         return path.is_file() and self == Stamp.of(path, dated=self.modified is not None)
 
 
@@ -96,7 +94,6 @@ class RayValue(Generic[T]):
     home: str  # Ray's id of the driver's machine
 
     def load(self) -> T:
-        """The value; the machine's store keeps it while it has room."""
         if _here() != self.home:
             copies = get_object_locations([self.ref]).get(self.ref, {})
             if _here() not in copies.get("node_ids", ()):
@@ -182,10 +179,6 @@ class FileSharing:
         )
 
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> NodeFiles:
-        """What finds files of the scene, and files that the run has made.
-
-        Raises OSError if one of them is gone.
-        """
         if self._server is None:
             self._process.unlink(missing_ok=True)
             here = NodeAffinitySchedulingStrategy(self._home, soft=False)
@@ -284,7 +277,6 @@ def received_bytes() -> int:
 
 
 def _here() -> str:
-    """Ray's id of this machine."""
     node: str = ray.get_runtime_context().get_node_id()
     return node
 
@@ -318,6 +310,5 @@ def _unused(folder: Path) -> list[Path]:
 
 
 def _remove(cache: str) -> None:
-    """Runs on each machine."""
     folder = Path(ray.get_runtime_context().get_temp_dir()) / _FOLDER / cache
     shutil.rmtree(folder, ignore_errors=True)

@@ -1,8 +1,7 @@
 """Runs on a remote cluster: commands of the command line as jobs of Ray's job server on the head node.
 
-The server runs a job's command on the head, so all paths are the head's. Nothing about a run is kept here or
-there: a run's jobs are listed by the server, its state is in the run folder, read by `panolog status` on
-the head. That holds for a run that lives, has ended or was killed, from any machine that has the token.
+All paths are the head's, and nothing about a run is kept here or there: its jobs are listed by the server,
+its state is in the run folder, read by `panolog status` on the head.
 """
 
 import json
@@ -170,7 +169,6 @@ def on_head(path: str, what: str) -> str:
 
 
 def _job(details: Any) -> ClusterJob:
-    """What matters of a `JobDetails`."""
     status = _STATUS[details.status.value]
     lines = (details.message or "").strip().splitlines() if status == "failed" else []
     reason = lines[-1].removeprefix("panolog: ") if lines else None

@@ -1,7 +1,6 @@
 """Announces that this machine leaves its Ray cluster: for what ends machines without a metadata service.
 
-Such are a pod's preStop hook and a batch system's signal. Ray has no other way to say it than to drain the
-node, which nothing takes back. The command line of Ray that does so is used, since its Python interface is
+Ray can only drain the node, which nothing takes back; its command line does so, since the Python interface is
 not public. The raylet of a node that drains ends once nothing runs there any more.
 """
 

@@ -1,8 +1,4 @@
-"""Workers on Ray: tasks go in, messages come out.
-
-Each task is a remote generator on a node that the driver names; what it yields arrives in order while it
-runs.
-"""
+"""Workers on Ray: each task is a remote generator on a node that the driver names."""
 
 import os
 import socket
@@ -108,7 +104,6 @@ class RayPool:
 
     @reported
     def notices(self) -> dict[str, LeaveNotice]:
-        """Which machines have announced that they leave, as of the last look at them."""
         draining = self._nodes.draining()
         self._agents.review(self._nodes.ids, draining, self._busy())
         return self._agents.notices() | draining
@@ -118,7 +113,6 @@ class RayPool:
 
     @reported
     def growth(self) -> Growth:
-        """What Ray's autoscaler could start, and does."""
         if self._autoscaler is None:
             return NO_GROWTH
         growth, alive = self._autoscaler.growth(), self._nodes.ids
@@ -127,7 +121,6 @@ class RayPool:
 
     @reported
     def request(self, wanted: Mapping[str, int]) -> None:
-        """Requests so many machines more than there are, by the name of their group, and no others."""
         if self._autoscaler is not None:
             self._autoscaler.request(wanted, self._nodes.ids)
 
@@ -138,10 +131,6 @@ class RayPool:
 
     @reported
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
-        """How a task finds files of the scene, and files that the run has made.
-
-        Raises OSError if one of them is gone.
-        """
         return here if self._sharing is None else self._sharing.share_files(scene, run)
 
     @reported
@@ -165,7 +154,6 @@ class RayPool:
 
     @reported
     def stop(self, task: TaskId) -> None:
-        """Requests a last checkpoint and the end of a task that has said Hello."""
         running = self._running[task]
         if running.hello is not None:
             self._agents.stop(running.placement.node, running.hello.pid)
@@ -219,7 +207,6 @@ class RayPool:
 
     @reported
     def take(self, task: TaskId) -> Message:
-        """The next message of a task that is ready."""
         running = self._running[task]
         if running.cut_off:
             del self._running[task]

@@ -1,8 +1,7 @@
 """The state of a run for Prometheus and the dashboards of Ray: as metrics of `ray.util.metrics`.
 
-Only the driver exports, from the state that it has anyway: workers know nothing of it, and no number has two
-sources. Ray puts "ray_" before the names. It forgets a gauge that is not set again for some seconds, so all
-are set every few: a task that has ended keeps its results, and the node that it has left loses them.
+Only the driver exports, from the state that it has anyway. Ray puts "ray_" before the names. It forgets a
+gauge that is not set again for some seconds, so all are set every few.
 """
 
 import time

@@ -139,7 +139,6 @@ class Sizes:
         return self._plan
 
     def _of_blocks(self, state: RunState) -> Mapping[int, int]:
-        """By block; they are counted once, with the plan."""
         if not self._blocks:
             self._blocks = {plan.block: self._block(plan) for plan in state.plan or ()}
         return self._blocks
@@ -151,12 +150,10 @@ class Sizes:
 
     @cached_property
     def _scored(self) -> int:
-        """A shard of scores with levels of detail."""
         host, device = self._estimator.scored(self._gaussians)[1]
         return device or host
 
     def _measured(self, merged: int) -> int:
-        """A shard of the evaluation of a model of so many Gaussians; counted once."""
         if merged not in self._shards:
             host, device = self._estimator.measured(merged)[1]
             self._shards[merged] = device or host
@@ -164,7 +161,6 @@ class Sizes:
 
     @cached_property
     def _rendering(self) -> int:
-        """Scoring and evaluation with the whole model, whichever is larger."""
         estimator, work = self._estimator, (self._gaussians, len(self._job.scene.train))
         needs = [estimator.rendering(*work), estimator.scoring(*work)]
         return max(device or host for host, device in needs)

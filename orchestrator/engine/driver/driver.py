@@ -189,7 +189,6 @@ class Driver:
         self._news = True
 
     def _take_requests(self) -> None:
-        """Carries out what users have requested through the run folder."""
         self._news = self._requests.carry_out() or self._news
         ends = self._own_machine_leaves
         for task, attempt in list(self._attempts.items()):
@@ -207,7 +206,6 @@ class Driver:
         return leaves_for_sure(self._state.leaving(), gethostname())
 
     def _stop_task(self, task: TaskId) -> None:
-        """Requests a last checkpoint and the end of a task."""
         self._attempts[task].stopping = True
         self._pool.stop(task)
 
@@ -244,7 +242,6 @@ class Driver:
         self._journal.record(records)
 
     def _place(self, tasks: Sequence[TaskId]) -> None:
-        """Decides which of the tasks start now, and where."""
         demands = Demands(self._sizes, self._state)
         running = demands.running({t: it.placement for t, it in self._attempts.items()}, self._clock.time())
         nodes = quarantine.usable(self._state, self._nodes)
@@ -387,7 +384,6 @@ class Driver:
         return records
 
     def _forget(self, task: TaskId) -> Attempt:
-        """An attempt that the pool has no longer."""
         self._evaluations.pop(task, None)
         self._writers.forget(task)
         return self._attempts.pop(task)

@@ -280,7 +280,6 @@ class Specs:
         return read_scores(self._job.folder.scores, self.plan.rows, self.plan.grid.count).tocsc()
 
     def _part(self, rows: tuple[int, ...]) -> Source[Scene]:
-        """The scene as a task on some of its panoramas needs it."""
         scene = self._job.scene
         if len(rows) >= len(scene.train):
             return self._whole
@@ -300,7 +299,6 @@ class Specs:
 
     @cached_property
     def _labels(self) -> Source[NDArray[np.int64]]:
-        """The block of each scene Gaussian of the Stage I model."""
         return self._sharing.put(block_labels(self._job.scene, self.means, self._job.config))
 
     def _surroundings(self, *models: Path, detail: float | None = None) -> list[Surroundings]:
@@ -372,7 +370,6 @@ class Specs:
         )
 
     def _locate(self, views: Iterable[int], *made: Path) -> Locate:
-        """Where a worker finds the files of some panoramas, and files that the run has made."""
         files = (file for row in views for file in self._job.scene.panoramas[row].files)
         return self._sharing.share_files(files, made)
 

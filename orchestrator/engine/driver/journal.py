@@ -76,7 +76,6 @@ class Backlog:
         self._waiting: list[tuple[float, Record]] = []
 
     def __len__(self) -> int:
-        """How many records wait."""
         return len(self._waiting)
 
     def store(self, records: Sequence[Record], *, wait_s: float = 0.0) -> list[Stored]:

@@ -1,8 +1,7 @@
-"""Workers without Ray: each task in a process of its own on this machine.
+"""Workers without Ray: each task in a process of its own on this machine. Results are the same bytes.
 
-Results are the same bytes as with Ray. A worker gets its spec when it has said Hello, and sends its messages
-through the same socket. No process that hangs holds the driver up. Workers are forked from a server process
-that has imported torch once and computes nothing, so a task starts in milliseconds.
+A worker gets its spec when it has said Hello, and sends its messages through the same socket. Workers are
+forked from a server process that has imported torch once and computes nothing.
 """
 
 import os
@@ -72,16 +71,13 @@ class LocalPool(InProcess):
         forkserver.ensure_running()  # imports torch while the driver reads the scene
 
     def nodes(self) -> tuple[Node, ...]:
-        """This machine."""
         return (self._node,)
 
     def notices(self) -> dict[str, LeaveNotice]:
-        """What this machine knows of its end."""
         notice = self._watch.notice()
         return {self._node.id: notice} if notice else {}
 
     def start(self, placement: Placement, spec: TaskSpec) -> None:
-        """Runs a spec in a new process."""
         ours, theirs = Pipe()
         _limit_waits(ours)
         work = (placement, theirs, dict(os.environ))
@@ -91,7 +87,6 @@ class LocalPool(InProcess):
         self._running[spec.task] = _Task(ours, process, spec)
 
     def stop(self, task: TaskId) -> None:
-        """Requests a last checkpoint and the end of a task that has said Hello."""
         if (hello := self._running[task].hello) is not None:
             stopping.request(hello.pid)
 
@@ -100,14 +95,12 @@ class LocalPool(InProcess):
         return False
 
     def cancel(self, task: TaskId) -> None:
-        """Kills the process of a task; nothing of it arrives any more."""
         running = self._running.pop(task)
         running.messages.close()
         running.process.kill()
         running.process.join(_EXIT_S)  # one that the kernel holds for a dead disk stays
 
     def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
-        """The tasks that have a message; waits at most `seconds` for the first. Args: but, not of these."""
         others = {task: running.messages for task, running in self._running.items() if task not in but}
         if not others:
             sleep(seconds)
@@ -116,13 +109,11 @@ class LocalPool(InProcess):
         return [task for task, messages in others.items() if messages in ready]
 
     def close(self) -> None:
-        """Ends what still runs."""
         self._watch.close()
         for task in list(self._running):
             self.cancel(task)
 
     def take(self, task: TaskId) -> Message:
-        """The next message of a task that is ready."""
         running = self._running[task]
         try:
             message: Message = pickle.loads(running.messages.recv_bytes())
@@ -158,7 +149,6 @@ def _limit_waits(pipe: Connection) -> None:
 
 
 def _death_of(task: _Task) -> Failed:
-    """The last message of a task whose process has ended without one."""
     if task.hello is not None and oom_kills() > task.hello.oom_kills:
         return Failed("out of memory: the system killed the worker", Failure.MEMORY)
     return Failed("the worker process died: killed or crashed", Failure.LOST)

@@ -40,7 +40,6 @@ def ready(
 
 
 def _training(state: RunState, *, shards: int, refine: bool, districts: int) -> Iterator[tuple[TaskId, ...]]:
-    """The stages before the merge."""
     if districts > 1:
         yield tuple(map(TaskId.district, range(districts)))
     yield (COARSE,)

@@ -1,8 +1,7 @@
 """The money and the time of a run: what it reserves and loses, and when a limit ends its training early.
 
-The driver foresees what follows the training: last checkpoints, merge, evaluation and delivery. It ends the
-training when what is left of a limit is just enough for these. What decides that is a pure function of the
-state and the time.
+The training ends when what is left of a limit is just enough for what follows: last checkpoints, merge,
+evaluation and delivery.
 """
 
 import math

@@ -1,10 +1,8 @@
 """What users request of a driver, by signals and through the run folder.
 
-Ctrl-C: the first requests a run to stop with fresh checkpoints, the second stops it at once.
-
-A driver must not be interrupted in the middle of a record, so the first signal only sets a flag; it does
-interrupt work that takes long and can be discarded (`at_once`). SIGTERM, as job systems send it, and SIGHUP,
-when a terminal is closed, are the same.
+A driver must not be interrupted in the middle of a record, so the first Ctrl-C, SIGTERM or SIGHUP only sets a
+flag, and the run stops with fresh checkpoints; it does interrupt work that takes long and can be discarded
+(`at_once`). The second stops the run at once.
 """
 
 import math

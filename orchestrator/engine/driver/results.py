@@ -28,8 +28,6 @@ Deliver = Callable[[Job], list[Record]]
 
 
 class Results:
-    """Makes those of one job."""
-
     def __init__(self, job: Job, later: Callable[[], Specs], on_plan: OnPlan, deliver: Deliver) -> None:
         """Args: later, the specs after Stage I; on_plan is called with the plan and (N, 3) means of Stage I
         before plan.json is written; deliver makes the files for viewers and returns their records.
@@ -106,7 +104,6 @@ class Results:
         return [merge_run(folder, state, self._specs.plan, self._specs.repaired, early)]
 
     def _join(self, state: RunState) -> list[Record]:
-        """The evaluation from its shards."""
         job, faces = self._job, len(self._specs.faces)
         evaluation = new_evaluation(job, faces, detail=job.config.measured_detail)
         evaluation.join(job.folder, state.measures)

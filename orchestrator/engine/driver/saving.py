@@ -129,7 +129,6 @@ def _repaired(folder: RunFolder, task: TaskId) -> str:
 
 
 def _aside(last: Path) -> Path:
-    """Where a damaged checkpoint is kept until its task is done."""
     return last.with_name(f"{last.name}.damaged")
 
 

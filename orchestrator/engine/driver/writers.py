@@ -25,8 +25,6 @@ _UNMEASURED = 2**26  # bytes per second, expected of a disk before anything larg
 
 @dataclass
 class _Job:
-    """One message on its way to the disk."""
-
     event: Checkpoint | Trained
     size: int  # bytes, 0 = unknown
     future: Future[tuple[Record, float]]
@@ -51,7 +49,6 @@ class Writers:
 
     @property
     def busy(self) -> bool:
-        """Whether anything is on its way to the disk."""
         return bool(self._jobs)
 
     def announce(self, task: TaskId, size: int) -> None:
@@ -64,11 +61,9 @@ class Writers:
         return set(self._jobs).union(list(self._announced)[room:])
 
     def writes(self, task: TaskId) -> bool:
-        """Whether a message of a task is on its way to the disk."""
         return task in self._jobs
 
     def start(self, event: Checkpoint | Trained) -> None:
-        """Begins to write what an event carries."""
         size = self._announced.pop(event.task, 0)
         self._jobs[event.task] = _Job(event, size, self._threads.submit(self._write, event))
 
@@ -106,7 +101,6 @@ class Writers:
             raise failure
 
     def wait(self, seconds: float) -> None:
-        """Returns when something is written, at the latest after so many seconds."""
         if futures := [job.future for job in self._jobs.values() if job.again is None]:
             wait_for(futures, seconds, FIRST_COMPLETED)
         else:

@@ -32,8 +32,6 @@ WELL = 0.05  # of its iterations after which the rate of a running block predict
 
 @dataclass(frozen=True)
 class StageEstimate:
-    """What one stage needs."""
-
     name: Stage
     tasks: int
     together: int  # of them at a time
@@ -53,7 +51,6 @@ class Estimate:
 
     @property
     def seconds(self) -> float | None:
-        """Of all stages."""
         seconds = [stage.seconds for stage in self.stages]
         return None if None in seconds else sum(filter(None, seconds))
 
@@ -63,7 +60,6 @@ class Estimate:
         return next(stage.gaussians for stage in self.stages if stage.name is Stage.COARSE)
 
     def as_json(self) -> dict[str, Any]:
-        """Seconds and bytes."""
         return asdict(self) | {"seconds": self.seconds}
 
 

@@ -1,10 +1,8 @@
 """What every stage of a job needs, from its scene, its settings, a calibration and the machines there are.
 
-Memory. What a Gaussian takes is in `calibration`, on a GPU in `workers.device_memory`. A checkpoint is one
-copy of values and moments, and one more on its way to the driver, both in the host's memory. All else (the
-process, the images of a step, what decoding needs) is what the calibration's process had beyond its own
-Gaussians and panoramas. Decoded panoramas stay within `cache.memory`. On the CPU, scoring and evaluation have
-the model, what reading it took, and one set of gradients. A block with a baked exterior trains what its cell
+Memory. What a Gaussian takes is in `calibration`, on a GPU in `workers.device_memory`. All else (the process,
+the images of a step, what decoding needs) is what the calibration's process had beyond its own Gaussians and
+panoramas; decoded panoramas stay within `cache.memory`. A block with a baked exterior trains what its cell
 has; the fullest cell is expected to have as large a share of the Gaussians as of the sparse points.
 
 Time. An iteration takes a + b · Gaussians seconds: the calibration has tried two numbers of them, and
@@ -58,7 +56,6 @@ class Estimator:
     nodes: Sequence[Node]
 
     def estimate(self) -> Estimate:
-        """All stages."""
         coarse, block = self._whole + self._sky, self._block[-1][1] + self._frozen_sky
         stages = self._coarse_stages(coarse)
         merged = coarse
@@ -73,11 +70,9 @@ class Estimator:
 
     @cached_property
     def parts(self) -> Parts:
-        """Of the place."""
         return Parts(self.scene, self.config, self.width)
 
     def _coarse_stages(self, gaussians: int) -> list[StageEstimate]:
-        """Stage I: of the whole place, or of its districts and then their union."""
         sky, count, cameras = self._sky, self.config.districts, self.parts.district[0]
         largest = self._coarse[-1][1] + sky
 
@@ -124,7 +119,6 @@ class Estimator:
         return self._stage(stage, tasks, gaussians, need, training)
 
     def _refinement(self, coarse: int) -> list[StageEstimate]:
-        """Scoring, with the plan, and the blocks."""
         train, blocks, cameras = len(self.scene.train), self.config.grid.count, self.parts.block_cameras
         seen, need = self.scored(coarse)
 
@@ -158,7 +152,6 @@ class Estimator:
         return max(seen, around), (max(host, with_both), max(device, on_gpu))
 
     def _passes(self) -> list[StageEstimate]:
-        """What trains once more, each after a union of the blocks."""
         blocks, own, stages = self.config.grid.count, self._block[-1][1], list[StageEstimate]()
         whole = blocks * own + self._sky
         for stage in self.config.passes.stages:
@@ -185,7 +178,6 @@ class Estimator:
         return [merge, shards, self._stage(Stage.EVAL, 1, merged, (0, 0), lambda _: 0.0)]
 
     def _writing(self, gaussians: int) -> float:
-        """Seconds in which models are read and written as one."""
         return 2 * gaussians * _PLY / _DISK
 
     def _disk(self, coarse: int, block: int, merged: int) -> int:
@@ -239,12 +231,10 @@ class Estimator:
 
     @property
     def _frozen_sky(self) -> int:
-        """Sky Gaussians in the training of a block."""
         return 0 if self.bakes else self._sky
 
     @cached_property
     def _periods(self) -> Callable[[int], list[Period]]:
-        """How a block grows from so many scene Gaussians."""
         schedule = replace(self._schedule, refine=True)
         return cache(lambda start: population(start, self._added, self._pixels, schedule))
 
@@ -339,7 +329,6 @@ class Estimator:
 
     @property
     def _saved(self) -> int:
-        """Bytes of a Gaussian in a checkpoint."""
         return CHECKPOINT + (AVERAGE if self.config.optimizer.average else 0)
 
     @property
@@ -374,7 +363,6 @@ class Estimator:
 
     @property
     def _each(self) -> int:
-        """Peak bytes of one Gaussian in training."""
         return TRAINED + (2 * self._saved if self._saves else 0)
 
     def _fixed(self, cameras: int, baked: int = 0) -> int:

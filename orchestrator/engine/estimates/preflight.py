@@ -41,8 +41,6 @@ _CAMERAS = 16  # a block that is only there to keep a machine busy has at least 
 
 @dataclass(frozen=True)
 class Preflight:
-    """The result for a job."""
-
     config: RunConfig  # with its blocks chosen
     basis: Basis
     estimate: Estimate
@@ -53,12 +51,10 @@ class Preflight:
     workers: Workers
 
     def require(self) -> None:
-        """Raises InputError if the job cannot be done."""
         if self.problem:
             raise InputError(self.problem)
 
     def as_json(self) -> dict[str, Any]:
-        """Seconds and bytes: what doctor prints and the run folder keeps."""
         return {
             "problem": self.problem,
             "estimate": self.estimate.as_json(),
@@ -69,7 +65,6 @@ class Preflight:
         }
 
     def summary(self) -> str:
-        """One line for people."""
         memory = max(stage.device or stage.host for stage in self.estimate.stages)
         trained = [
             f"{_TRAINED[it.name]} {it.gaussians:,}" for it in self.estimate.stages if it.name in _TRAINED
@@ -167,7 +162,6 @@ def _whole(scene: Scene, config: RunConfig, basis: Basis) -> Estimate:
 
 
 def _most_memory(estimate: Estimate) -> int:
-    """Bytes of the largest task."""
     return max(stage.device or stage.host for stage in estimate.stages)
 
 
@@ -254,13 +248,11 @@ def free_disk(root: Path) -> int:
 
 
 def machine_line(node: Node) -> str:
-    """What a machine has, for people."""
     gpus = ", ".join(f"{gpu.name} with {gib(gpu.memory)} free" for gpu in node.gpus)
     return f"{node.cpus} cores, {gib(node.memory)} of memory free" + (f", {gpus}" if gpus else "")
 
 
 def stage_line(stage: StageEstimate) -> str:
-    """What a stage needs, for people."""
     gpu = f"{gib(stage.device)} of a GPU, " if stage.device else ""
     host = f"{gib(stage.host)} of memory, " if stage.host else ""
     tasks = f"{stage.tasks} tasks, {stage.together} at a time, " if stage.tasks > 1 else ""
@@ -268,5 +260,4 @@ def stage_line(stage: StageEstimate) -> str:
 
 
 def time_of(seconds: float | None) -> str:
-    """Seconds for people."""
     return "time not measured" if seconds is None else f"about {duration(seconds)}"

@@ -140,8 +140,6 @@ def _caps(estimator: Estimator, estimate: Estimate) -> list[int]:
 
 @dataclass(frozen=True)
 class _Short:
-    """What needs more than there is."""
-
     memory: bool  # of a task, which is less where the place is divided; or else the disk
     what: str  # in words
 

@@ -1,4 +1,4 @@
-"""Assigns tasks of known length to slots so that the last ends as soon as possible: arithmetic on arrays.
+"""Assigns tasks of known length to slots so that the last ends as soon as possible.
 
 Longest first, each to the slot on which it ends first (Graham's LPT); then, as long as that helps, the slot
 that ends last gives a task away or swaps one for another.

@@ -1,8 +1,4 @@
-"""Large messages of workers: how many bytes they carry, and what announces them.
-
-A driver has too little memory for the checkpoints of all its tasks at once, so it must know that a message is
-large before it takes it.
-"""
+"""Large messages of workers: how many bytes they carry, and what announces them to a driver."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass

@@ -41,16 +41,12 @@ class NoAnswerError(Exception):
 
 @dataclass(frozen=True)
 class Answer:
-    """Of a metadata service."""
-
     status: int
     body: str
     headers: Mapping[str, str]
 
 
 class Service:
-    """A metadata service at an address."""
-
     def __init__(self, url: str) -> None:
         """Args: url, http://HOST[:PORT]. Raises ValueError if it is none."""
         parts = urlsplit(url)
@@ -122,7 +118,6 @@ class Amazon:
     _token: str = ""
 
     def there(self) -> bool:
-        """Whether the service is EC2's."""
         self._renew()
         return bool(self._token)
 
@@ -162,12 +157,9 @@ _OF_GOOGLE = {"Metadata-Flavor": "Google"}
 
 @dataclass
 class Google:
-    """Compute Engine."""
-
     service: Service
 
     def there(self) -> bool:
-        """Whether the service is Compute Engine's."""
         answer = self.service.request("/computeMetadata/v1/", _OF_GOOGLE)
         return _OF_GOOGLE.items() <= answer.headers.items()
 
@@ -203,7 +195,6 @@ class Azure:
     _name: str = ""
 
     def there(self) -> bool:
-        """Whether the service is Azure's."""
         self._find_name()
         return bool(self._name)
 

@@ -1,13 +1,9 @@
 """Which waiting tasks start now, and where: pure decisions over what waits, what runs and what there is.
 
-On GPUs: each is cut into as many equal slots as tasks of the size at hand fit into its memory, at most
-`_SHARED`, and no more than there are tasks for. Tasks are assigned to these slots, to those that are busy
-too, so that the last ends as soon as possible (`assignment.assign_lpt`). Of those assigned to a free slot the
-longest starts. So a slot stays free only where others, busy now, will have done all the work sooner. Whenever
-a task ends, all is assigned anew (docs/decisions/0014-the-driver-chooses-gpus.md).
-
-On CPUs: as many at once as there are cores and memory for, because one thread each wastes less than many
-threads for one; those that start together share a node's free cores evenly.
+On GPUs (docs/decisions/0014-the-driver-chooses-gpus.md): each is cut into as many equal slots as tasks of the
+size at hand fit into its memory, at most `_SHARED`, and no more than there are tasks for. Tasks are assigned
+to these, also to busy ones, so that the last ends as soon as possible; of those assigned to a free slot the
+longest starts. On CPUs: as many at once as there are cores and memory for, which share a node's free cores.
 
 A task avoids the nodes and GPUs on which it has failed, as if it took `_PATIENCE_S` longer there for each
 failure: it waits so long at most for others, and where it has failed on all it starts where it did so least.
@@ -148,7 +144,6 @@ def _for_one_alone(demand: Demand, devices: Sequence[_Device]) -> _Device:
 
 
 def _whole(device: _Device) -> Placement:
-    """All of a device."""
     if device.gpu is None:
         return Placement(device.node.id, device.node.cpus, device.memory)
     return _part(device, 1)

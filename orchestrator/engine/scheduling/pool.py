@@ -82,7 +82,7 @@ class Sharing(Protocol):
         """Shares a value with all tasks."""
 
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
-        """How a task finds files of the scene, and files that the run has made."""
+        """How a task finds files of the scene and of the run. Raises OSError if one of them is gone."""
 
 
 class Pool(Sharing, Protocol):
@@ -158,7 +158,6 @@ def on_its_card(spec: TaskSpec, where: Placement) -> TaskSpec:
 
 
 def first_line(text: str) -> str:
-    """The first line of a text."""
     return (text.strip().splitlines() or [""])[0]
 
 
@@ -166,15 +165,12 @@ class InProcess:
     """`Sharing` with this process itself, on machines that are all there."""
 
     def put(self, value: T) -> Value[T]:
-        """The value."""
         return Value(value)
 
     def share_files(self, _scene: Iterable[Path], _run: Iterable[Path]) -> Locate:
-        """Every file is where it is."""
         return here
 
     def growth(self) -> Growth:
-        """No machine can be started."""
         return NO_GROWTH
 
     def request(self, _wanted: Mapping[str, int]) -> None:

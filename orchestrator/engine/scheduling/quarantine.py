@@ -2,11 +2,9 @@
 
 One on which `quarantine.failures` different tasks have failed without a success gets no task until
 `quarantine.seconds` have passed or a user releases it. A GPU of several is quarantined alone, as long as what
-failed on its node failed there. The last place that is left is quarantined only if tasks fail there alike:
-no attempt at them would end otherwise.
-
-If all are in quarantine, the cause is hardly a machine: a mount, a switch, a driver, the code. The run then
-waits `_SHARE` of the time and releases all, `_ROUNDS` times; if nothing has succeeded by then it fails.
+failed on its node failed there; the last place that is left only if tasks fail there alike. If all are in
+quarantine, the cause is hardly a machine: the run waits `_SHARE` of the time and releases all, `_ROUNDS`
+times, and fails if nothing has succeeded by then.
 """
 
 import re

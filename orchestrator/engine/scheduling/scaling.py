@@ -52,7 +52,6 @@ class Group:
         return Node(id, id, self.cpus, memory, (gpu,) * self.gpus, self.instance, self.labels)
 
     def text(self) -> str:
-        """For people."""
         gpus = f", {self.gpus} {self.accelerator or 'GPU'}" if self.gpus else ""
         memory = f", {gib(self.memory)}" if self.memory else ""
         cores = "core" if self.cpus == 1 else "cores"

@@ -42,7 +42,6 @@ class Watch:
             return self._now()
 
     def close(self) -> None:
-        """Ends the thread."""
         with self._change:
             self._closed = True
             self._change.notify_all()

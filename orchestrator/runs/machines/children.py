@@ -24,7 +24,6 @@ class Companion(Popen[str]):
     """
 
     def __init__(self, command: Sequence[str], plan: str) -> None:
-        """Starts the command."""
         self._errors = TemporaryFile()  # noqa: SIM115  # closed with this object
         super().__init__(
             command, stdin=PIPE, stdout=PIPE, stderr=self._errors, text=True, start_new_session=True

@@ -1,9 +1,8 @@
 """What has happened on each node and GPU: failures of different tasks, quarantines, whether a node leaves.
 
-A failure is the place's or the task's, and one alone does not show whose. So those of different tasks count
-against a node, and against its GPU, until something succeeds there. Where a task has failed in the same way
-at another place, whose last attempt before had succeeded, the cause is the task. What is lost with a node
-that has announced that it leaves is a failure of neither.
+Failures of different tasks count against a node, and against its GPU, until something succeeds there. Where a
+task has failed in the same way at another place, whose last attempt before had succeeded, the cause is the
+task. What is lost with a node that has announced that it leaves is a failure of neither.
 """
 
 from collections.abc import Iterable, Mapping
@@ -160,7 +159,6 @@ def _after_failure(nodes: Nodes, record: TaskFailed) -> Nodes:
 
 
 def _after_success(nodes: Nodes, id: str) -> Nodes:
-    """After a checkpoint or a result of a task."""
     here = nodes.get(id) or NodeState(id)
     after = replace(here, failures=here.failures if here.until else (), sound=True, quarantines=0)
     return nodes if after == here else {**nodes, id: after}

@@ -133,10 +133,8 @@ def oom_kills(mount: Path = _MOUNT, own: Path = _OWN, vmstat: Path = _VMSTAT) ->
 
 
 def _read(file: Path) -> str:
-    """The text of a file, "" if there is none."""
     return file.read_text().strip() if file.is_file() else ""
 
 
 def _counts(file: Path) -> dict[str, int]:
-    """The lines "name number" of a file, none if there is no file."""
     return {name: int(count) for name, count in map(str.split, _read(file).splitlines())}

@@ -56,7 +56,6 @@ class Placement:
 
     @property
     def threads(self) -> int:
-        """Threads of its process."""
         return max(1, int(self.cpus))
 
 

@@ -1,16 +1,4 @@
-"""The price list: what a machine costs per hour, by how it is known. A TOML file of the user.
-
-    currency = "USD"
-
-    [[machine]]
-    name = "g5.xlarge"              # the instance type, if no pattern is given
-    price = 1.006                   # per hour
-    spot = 0.42                     # optional: per hour, for machines that may be taken away
-
-    [[machine]]
-    name = "workstation"
-    price = 0.15                    # power
-    host = "desk-*"                 # patterns of the host name, `gpu`, `instance`, and of labels "key=value"
+"""The price list of a user, TOML: what a machine costs per hour, by how it is known (docs/money.md).
 
 The first entry that matches counts. Storage and transfer are not counted.
 """

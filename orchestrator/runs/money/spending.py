@@ -1,9 +1,8 @@
 """What a run has cost so far, and what of that was wasted: a pure function of its records.
 
-A machine costs its price from when the driver first sees it until it is gone or the driver has ended. While
-several tasks run on it, each bears an equal part; while none does, it is idle. What an attempt has done since
-its last checkpoint is lost when it ends without another. Nothing else is counted: no storage, no transfer,
-and no machine while no driver is at work.
+A machine costs its price from when the driver first sees it until it is gone or the driver has ended. Several
+tasks on it bear equal parts; while none runs, it is idle. What an attempt has done since its last checkpoint
+is lost when it ends without another. Nothing else is counted.
 """
 
 from collections.abc import Iterable

@@ -1,7 +1,7 @@
 """RUN/prepare/progress.json and RUN/prepare/STEP.json: how far the preparation is, and what its steps made.
 
-The driver writes them, anything may read them. What is read may be of another version, damaged or made to do
-harm: it is bounded, and what is not of the format counts as missing.
+What is read may be damaged or made to do harm: it is bounded, and what is not of the format counts as
+missing.
 """
 
 from collections.abc import Callable, Sequence
@@ -68,7 +68,6 @@ class StepResult(_Model):
 
 
 def progress_path(folder: RunFolder) -> Path:
-    """Where the progress is."""
     return folder.preparation / "progress.json"
 
 

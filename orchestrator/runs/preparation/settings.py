@@ -79,7 +79,6 @@ class Settings(Options):
 
 
 def settings_path(folder: RunFolder) -> Path:
-    """Where the settings are."""
     return folder.preparation / "settings.json"
 
 

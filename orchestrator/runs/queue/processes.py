@@ -14,7 +14,6 @@ class Processes:
     """Those of this machine, as /proc has them."""
 
     boot_file: Path = Path("/proc/sys/kernel/random/boot_id")
-    proc: Path = Path("/proc")
 
     def boot(self) -> str:
         """What is another one after each start of the machine. Raises OSError where /proc is missing."""
@@ -34,7 +33,7 @@ class Processes:
 
     def _stat(self, pid: int) -> list[str] | None:
         try:
-            text = (self.proc / str(pid) / "stat").read_text(errors="replace")
+            text = Path("/proc", str(pid), "stat").read_text(errors="replace")
         except (FileNotFoundError, ProcessLookupError):
             return None
         fields = text.rpartition(")")[2].split()  # a program's name may hold spaces and brackets

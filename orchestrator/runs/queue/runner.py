@@ -1,16 +1,11 @@
 """`panolog queue run`: starts the runs of a queue one after another, or side by side.
 
-Each run is the supervised command, a child of the runner, which the kernel stops when the runner ends,
-however that comes: as after Ctrl-C, with checkpoints. What was running then stays so in the database, and the
-next runner resumes it first. It begins a run only when nothing of an earlier start is left:
-
-- A child waits at a gate until its identity is in the database. If the runner is killed before, the child
-  ends at the gate, and nothing of the run has begun.
-- A process counts as that of an entry only with the same boot of the machine, number and moment of its start.
-- While a driver has the lock of the run folder, the run is alive, however it was started.
-
-Runs start strictly in order: one that waits for its share of the machine keeps those after it waiting, so
-that a large one gets its turn. One that needs more than the machine has fails, and keeps none waiting.
+Each run is the supervised command, a child of the runner, which the kernel stops when the runner ends: as
+after Ctrl-C, with checkpoints. What was running then stays so in the database, and the next runner resumes it
+first, but only when nothing of an earlier start is left. A child waits at a gate until its identity is in the
+database: boot of the machine, number, and moment of its start. While a driver has the lock of the run folder,
+the run is alive, however it was started. Runs start strictly in order: one that waits for its share of the
+machine keeps those after it waiting; one that needs more than the machine has fails.
 """
 
 import os
@@ -49,8 +44,6 @@ _Answer = TypeVar("_Answer")
 
 @dataclass(frozen=True)
 class Limits:
-    """What a runner may do."""
-
     at_once: int = 1  # runs side by side
     forever: bool = False  # wait for new entries when none is left
     program: tuple[str, ...] = PROGRAM  # that takes the words of an entry
@@ -93,16 +86,12 @@ def run_queue(queue: Queue, limits: Limits, say: Callable[[str], None]) -> int:
 
 @dataclass
 class _Live:
-    """A run that is at work."""
-
     entry: Entry
     child: subprocess.Popen[bytes] | None  # None: a runner before has started it
 
 
 @dataclass
 class _Runner:
-    """One at work."""
-
     queue: Queue
     limits: Limits
     say: Callable[[str], None]
@@ -115,7 +104,6 @@ class _Runner:
     failed: bool = False  # a run has
 
     def run(self) -> int:
-        """As the function."""
         self._written(self.queue.forget_waits)  # of a runner before
         for entry in self._written(self.queue.running):
             self.live[entry.id] = _Live(entry, None)  # until it is seen that it is not
@@ -229,7 +217,6 @@ class _Runner:
         )
 
     def _end_ended(self) -> None:
-        """Takes note of the runs that have ended, and of those that must be started anew."""
         for id, live in list(self.live.items()):
             code = live.child.poll() if live.child is not None else None
             ended = code is not None if live.child is not None else not self._alive(live.entry)

@@ -27,8 +27,6 @@ class NeverFitsError(Exception):
 
 @dataclass(frozen=True)
 class Capacity:
-    """All that there is to share."""
-
     gpus: tuple[str, ...]  # as CUDA_VISIBLE_DEVICES calls them; () if none are known
     cores: tuple[int, ...]
     memory: int  # bytes

@@ -1,8 +1,7 @@
 """QUEUE/queue.db: the entries of a queue in SQLite, which several commands may use at once.
 
-The journal is a WAL, so that `list` and the dashboard never wait for a command that writes: the folder
-must be on a disk of this machine, since a WAL does not work on network file systems. Every change is one
-transaction that checks the state that it relies on.
+The journal is a WAL, so that `list` and the dashboard never wait for a command that writes: the folder must
+be on a disk of this machine. Every change is one transaction that checks the state that it relies on.
 """
 
 import json
@@ -103,7 +102,6 @@ class Queue:
         return int(self._connection.execute("PRAGMA user_version").fetchone()[0])
 
     def close(self) -> None:
-        """Lets go of the files."""
         self._connection.close()
 
     def add(self, command: Command) -> int:

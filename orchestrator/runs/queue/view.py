@@ -19,15 +19,12 @@ _LEFT = "interrupted"  # how a running entry is shown while no runner is at work
 
 @dataclass(frozen=True)
 class QueueView:
-    """A queue at one moment."""
-
     folder: Path
     runner: bool  # one is at work
     entries: tuple[Entry, ...]
     alive: frozenset[int]  # running entries of which a process is alive
 
     def label(self, entry: Entry) -> str:
-        """The state of an entry for people."""
         left = entry.state == State.RUNNING and not self.runner and entry.id not in self.alive
         return _LEFT if left else str(entry.state)
 
@@ -36,7 +33,6 @@ class QueueView:
         return entry.reason if self.runner or not _open(entry) else ""
 
     def as_json(self) -> dict[str, Any]:
-        """All of it."""
         return {
             "queue": str(self.folder),
             "runner": self.runner,
@@ -64,7 +60,6 @@ class QueueView:
         }
 
     def lines(self) -> Iterator[str]:
-        """All of it for people."""
         rows = [(str(entry.id), self.label(entry), str(entry.command.run)) for entry in self.entries]
         width = max((len(id) for id, _, _ in rows), default=0)
         for (id, label, run), entry in zip(rows, self.entries, strict=True):

@@ -38,7 +38,6 @@ class Cleaned:
         return any(run.failed for run in self.runs)
 
     def as_json(self) -> dict[str, Any]:
-        """All of it."""
         return {
             "dry_run": self.dry,
             "bytes": self._total,
@@ -55,7 +54,6 @@ class Cleaned:
         }
 
     def lines(self) -> Iterator[str]:
-        """All of it for people."""
         for run in self.runs:
             kinds = ", ".join(f"{kind} {gib(size)}" for kind, size in run.sizes.items())
             yield f"{run.root}: " + (

@@ -1,9 +1,8 @@
 """What can be removed of a run folder, by kind, with its bytes. Reads only.
 
-Always what is superseded: leftovers of killed writers, checkpoints of tasks that are done, earlier
-checkpoints beyond those to keep, and shards of a run that is done. On request also the models of the parts of
-a run that is done, whose Gaussians the merged model has. The last checkpoint of a task that is not done, the
-Stage I model and all results stay.
+Leftovers of killed writers, checkpoints of tasks that are done or beyond those to keep, shards of a run that
+is done; on request also the models of its parts, whose Gaussians the merged model has. The last checkpoint of
+a task that is not done, the Stage I model and all results stay.
 """
 
 import os
@@ -57,8 +56,6 @@ class Removal:
 
 @dataclass(frozen=True)
 class Survey:
-    """What may be removed of one run."""
-
     root: Path | StoreUrl
     removals: tuple[Removal, ...] = ()
     skipped: str = ""  # why the run is left as it is

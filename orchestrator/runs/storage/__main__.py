@@ -32,7 +32,6 @@ _PATIENCE_S = 30.0  # of one request: the mirror itself tries again
 
 
 def main() -> None:
-    """Runs the process."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     line = sys.stdin.readline()
@@ -79,7 +78,6 @@ def _begun(plan: MirrorPlan) -> tuple[Store, Lease, Manifest | None]:
 def _follow(
     plan: MirrorPlan, mirror: Mirror, lease: Lease, ended: threading.Event, stop: threading.Event
 ) -> None:
-    """Mirrors the run, and says what is left."""
     folder = RunFolder(plan.root)
     mirror.follow(ended, stop, plan.period, plan.patience)
     with suppress(StoreError, StoreLostError):

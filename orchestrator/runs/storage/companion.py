@@ -44,8 +44,6 @@ def mirrored(plan: MirrorPlan | None, say: Say) -> Iterator[None]:
 
 
 class _Keeper:
-    """Keeps the process of a mirror alive."""
-
     def __init__(self, plan: MirrorPlan, say: Say) -> None:
         self._plan, self._say = plan, say
         self._left = ""

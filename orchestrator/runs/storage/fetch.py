@@ -107,14 +107,8 @@ def for_report(name: str) -> bool:
 
 def for_export(name: str) -> bool:
     """Which files an export of the model needs."""
-    path = PurePosixPath(name)
-    return path.suffix != ".safetensors" and path.parts[0] not in (
-        "web",
-        "scene",
-        "blocks",
-        "round",
-        "repair",
-    )
+    path, others = PurePosixPath(name), ("web", "scene", "blocks", "round", "repair")
+    return path.suffix != ".safetensors" and path.parts[0] not in others
 
 
 def _fetch_one(store: Store, path: Path, entry: StoredFile) -> None:
@@ -132,7 +126,6 @@ def _fetch_one(store: Store, path: Path, entry: StoredFile) -> None:
 
 
 def _set_aside(folder: RunFolder, say: Say) -> None:
-    """Renames a folder whose run another machine has continued."""
     moment = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
     aside = folder.root.with_name(f"{folder.root.name}.before-{moment}")
     folder.root.rename(aside)

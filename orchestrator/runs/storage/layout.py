@@ -41,8 +41,6 @@ _WORK = (*_MADE, "prepare", "follower", DATABASE)  # what a run needs only to be
 
 @dataclass(frozen=True)
 class StoredFile:
-    """One file of a run."""
-
     key: str  # of its object, below the URL
     size: int  # bytes
     sha256: str
@@ -65,7 +63,6 @@ class Manifest:
         return 0.0
 
     def pack(self) -> bytes:
-        """The content of its object."""
         files = {name: asdict(entry) for name, entry in sorted(self.files.items())}
         return zlib.compress(json.dumps({"format": 1, "files": files}).encode())
 

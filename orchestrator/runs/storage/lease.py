@@ -1,8 +1,7 @@
 """Who writes a run in a store: one driver at a time, by a lease with an owner and a time.
 
-Leases are numbered; a new one is an object that must not exist yet, so of two that want the same number one
-gets it. That of the highest number counts. A lease is written again while its owner works, and expires when
-it has not been for `EXPIRES_S`, by the clocks of the machines: these must agree to some seconds.
+Leases are numbered; a new one is an object that must not exist yet. That of the highest number counts. It is
+written again while its owner works, and expires after `EXPIRES_S`, by clocks that must agree to some seconds.
 """
 
 import json
@@ -82,8 +81,6 @@ def _machine() -> str:
 
 @dataclass(frozen=True)
 class _Owner:
-    """Who holds a lease."""
-
     folder: str  # stands for the run's folder on its machine
     machine: str = field(default_factory=_machine)
     token: str = field(default_factory=lambda: secrets.token_hex(8))

@@ -1,9 +1,8 @@
 """The mirror of a run: copies what the driver makes into a store, so that the store is whole at any moment.
 
-A round first stores the files that have changed, then takes a snapshot of run.db, stores the files that have
-changed meanwhile, and the snapshot; then the manifest, and at last the pointer. The driver writes a file
-before the record that names it, so whatever the snapshot names is in the store before the snapshot counts.
-Nothing that a round replaces is removed: `panolog clean URL` does that.
+A round stores the files that have changed, takes a snapshot of run.db, stores what has changed meanwhile and
+the snapshot; then the manifest, and at last the pointer. The driver writes a file before the record that
+names it, so whatever the snapshot names is in the store before it counts. Nothing is removed.
 """
 
 import os
@@ -68,7 +67,6 @@ class Mirror:
 
     @property
     def state(self) -> MirrorState:
-        """How far it is."""
         return self._state
 
     def follow(self, ended: threading.Event, stop: threading.Event, period: float, patience: float) -> None:
@@ -184,7 +182,6 @@ class Mirror:
         return {name: self._stored[name][1] for name in present if name in self._stored}
 
     def _send_one(self, name: str, stamp: Stamp) -> None:
-        """Stores one file, unless the store has the same bytes."""
         held = self._folder.mirror.with_name(f"{secrets.token_hex(4)}.part")
         try:
             if not self._hold(self._folder.root / name, held):
@@ -221,7 +218,6 @@ class Mirror:
         return entry
 
     def _snapshot(self) -> Path:
-        """A copy of run.db as it is after some commit."""
         copy = self._folder.mirror.with_name(f"{secrets.token_hex(4)}.db.part")
         copy.parent.mkdir(exist_ok=True)
         with reading(self._folder.database) as source, closing(sqlite3.connect(copy)) as target:
@@ -229,7 +225,6 @@ class Mirror:
         return copy
 
     def _publish(self, files: dict[str, StoredFile], moment: float) -> None:
-        """Makes these files the run, for all who read the store."""
         if files == self._files:
             return
         self._lease.require()

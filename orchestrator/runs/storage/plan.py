@@ -70,12 +70,10 @@ def local_folder(url: str, environment: Mapping[str, str]) -> Path:
 
 
 def to_json(plan: MirrorPlan) -> str:
-    """A plan in one line."""
     return json.dumps({**vars(plan), "root": str(plan.root)})
 
 
 def plan_from_json(text: str) -> MirrorPlan:
-    """The plan of a line of `to_json`."""
     content = json.loads(text)
     return MirrorPlan(**content | {"root": Path(content["root"])})
 

@@ -1,13 +1,13 @@
 """RUN/store/state.json: how far a run in an object store has been copied out, for all that show it."""
 
 import json
-import os
 import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from panolog.orchestrator.runs.folder import read_object
 from panolog.orchestrator.runs.units import duration, gib
 from panolog.scene.files import write_bytes
 
@@ -32,7 +32,6 @@ class MirrorState:
 
     @property
     def line(self) -> str:
-        """It in one line, for people."""
         if self.complete:
             return f"all of the run is in {self.url}"
         left = f"{self.pending_files:,} files ({gib(self.pending_bytes)}) to go" if self.pending_files else ""
@@ -69,14 +68,12 @@ def read_state(path: Path, *, running: bool = False) -> MirrorState | None:
 
     Args: running, whether a driver is at work: then a mirror that is silent is a problem.
     """
+    content = read_object(path, _MOST)
+    kinds = {name: str(field.type) for name, field in MirrorState.__dataclass_fields__.items()}
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-        with os.fdopen(handle, "rb") as file:
-            content: Any = json.loads(file.read(_MOST))
-        kinds = {name: field.type for name, field in MirrorState.__dataclass_fields__.items()}
-        given = {name: _plain(content[name], str(kinds[name])) for name in kinds if name in content}
+        given = {name: _plain(content[name], kind) for name, kind in kinds.items() if name in content}
         state = MirrorState(**given)
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+    except (ValueError, TypeError, OverflowError):  # the URL is missing, or a value is of another type
         return None
     if running and not state.complete and time.time() - state.time > _SILENT_S:
         return MirrorState(**(asdict(state) | {"problem": "the mirror has ended; resume the run"}))

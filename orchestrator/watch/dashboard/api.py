@@ -60,10 +60,11 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import Response, StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from panolog.orchestrator.watch.dashboard import maps, pictures, stream
 from panolog.orchestrator.watch.dashboard.dependencies import (
+    Body,
     ComparedRuns,
     Registry,
     Run,
@@ -99,20 +100,16 @@ router = APIRouter()
 _EventId = Annotated[int, Field(ge=0, lt=2**63)]
 
 
-class ActionRequest(BaseModel):
+class ActionRequest(Body):
     """The body of a POST to /actions."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
 
     action: Literal["stop", "resume", "retry", "pause", "unpause", "release"]
     block: int | None = None
     node: Annotated[str, Field(max_length=255)] | None = None
 
 
-class QueueRequest(BaseModel):
+class QueueRequest(Body):
     """The body of a POST to /queue."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
 
     action: QueueAction
     entry: Annotated[int, Field(ge=1, lt=2**63)]

@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, HTTPException, Query, Request
 from fastapi.responses import Response
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from panolog.orchestrator.watch.dashboard.discovery import read_below
 from panolog.orchestrator.watch.dashboard.registry import RunRegistry, Topic
@@ -21,7 +21,15 @@ _BODY = 4_096  # bytes of a POST at most
 _BODY_TIMEOUT_S = 10.0
 _RunId = Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
 _RunIds = Annotated[list[_RunId], Query(min_length=2, max_length=MOST)]
-_Body = TypeVar("_Body", bound=BaseModel)
+
+
+class Body(BaseModel):
+    """The body of a POST."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+_Body = TypeVar("_Body", bound=Body)
 
 
 def registry_of(request: Request) -> RunRegistry:

@@ -31,12 +31,19 @@ class Courier(threading.Thread):
         self.label = f"notify {target.label}"
         self.problem = ""  # why something was not delivered; one line
         self._target, self._board, self._path, self._deliver = target, board, path, deliver
-        self._ledger: Ledger | None = None
         self._over: set[str] = set()  # ids that are delivered, or never will be
 
     def run(self) -> None:
         """Works until the run has ended and all is delivered, or no time is left."""
         news = self._board.news
+        while not news.run:
+            if news.ended:
+                return
+            news = self._board.wait(60.0, news)
+        self._ledger = Ledger(self._path, news.run)
+        if self._ledger.new:  # what was before is no news to this target
+            self._note(since=news.began - 1)
+        self._over = set(self._ledger.get("delivered", [])) | set(self._ledger.get("abandoned", {}))
         while True:
             due = self._due(news)
             if news.ended and (not due or self._board.left <= 0):
@@ -46,13 +53,6 @@ class Courier(threading.Thread):
             news = self._board.wait(60.0, news) if not news.ended else self._board.news
 
     def _due(self, news: News) -> list[Notification]:
-        if not news.run:
-            return []
-        if self._ledger is None:
-            self._ledger = Ledger(self._path, news.run)
-            if self._ledger.new:  # what was before is no news to this target
-                self._note(since=news.began - 1)
-            self._over = set(self._ledger.get("delivered", [])) | set(self._ledger.get("abandoned", {}))
         since = self._ledger.get("since", 0)
         due = [it for it in news.notifications if it.record > since and it.id not in self._over]
         room = _MOST - len(self._over)
@@ -66,7 +66,7 @@ class Courier(threading.Thread):
             refusal = self._deliver(self._target, notification)
             if refusal is None:
                 self._over.add(notification.id)
-                self._note(delivered=[*self._kept("delivered"), notification.id])
+                self._note(delivered=[*self._ledger.get("delivered", []), notification.id])
                 return True
             problem = f"{refusal.reason}; not delivered: {notification.kind}"
             if refusal.final:
@@ -76,17 +76,10 @@ class Courier(threading.Thread):
                 return False
         self.problem = problem
         self._over.add(notification.id)
-        assert self._ledger is not None  # `_due` comes first
         self._note(abandoned=self._ledger.get("abandoned", {}) | {notification.id: self.problem})
         return True
 
-    def _kept(self, name: str) -> list[str]:
-        assert self._ledger is not None  # `_due` comes first
-        known: list[str] = self._ledger.get(name, [])
-        return known
-
     def _note(self, **values: object) -> None:
         """A full disk costs the memory of what was delivered, not the delivery."""
-        assert self._ledger is not None  # `_due` comes first
         with suppress(OSError):
             self._ledger.keep(**values)

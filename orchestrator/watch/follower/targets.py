@@ -33,13 +33,6 @@ class Target:
     user: str = field(default="", repr=False)  # of the mail server
     secret: str = field(default="", repr=False)  # signs a webhook; token of ntfy; password of the mail server
 
-    @property
-    def secrets(self) -> tuple[str, ...]:
-        """What must not be shown anywhere."""
-        parts = urlsplit(self.url)
-        whole = (self.url, f"{parts.path}?{parts.query}" if parts.query else parts.path, self.secret)
-        return tuple(text for text in whole if len(text) > 1)
-
 
 def read_targets(given: Sequence[str], references: References) -> tuple[Target, ...]:
     """The targets of a command line, as TARGETs of `--notify`, and those of PANOLOG_NOTIFY.

@@ -206,30 +206,20 @@ def _labels(view: MapWindow, *, planned: bool) -> dict[str, Any]:
     }
 
 
-def _layout() -> dict[str, Any]:
-    return {
-        "paper_bgcolor": "rgba(0,0,0,0)",
-        "plot_bgcolor": "rgba(0,0,0,0)",
-        "font": {"family": _FONT, "size": 12, "color": "#5a6472"},
-        "autosize": True,
-    }
-
-
-def _axis() -> dict[str, Any]:
-    return {"gridcolor": _GRID, "linecolor": _GRID, "zeroline": False, "ticks": "", "automargin": True}
-
-
 def _map_layout(view: MapWindow) -> dict[str, Any]:
     """Axes of equal scale, which end with the window."""
     across, up, _ = view.axes
     axes = []
     for i, axis in enumerate((across, up)):
         low, high = float(view.lower[i]), float(view.upper[i])
+        line = {"gridcolor": _GRID, "linecolor": _GRID, "zeroline": False, "ticks": "", "automargin": True}
         title = {"text": f"{'xyz'[axis]} (world units)", "standoff": 8}
-        axes.append(
-            _axis() | {"title": title, "showgrid": False, "range": [low, high], "constrain": "domain"}
-        )
-    return _layout() | {
+        axes.append(line | {"title": title, "showgrid": False, "range": [low, high], "constrain": "domain"})
+    return {
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "font": {"family": _FONT, "size": 12, "color": "#5a6472"},
+        "autosize": True,
         "margin": {"l": 14, "r": 20, "t": 4, "b": 4},
         "xaxis": axes[0],
         "yaxis": axes[1] | {"scaleanchor": "x", "scaleratio": 1},

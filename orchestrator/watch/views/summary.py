@@ -173,10 +173,6 @@ class Summary(SummaryHead):
     tasks: tuple[TaskView, ...]
     blocks: tuple[BlockView, ...]
 
-    def task(self, name: str) -> TaskView | None:
-        """The task of a name; None if nothing is known of it."""
-        return next((task for task in self.tasks if task.name == name), None)
-
 
 def summarize(
     state: RunState,

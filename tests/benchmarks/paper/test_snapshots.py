@@ -5,22 +5,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import panolog
-from benchmarks.paper.measure import Gallery, haze
+from benchmarks.paper.measure import haze
 from benchmarks.paper.snapshots import State, _assembled
-from panolog.orchestrator.runs.config import RunConfig
 from panolog.partition.cells import Grid
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import write_ply
-from panolog.scene.read import read_scene
 from panolog.workers.events import Checkpoint
 from panolog.workers.merge import retained
 from panolog.workers.tasks import TaskId
 from panolog.workers.training.checkpoint import save
-from panolog.workers.training.initialise import isotropic, near_distance
+from panolog.workers.training.initialise import isotropic
 from panolog.workers.training.optimizer import ModelState
 from tests.partition.test_plan import CENTERS, planned
-from tests.scenes import write_scene
 
 
 def gaussians(count: int, sky: int, opacity: float = 0.5, seed: int = 0) -> Gaussians:
@@ -58,10 +54,3 @@ def test_haze_is_the_share_that_hardly_shows() -> None:
     clear, veil = gaussians(30, 0), gaussians(10, 0, opacity=0.01)
     assert haze(concatenate(clear, veil)) == 0.25
     assert haze(gaussians(4, 4)) is None
-
-
-def test_states_are_measured_as_the_whole_run_is(tmp_path: Path) -> None:
-    scene, model = read_scene(write_scene(tmp_path / "scene")), gaussians(50, 0)
-    found = Gallery(scene, 64, near_distance(scene, RunConfig())).quality(model)
-    whole = panolog.evaluate(model, scene, width=64)["mean"]
-    assert all(found[name] == whole[name] for name in ("psnr", "ssim", "ws_psnr", "ws_ssim"))

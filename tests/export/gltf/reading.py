@@ -9,9 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-COMPONENTS: dict[int, type[np.generic]] = {5121: np.uint8, 5126: np.float32}
-SHAPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-
 
 @dataclass(frozen=True)
 class Glb:
@@ -38,12 +35,6 @@ class Glb:
         view = self.document["bufferViews"][index]
         start = view.get("byteOffset", 0)
         return self.buffer[start : start + view["byteLength"]]
-
-    def attribute(self, name: str) -> NDArray[Any]:
-        """(N, components) of an attribute."""
-        accessor = self.document["accessors"][self.primitive["attributes"][name]]
-        values = np.frombuffer(self.view(accessor["bufferView"]), COMPONENTS[accessor["componentType"]])
-        return values.reshape(accessor["count"], SHAPES[accessor["type"]])
 
 
 def read_glb(path: Path) -> Glb:

@@ -1,6 +1,7 @@
 """Viewers of others show what is exported upright: SuperSplat's, which has PlayCanvas's engine, and Spark."""
 
 import shutil
+from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 
@@ -114,15 +115,16 @@ def test_supersplat_shows_a_site_at_its_start(tmp_path: Path) -> None:
     seen_upright(supersplat(tmp_path, "model.sog"))
 
 
-@pytest.mark.parametrize("kind", ["sog", "ply", "compressed-ply"])
-def test_supersplat_shows_files_upright(tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize(
+    ("viewer", "kind"),
+    [
+        *((supersplat, kind) for kind in ("sog", "ply", "compressed-ply")),
+        *((spark, kind) for kind in ("sog", "ply", "spz")),
+    ],
+)
+def test_files_are_shown_upright(
+    tmp_path: Path, viewer: Callable[[Path, str], NDArray[np.float64]], kind: str
+) -> None:
     site(tmp_path / "site")
     exported(tmp_path / "site")
-    seen_upright(supersplat(tmp_path, FILES[kind]))
-
-
-@pytest.mark.parametrize("kind", ["sog", "ply", "spz"])
-def test_spark_shows_files_upright(tmp_path: Path, kind: str) -> None:
-    site(tmp_path / "site")
-    exported(tmp_path / "site")
-    seen_upright(spark(tmp_path, FILES[kind]))
+    seen_upright(viewer(tmp_path, FILES[kind]))

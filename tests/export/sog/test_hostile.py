@@ -5,7 +5,6 @@ import json
 import struct
 import tracemalloc
 import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -44,7 +43,6 @@ def changed_meta(whole: Path, folder: Path, change: Change) -> Path:
     ("change", "line"),
     [
         (lambda meta: meta.update(version=3), "is of version 3"),
-        (lambda meta: meta.update(count=1.5), "no whole number from 1"),
         (lambda meta: meta.update(count=10**9), "no whole number from 1"),
         (lambda meta: meta.update(count=30_000_000), "30,000,000 Gaussians cannot be in"),
         (lambda meta: meta.update(count=1000), "pixels for 1,000 Gaussians"),
@@ -62,9 +60,7 @@ def changed_meta(whole: Path, folder: Path, change: Change) -> Path:
         (lambda meta: meta["quats"].update(files=["sh0.webp"]), "quaternions have a reserved form"),
         (lambda meta: meta["shN"].update(count=3), "of a palette of 3"),
         (lambda meta: meta["shN"].update(count=65_537), r"as shN\.count"),
-        (lambda meta: meta["shN"].update(bands=4), r"as shN\.bands"),
         (lambda meta: meta.pop("sh0"), "has no sh0"),
-        (lambda meta: meta.update(scales=[]), "has no scales"),
     ],
 )
 def test_wrong_meta(whole: Path, tmp_path: Path, change: Change, line: str) -> None:
@@ -153,22 +149,6 @@ def test_image_bombs(whole: Path, tmp_path: Path) -> None:
     (folder / "means_u.webp").write_bytes(flat.getvalue())
     line, bytes_taken = peak(folder)
     assert "no WebP or PNG of up to" in line and bytes_taken < 2**24
-    # A PNG of which the header is small and the pixels are not; and one that is as large as it may be.
-    (folder / "means_u.webp").write_bytes(png(60_000, 60_000))
-    assert "no WebP or PNG of up to" in line_of(folder)
-    (folder / "means_u.webp").write_bytes(png(20, 20))
-    assert line_of(folder)
-
-
-def png(width: int, height: int) -> bytes:
-    """A PNG whose pixels are missing."""
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    chunks = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + chunks
 
 
 def test_png_is_read(whole: Path, tmp_path: Path) -> None:

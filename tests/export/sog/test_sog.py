@@ -1,6 +1,5 @@
 """SOG: what is written is read again, within the steps of its numbers, and with the same bytes each time."""
 
-import io
 import json
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -96,15 +95,6 @@ def test_folder_and_file_hold_the_same(tmp_path: Path) -> None:
         assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
     for path in (tmp_path / "folder", tmp_path / "folder/meta.json"):
         np.testing.assert_array_equal(read_sog(path).means, read_sog(tmp_path / "a.sog").means)
-
-
-def test_order_is_kept_on_request() -> None:
-    model = splats(900, 1)
-    with ThreadPoolExecutor(1) as pool:
-        files = encode(InMemory(model), pool, sort=False)
-    pixels = np.asarray(Image.open(io.BytesIO(files["sh0.webp"]))).reshape(-1, 4)[:900, 3]
-    alpha = 255 / (1 + np.exp(-model.opacities.astype(np.float64)))
-    assert np.abs(pixels - alpha).max() <= 0.501
 
 
 def test_bytes_do_not_depend_on_threads_or_pieces() -> None:

@@ -7,13 +7,11 @@ from typing import Any
 from typer.testing import CliRunner, Result
 
 from panolog.orchestrator.cli import app
-from panolog.orchestrator.runs.config import RunConfig
-from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.scene.ply import write_ply
 from panolog.scene.read import read_scene
 from panolog.workers.tasks import COARSE
 from panolog.workers.training.initialise import scene_gaussians
+from tests.orchestrator.history import begun
 from tests.orchestrator.messages import without_progress
 
 STEPS = (  # of a preflight
@@ -23,7 +21,6 @@ STEPS = (  # of a preflight
     "measuring exposures",
     "calibrating",
 )
-GONE = SceneRef(path="/gone", fingerprint="f")
 
 
 def call(*arguments: object) -> Result:
@@ -48,18 +45,10 @@ def shown(*arguments: object) -> Any:
     return json.loads(result.stdout)
 
 
-def begun(root: Path, scene: SceneRef = GONE) -> RunFolder:
-    """A run folder with its settings, of a scene that is gone."""
-    folder = RunFolder(root)
-    folder.root.mkdir()
-    write_info(folder, make_info(scene, RunConfig(width=64)))
-    return folder
-
-
 def finished(root: Path, scene: Path, fingerprint: str | None = None) -> Path:
     """A run folder with both models. Args: fingerprint, another than that of the scene."""
     read = read_scene(scene)
-    folder = begun(root, SceneRef(path=str(scene), fingerprint=fingerprint or read.fingerprint))
+    folder = begun(root, scene=scene, fingerprint=fingerprint or read.fingerprint)
     folder.of(COARSE).mkdir(parents=True)
     for path in (folder.model(COARSE), folder.point_cloud):
         write_ply(path, scene_gaussians(read))

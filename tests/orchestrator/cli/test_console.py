@@ -64,14 +64,11 @@ def test_quick_work_prints_nothing(lines: tuple[list[str], Event]) -> None:
 
 
 def test_a_terminal_shows_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = Console(file=StringIO(), force_terminal=True, width=80)
+    terminal = Console(file=(output := StringIO()), force_terminal=True, width=80)
     monkeypatch.setattr(console, "err", lambda: terminal)
     with console.progress_bar("reading the scene") as show:
         show("masks", 3, 1_200)
-    output = terminal.file
-    assert isinstance(output, StringIO)
-    assert "reading the scene" in output.getvalue()
-    assert "3 of 1,200" in output.getvalue()
+    assert "reading the scene" in output.getvalue() and "3 of 1,200" in output.getvalue()
 
 
 def commands() -> Iterator[list[str]]:
@@ -106,15 +103,13 @@ def test_the_reason_of_a_failed_run_is_printed_once(terminal: bool, tmp_path: Pa
     ]
     with closing(Database(tmp_path / "run.db")) as database:
         stored = database.append(records)
-    shown = Console(file=StringIO(), force_terminal=terminal, width=120)
     (tmp_path / "run.json").write_text("{}")
-    with progress(shown, tmp_path) as show:
+    shown, status = StringIO(), StringIO()
+    with progress(Console(file=shown, force_terminal=terminal, width=120), tmp_path) as show:
         show(replay(stored), stored)
-    status = Console(file=StringIO(), width=120)
-    status.print(page(replay(stored), root=tmp_path, running=False, wide=True))
-    for display, times in ((shown, 0), (status, 1)):
-        assert isinstance(display.file, StringIO)
-        assert display.file.getvalue().count("no memory") == times
+    found = page(replay(stored), root=tmp_path, running=False, wide=True)
+    Console(file=status, width=120).print(found)
+    assert [output.getvalue().count("no memory") for output in (shown, status)] == [0, 1]
 
 
 def full() -> TextIO:

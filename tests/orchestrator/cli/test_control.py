@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from threading import Event, Thread
 
@@ -12,21 +11,18 @@ from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs.control import Action, ControlRequest
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.presence import Presence
-from panolog.orchestrator.runs.records import BlockPlan, NodeQuarantined, PlanSaved, RunBegan, TaskFailed
-from panolog.orchestrator.runs.store import Database
+from panolog.orchestrator.runs.records import BlockPlan, NodeQuarantined, PlanSaved, TaskFailed
 from panolog.workers.tasks import TaskId
-from tests.orchestrator.cli.program import begun, call, one_line, shown
+from tests.orchestrator.cli.program import call, one_line, shown
+from tests.orchestrator.history import BEGAN, append, begun
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
     """A run with two blocks, of which the second has failed."""
-    folder = begun(tmp_path / "run")
-    blocks = tuple(BlockPlan(block, 4, 100, train=True) for block in (0, 1))
-    with closing(Database(folder.database)) as database:
-        database.append([RunBegan("host", 1, resumed=False), PlanSaved("plan.json", blocks)])
-        database.append([TaskFailed(TaskId.block(1), 3, "NaN", final=True)])
-    return folder
+    plan = PlanSaved("plan.json", tuple(BlockPlan(block, 4, 100, train=True) for block in (0, 1)))
+    failed = TaskFailed(TaskId.block(1), 3, "NaN", final=True)
+    return begun(tmp_path / "run", BEGAN, plan, failed)
 
 
 @pytest.fixture
@@ -66,8 +62,7 @@ def test_what_makes_no_sense_is_one_line(driven: RunFolder) -> None:
 def test_a_machine_in_quarantine_is_shown_and_released(driven: RunFolder) -> None:
     until = time.time() + 228.5 * 3_600
     bad = NodeQuarantined("3f2a81c4d5", "gpu-07", "3 tasks have failed there in a row", until)
-    with closing(Database(driven.database)) as database:
-        database.append([bad])
+    append(driven, bad)
     text = call("status", driven.root).stdout
     assert "gpu-07 (3f2a81c4): in quarantine for another 228:" in " ".join(text.split())
     assert f"panolog release {driven.root} gpu-07" in text

@@ -6,8 +6,11 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from panolog.orchestrator.runs.info import SceneRef
-from tests.orchestrator.cli.program import begun, call, one_line
+from panolog.orchestrator.cli.commands.demo import SETTINGS
+from panolog.orchestrator.runs.config import load_config
+from panolog.workers.training.schedule import Schedule
+from tests.orchestrator.cli.program import call, one_line
+from tests.orchestrator.history import begun
 
 
 class Demo(NamedTuple):
@@ -39,7 +42,7 @@ def test_where_a_demo_cannot_go(demo: Demo, tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").touch()
     assert "is not empty" in one_line(call("demo", "-o", "."))
     assert "cannot be written next to it" in one_line(call("demo", "-o", "/"))
-    begun(tmp_path / "run", SceneRef(path=str(tmp_path / "run-town"), fingerprint="f"))
+    begun(tmp_path / "run", scene=tmp_path / "run-town")
     for options in (("--flight",), ("--city", "9")):
         assert "a run of another scene" in one_line(call("demo", *options, "-o", tmp_path / "run"))
     assert call("demo", "--city", "1").exit_code == 2
@@ -69,3 +72,16 @@ def test_each_place_is_made_next_to_its_run(demo: Demo, tmp_path: Path) -> None:
 
 
 SCENES = ("flight-district", "city-city-300", "city-city-20-flight")
+
+
+@pytest.mark.parametrize("refine", [False, True])
+def test_the_demo_goes_through_what_the_paper_describes(refine: bool) -> None:
+    """Growth of harmonics, densification before and after an opacity reset (app. D), and a quiet end."""
+    config = load_config(flags=SETTINGS)
+    schedule = Schedule(config, config.iterations, 1.0, refine)
+    every = range(1, config.iterations + 1)
+    (reset,) = [i for i in every if schedule.resets(i)]
+    densified = [i for i in every if schedule.densifies(i)]
+    assert densified[0] < reset < densified[-1] < 0.7 * config.iterations
+    degrees = {schedule.sh_degree(i) for i in every}
+    assert degrees == ({3} if refine else {0, 1, 2, 3})

@@ -13,14 +13,14 @@ from typer.testing import Result
 
 from panolog.export.reading import read_model
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.info import SceneRef
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import read_ply, write_ply
 from panolog.scene.read import read_scene
 from panolog.scene.write import Offset, Origin, write_offset
 from panolog.workers.training.initialise import scene_gaussians
-from tests.orchestrator.cli.program import begun, one_line, shown
 from tests.orchestrator.cli.program import call as panolog
+from tests.orchestrator.cli.program import one_line, shown
+from tests.orchestrator.history import begun
 from tests.scenes import write_scene
 
 MODELS = ("sog", "spz", "compressed-ply", "ply")
@@ -59,7 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     folder = tmp_path_factory.mktemp("place")
     root = write_scene(folder / "scene", points=300)
     write_offset(root, Offset(offset=(1, 2, 3), frame="ENU", origin=PLACE))
-    found = begun(folder / "place", SceneRef(path=str(root), fingerprint=read_scene(root).fingerprint))
+    found = begun(folder / "place", scene=root, fingerprint=read_scene(root).fingerprint)
     write_ply(found.point_cloud, model(root))
     return found
 
@@ -77,16 +77,9 @@ def test_all_formats_at_once(run: RunFolder, tmp_path: Path) -> None:
     kinds = ("sog", "web", "spz", "compressed-ply", "ply", "glb", "3dtiles", "sky-image")
     content = shown("export", run.root, "-o", out, *(f"--{kind}" for kind in kinds))
     files = {Path(file["path"]).name: file["bytes"] for file in content["files"]}
-    models = {
-        "place.sog",
-        "web",
-        "place.spz",
-        "place-sky.spz",
-        "place.compressed.ply",
-        "place.ply",
-        "place.glb",
-    }
-    assert set(files) == models | {"3dtiles", "sky.jpg", "sky.exr", "georef.json"}
+    models = {f"place.{ending}" for ending in ("sog", "spz", "compressed.ply", "ply", "glb")}
+    folders = {"web", "3dtiles"}
+    assert set(files) == models | folders | {"place-sky.spz", "sky.jpg", "sky.exr", "georef.json"}
     assert {path.name for path in out.iterdir()} == set(files)
     assert all(size > 0 for size in files.values())
     place = json.loads((out / "georef.json").read_bytes())
@@ -129,38 +122,31 @@ def test_evaluation_of_an_exported_file(run: RunFolder, tmp_path: Path) -> None:
     assert found["bytes"] == file.stat().st_size
 
 
-def test_choices(run: RunFolder, tmp_path: Path) -> None:
-    whole = read_ply(run.point_cloud)
+@pytest.mark.parametrize("kind", ["spz", "ply"])
+def test_choices(run: RunFolder, tmp_path: Path, kind: str) -> None:
+    whole, file = read_ply(run.point_cloud), tmp_path / f"model.{kind}"
     scene = len(whole) - whole.sky
-    file = tmp_path / "model.spz"
-
-    def exported(*options: object) -> int:
+    x = float(whole.means[:scene, 0].median())
+    crop = ("--crop", f"{x},-1e9,-1e9,1e9,1e9,1e9")
+    for options, count in (((), scene), (crop, int((whole.means[:scene, 0] >= x).sum()))):
         export(run.point_cloud, "-o", file, "--without-sky", *options)
         assert not (tmp_path / "model-sky.spz").exists()
-        return len(read_model(file))
-
-    assert exported() == scene
-    x = float(whole.means[:scene, 0].median())
-    assert exported("--crop", f"{x},-1e9,-1e9,1e9,1e9,1e9") == int((whole.means[:scene, 0] >= x).sum())
-    assert exported("--sh", 0) == scene
-    assert read_model(file).degree == 0
-    assert panolog("export", run.point_cloud, "-o", file, "--min-opacity", 0.95).exit_code == 2
+        assert len(read_model(file) if kind == "spz" else read_ply(file)) == count
+    export(run.point_cloud, "-o", file, "--without-sky", "--sh", 0)
+    assert kind == "ply" or read_model(file).degree == 0
+    nothing = ("--without-sky", "--min-opacity", 0.95)
+    assert panolog("export", run.point_cloud, "-o", file, *nothing).exit_code == 2
 
 
 def test_choices_of_a_plain_ply(run: RunFolder, tmp_path: Path) -> None:
     """Its sky is its last rows, and what has a lower degree has fewer columns."""
     whole, file = read_ply(run.point_cloud), tmp_path / "model.ply"
-    scene = len(whole) - whole.sky
     export(run.root, "-o", file, "--sh", 1)
     assert file.stat().st_size < run.point_cloud.stat().st_size / 2
     found = read_ply(file)
     assert (len(found), found.sky) == (len(whole), whole.sky)
     assert not found.shN[:, 3:].any()
     torch.testing.assert_close(found.scales, whole.scales)
-    x = float(whole.means[:scene, 0].median())
-    export(run.root, "-o", file, "--without-sky", "--crop", f"{x},-1e9,-1e9,1e9,1e9,1e9")
-    found = read_ply(file)
-    assert (len(found), found.sky) == (int((whole.means[:scene, 0] >= x).sum()), 0)
     before = run.point_cloud.read_bytes()
     assert "is the model itself" in one_line(panolog("export", run.root, "-o", run.point_cloud))
     assert run.point_cloud.read_bytes() == before
@@ -170,17 +156,14 @@ def test_up(run: RunFolder, tmp_path: Path) -> None:
     """+y of an SPZ is up, of SOG and PLY down: of a PLY -y, of a run's scene with a place +z."""
     whole = read_ply(run.point_cloud)
     means = whole.means[whole.scene].numpy()
+    files = ("up.spz", 1, read_model), ("up.sog", -1, read_model), ("up.ply", -1, read_ply)
     for source, options, axis, sign in (
         (run.root, [], 2, 1),
         (run.point_cloud, [], 1, -1),
         (run.point_cloud, ["--up", "-x"], 0, -1),
         (run.point_cloud, ["--up", "0,0,-2"], 2, -1),
     ):
-        for name, turned, read in (
-            ("up.spz", 1, read_model),
-            ("up.sog", -1, read_model),
-            ("up.ply", -1, read_ply),
-        ):
+        for name, turned, read in files:
             file = tmp_path / name
             export(source, "-o", file, "--without-sky", *options)
             heights = np.sort(turned * np.asarray(read(file).means)[:, 1])
@@ -255,9 +238,8 @@ def test_heights_of_a_globe(run: RunFolder, tmp_path: Path) -> None:
     for name, options, said in (("a", [], True), ("b", ["--geoid", 46], False)):
         done = export(run.root, "-o", tmp_path / name, "--3dtiles", "--glb", *options)
         assert ("heights are taken to be above the ellipsoid" in done.stderr) == said
-        heights.append(
-            json.loads((tmp_path / name / "georef.json").read_bytes())["exports"]["wgs84"]["height"]
-        )
+        place = json.loads((tmp_path / name / "georef.json").read_bytes())
+        heights.append(place["exports"]["wgs84"]["height"])
     assert heights[1] - heights[0] == pytest.approx(46, abs=1e-3)
 
 
@@ -276,9 +258,9 @@ def test_a_sky_that_spz_cannot_hold_is_pulled_in(run: RunFolder, tmp_path: Path)
         whole.select(torch.arange(len(whole)) >= len(whole) - 4),
     )
     assert 1000 < np.abs(found.means).max() < 2048  # less, as its Gaussians have to fit, too
-    sizes = [np.exp(side.scales).max() / np.linalg.norm(side.means, axis=1).max() for side in (found,)]
+    size = np.exp(found.scales).max() / np.linalg.norm(found.means, axis=1).max()
     was = float(true.scales.exp().max() / true.means.norm(dim=1).max())
-    assert sizes[0] == pytest.approx(was, rel=0.1)  # as large as it was, seen from the origin
+    assert size == pytest.approx(was, rel=0.1)  # as large as it was, seen from the origin
     assert len(read_model(tmp_path / "far.spz")) == len(whole) - whole.sky
 
 
@@ -290,8 +272,7 @@ def test_rows_that_are_no_gaussians_are_counted(run: RunFolder, tmp_path: Path) 
         tensor[10:17] = 0
     write_ply(tmp_path / "bad.ply", whole.with_tensors(tensors))
     done = export(tmp_path / "bad.ply", "-o", tmp_path / "bad.sog")
-    assert (
-        f"5 of {len(whole)} Gaussians have numbers that are not finite; exports leave them out" in done.stderr
-    )
+    left_out = f"5 of {len(whole)} Gaussians have numbers that are not finite; exports leave them out"
+    assert left_out in done.stderr
     assert f"7 of {len(whole)} Gaussians have a rotation of zeros" in done.stderr
     assert "not finite" not in export(run.point_cloud, "-o", tmp_path / "good.sog").stderr

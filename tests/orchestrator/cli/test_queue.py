@@ -9,17 +9,13 @@ import pytest
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.queue.entries import Needs, State
 from panolog.orchestrator.runs.queue.store import opened
-from tests.orchestrator.cli.program import begun, call, one_line, shown
+from tests.orchestrator.cli.program import call, one_line, shown
+from tests.orchestrator.history import begun
 from tests.scenes import write_scene
 
 pytestmark = pytest.mark.system
 
 PRICES = Path(__file__).parents[3] / "deploy" / "prices.toml"
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("queued") / "town")
 
 
 @pytest.fixture

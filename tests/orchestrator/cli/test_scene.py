@@ -1,7 +1,8 @@
-"""`panolog scene depth` and `scene mask`: what they print, how they end; nothing half-written stays."""
+"""`panolog scene`: what its commands print, how they end; nothing half-written stays."""
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,11 +11,14 @@ from typer.testing import Result
 
 from panolog.prepare.networks import depth_maps, masks
 from panolog.prepare.networks.depth_maps import DepthJob
+from panolog.prepare.sfm import pipeline
 from panolog.scene.files import SUFFIX
 from panolog.scene.read import read_scene
 from tests.orchestrator.cli import program
-from tests.orchestrator.cli.program import one_line
+from tests.orchestrator.cli.program import one_line, shown
+from tests.prepare.importers.writers import nerfstudio, opensfm
 from tests.prepare.networks.networks import given, red_depth
+from tests.prepare.sfm.reports import faulty
 from tests.scenes import HEIGHT, WIDTH, write_scene
 from tests.workers.small import AFFINE
 
@@ -169,3 +173,67 @@ def test_what_masks_ignore_and_files_that_match_nothing_are_shown(scene: Path) -
     for name in NAMES[:2]:
         cv2.imwrite(str(folder / name), np.full((32, 64), 255, np.uint8))
     assert "nothing is: black or transparent is what is ignored" in call("info", scene).stdout
+
+
+def test_import(tmp_path: Path) -> None:
+    _, source = opensfm(tmp_path / "source")
+    result = call("import", source.path, "-o", tmp_path / "scene")
+    assert result.exit_code == 0, result.output
+    assert "6 panoramas, 40 points" in result.stdout
+    assert "smaller reconstructions are left out" in result.stderr
+    assert call("info", tmp_path / "scene").exit_code == 0
+
+
+def test_import_as_json(tmp_path: Path) -> None:
+    _, source = nerfstudio(tmp_path / "source")
+    arguments = ("-o", tmp_path / "scene", "--link", "--format", "nerfstudio")
+    report = shown("scene", "import", source.path / "transforms.json", *arguments)
+    assert (report["format"], report["panoramas"], report["points"]) == ("nerfstudio", 6, 40)
+    assert (tmp_path / "scene" / "images" / "pano_00.png").is_symlink()
+    # The pictures of the small scene are noise: said in one line, and by the exit code.
+    result = call("check", tmp_path / "scene")
+    assert result.exit_code == 2
+    (line,) = [line for line in result.stdout.splitlines() if line.startswith("WRONG")]
+    assert "points and pixels hardly correlate" in line
+    assert result.stdout.splitlines()[-1] == "verdict: a problem; fix that first, or training yields fog"
+    found = call("check", tmp_path / "scene", "--json")
+    assert found.exit_code == 2
+    assert len(json.loads(found.stdout)["problems"]) == 1
+
+
+@pytest.mark.parametrize("option", [(), ("--format", "colmapper"), ("--images", "nowhere")])
+def test_wrong_imports_are_one_line(option: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    assert one_line(call("import", tmp_path / "empty", "-o", tmp_path / "scene", *option))
+    assert not (tmp_path / "scene").exists()
+    assert call("check", tmp_path / "scene").exit_code == 2
+
+
+def test_options_reach_the_job_and_its_report_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[tuple[Any, ...]] = []
+    report = faulty()
+
+    def make_scene(*arguments: Any, memory: int) -> object:
+        assert memory > 0
+        given.append(arguments[:3])
+        return report
+
+    monkeypatch.setattr(pipeline, "make_scene", make_scene)
+    output = tmp_path / "scene"
+    result = call("sfm", "images", "-o", output, "--json", "--partial", "--pairs", "exhaustive")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == {"scene": str(output), **report.as_json()}
+    wanted = pipeline.SfmSettings(partial=True, parts=True, pairing="exhaustive")
+    assert given == [(Path("images"), output, wanted)]
+    result = call("sfm", "images", "-o", output)
+    assert result.exit_code == 0
+    assert result.stdout.splitlines()[: len(list(report.lines()))] == list(report.lines())
+
+
+def test_what_cannot_be_done_is_one_line(tmp_path: Path) -> None:
+    output = tmp_path / "scene"
+    assert one_line(call("sfm", tmp_path / "nothing", "-o", output))
+    assert call("sfm", tmp_path, "-o", output, "--mapper", "magic").exit_code == 2
+    assert not output.exists()

@@ -16,11 +16,7 @@ LOCAL = "takes files and folders of this machine only"
     ("words", "line"),
     [
         (["render", "s3://bucket/run", "-o", "x"], LOCAL),
-        (
-            ["view", "s3://bucket/run", "--output=gs://bucket/x"],
-            "takes files and folders of this machine only",
-        ),
-        (["scene", "mask", "az://bucket/x"], LOCAL),
+        (["view", "run", "--output=gs://bucket/x"], LOCAL),
         (["pause", "s3://bucket/run", "1"], LOCAL),
         (["run", "town", "-o", "s3://me:T0PSECRET@bucket/run"], "user and password do not belong into a URL"),
         (["status", "s3://bucket/run?key=T0PSECRET"], "may hold a secret"),
@@ -30,7 +26,6 @@ LOCAL = "takes files and folders of this machine only"
         (["report", "file:///nowhere/run"], "give -o FILE.html"),
         (["status", "file:///nowhere/run"], "there is no run"),
         (["run", "file:///nowhere/town", "-o", "new"], "there is no COLMAP model"),
-        (["doctor", "file:///nowhere/town"], "there is no COLMAP model"),
         (["doctor", "s3://bucket/town?key=T0PSECRET"], "may hold a secret"),
     ],
 )

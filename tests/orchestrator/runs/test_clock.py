@@ -4,8 +4,6 @@ from panolog.orchestrator.runs.clock import Steady
 
 
 class Machine:
-    """A clock that can be set."""
-
     def __init__(self) -> None:
         self.wall, self.passed, self.slept = 1e9, 50.0, 0.0
 
@@ -19,7 +17,6 @@ class Machine:
         self.slept += seconds
 
     def work(self, seconds: float) -> None:
-        """So many seconds pass."""
         self.wall, self.passed = self.wall + seconds, self.passed + seconds
 
 

@@ -126,7 +126,7 @@ def test_a_flood_is_taken_piece_by_piece(folder: RunFolder) -> None:
     assert [len(control.take(folder)) for _ in range(3)] == [100, 50, 0]
 
 
-def test_a_new_driver_does_nothing_of_what_an_older_one_was_asked(folder: RunFolder) -> None:
+def test_a_new_driver_does_nothing_of_what_was_requested_of_an_older_one(folder: RunFolder) -> None:
     control.send(folder, Action.PAUSE, 2)
     assert [said.message for said in control.begin(folder)] == [
         "pause block 2: was requested of an earlier driver, so nothing is done"
@@ -134,7 +134,7 @@ def test_a_new_driver_does_nothing_of_what_an_older_one_was_asked(folder: RunFol
     assert control.take(folder) == []
 
 
-def test_who_may_ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_may_send_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = RunFolder(tmp_path)
     assert control.allowed(folder) == "no driver is at work on the run"
     with pytest.raises(InputError, match="no driver"):
@@ -233,8 +233,6 @@ def test_a_machine_in_quarantine_is_released_by_its_host_or_the_begin_of_its_id(
 
 
 class Listening(Harness):
-    """A job whose drivers accept requests, and workers that yield on request."""
-
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         control.begin(self.folder)
@@ -245,7 +243,6 @@ class Listening(Harness):
             control.send(self.folder, action, block)
 
     def trains(self, spec: TaskSpec, iterations: int = 50) -> Iterator[Event]:
-        """All goes well, slowly."""
         for i in range(iterations if spec.task.stage is Stage.BLOCK else 0):
             yield Progress(spec.task, i, iterations, 1.0)
             if spec.task in self.pool.stopped:

@@ -57,13 +57,6 @@ def test_an_unknown_level_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
         log.configure()
 
 
-def test_workers_inherit_the_level(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(log.VARIABLE, raising=False)
-    assert log.environment() == {}
-    monkeypatch.setenv(log.VARIABLE, "INFO")
-    assert log.environment() == {"PANOLOG_LOG": "INFO"}
-
-
 def test_the_option_of_the_program() -> None:
     ended = subprocess.run([sys.executable, "-c", PROGRAM], check=False, capture_output=True, text=True)
     assert ended.stdout.splitlines()[-1] == str(logging.DEBUG)

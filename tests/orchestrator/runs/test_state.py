@@ -47,7 +47,6 @@ NAMES: dict[
 
 
 def values(kind: Any) -> st.SearchStrategy[Any]:
-    """Any values of a type that a record may have."""
     parts = get_args(kind)
     if kind is TaskId:
         return st.sampled_from(TASKS)
@@ -63,7 +62,6 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
 
 
 def made(kind: Any) -> st.SearchStrategy[Any]:
-    """Any object of a dataclass."""
     of_fields = {name: values(of) for name, of in get_type_hints(kind).items()}
     return st.builds(kind, **of_fields | NAMES.get(kind, {}))
 
@@ -135,26 +133,14 @@ def test_only_the_last_progress_of_each_task_matters(
 def test_summary_names_stage_status_and_time_left() -> None:
     expected = PreflightSaved("preflight.json", {"coarse": 30.0})
     state = after(BEGAN, expected, started(COARSE), Progressed(COARSE, 25, 100, 5.0, loss=0.1))
-    shown = summarize(state, running=True, now=11.0)
-    assert (shown.status, shown.label, shown.stage, shown.eta) == ("running", "running", "coarse", 24.0)
-    assert (shown.seconds, shown.tasks[0].status) == (10.0, Status.RUNNING)
-    killed = summarize(state, running=False, now=11.0)
-    assert (killed.status, killed.label, killed.stage, killed.eta) == (
-        "stopped",
-        "driver lost",
-        "coarse",
-        None,
-    )
-    assert (killed.seconds, killed.tasks[0].status, killed.tasks[0].eta) == (3, Status.WAITING, None)
+    shown, killed = (summarize(state, running=running, now=11.0) for running in (True, False))
+    assert (shown.label, shown.stage, shown.eta, shown.seconds) == ("running", "coarse", 24.0, 10.0)
+    assert (killed.label, killed.stage, killed.eta, killed.seconds) == ("driver lost", "coarse", None, 3)
+    assert [it.tasks[0].status for it in (shown, killed)] == [Status.RUNNING, Status.WAITING]
     assert stage_of(after(model(COARSE), started(TaskId.shard(0)))) == "score"
     assert stage_of(after(model(COARSE), RunEnded(Outcome.DONE))) == "done"
-    for outcome, label in (
-        (Outcome.INTERRUPTED, "stopped"),
-        (Outcome.FAILED, "failed"),
-        (Outcome.DONE, "done"),
-    ):
-        ended = summarize(after(BEGAN, RunEnded(outcome)), running=False)
-        assert (ended.status, ended.label) == (outcome, label)
+    ends = [summarize(after(BEGAN, RunEnded(end)), running=False).label for end in Outcome]
+    assert ends == ["done", "failed", "stopped", "ended early"]
 
 
 def test_gaussians_in_training_and_gaussians_that_are_kept_are_different_numbers() -> None:

@@ -75,14 +75,6 @@ def test_milestones_leave_out_old_progress_without_a_look_at_it(
     assert len(steps) * 100 < 20_000  # instructions of SQLite
 
 
-def test_metrics_are_series(path: Path) -> None:
-    with closing(sqlite3.connect(path)) as connection:
-        rows = connection.execute(
-            "SELECT name, iteration, value FROM metrics WHERE task = 'coarse'"
-        ).fetchall()
-    assert {("loss", 1, 0.5), ("loss", 2, 0.4), ("rate/means", 2, 1e-3)} <= set(rows)
-
-
 def test_a_copy_of_the_one_file_on_read_only_media_is_whole(path: Path, tmp_path: Path) -> None:
     folder = tmp_path / "copy"
     folder.mkdir()

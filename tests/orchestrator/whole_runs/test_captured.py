@@ -90,7 +90,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, RunFolder
 
 
 def files_of(folder: RunFolder) -> dict[str, bytes]:
-    """What a run has made of its scene and learnt, besides times and places."""
     learnt = [folder.measured, folder.captured(COARSE), folder.exposure, folder.poses, folder.mover_shares]
     models = [folder.point_cloud, folder.model(COARSE), folder.model(BLOCK), folder.plan]
     found = [*learnt, *models, folder.metrics, folder.seams]

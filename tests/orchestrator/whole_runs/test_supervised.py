@@ -1,4 +1,4 @@
-"""Whole runs through Ray under a supervisor, whose drivers are killed and lose Ray itself."""
+"""Whole runs under a supervisor, whose drivers are killed, lose Ray itself, or are stopped."""
 
 import os
 import signal
@@ -13,19 +13,33 @@ import pytest
 from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.engine.driver.local_pool import local_pool
 from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.control import state_of
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Noticed, Outcome, RunBegan, RunEnded, TaskYielded
 from panolog.orchestrator.runs.state import RunState, ignore
 from panolog.orchestrator.runs.store import read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
-from tests.orchestrator.whole_runs.test_whole_runs import SETS, state_of
+from tests.orchestrator.whole_runs.test_whole_runs import SETS
 from tests.ray_head import environment, wait_until
 
 pytestmark = pytest.mark.system
 
 SETTINGS = (*SETS, "iterations=120", "blocks=1x1x1", "width=64")
 OPTIONS = [word for setting in SETTINGS for word in ("--set", setting)]
+# PanoLOG whose supervisor starts drivers that have workers without Ray.
+WITHOUT_RAY = """
+import sys
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.cli.session import supervise
+from panolog.orchestrator.engine.cluster import connection
+from panolog.orchestrator.engine.driver.local_pool import local_pool
+
+connection.connect = lambda *_: local_pool()
+supervise._PROGRAM = (sys.executable, __file__)
+if __name__ == "__main__":
+    app.main()
+"""
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +47,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_town(tmp_path_factory.mktemp("supervised") / "town", panoramas=9, width=64, points=300)
 
 
-def supervise(scene: Path, root: Path, *more: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "panolog.orchestrator.cli", "run", str(scene), "-o", str(root), *OPTIONS]
+def supervise(program: list[str], scene: Path, root: Path, *more: str) -> subprocess.Popen[str]:
+    command = [sys.executable, *program, "run", str(scene), "-o", str(root), *OPTIONS]
     # A shell's background jobs ignore Ctrl-C; Ray gives a lost head a minute to come back.
     return subprocess.Popen(
         [*command, *more, "--supervise"],
@@ -65,7 +79,7 @@ def test_a_run_whose_driver_is_killed_and_loses_ray_ends_with_the_same_bytes(
     scene: Path, tmp_path: Path
 ) -> None:
     root, seen = tmp_path / "run", list[int]()
-    process = supervise(scene, root)
+    process = supervise(["-m", "panolog.orchestrator.cli"], scene, root)
     driver_with(root, lambda state: state.task(COARSE).checkpoint, seen).kill()
     driver = driver_with(root, lambda state: "running" in {it.status for it in state.tasks.values()}, seen)
     (head,) = (child for child in driver.children(recursive=True) if child.name() == "gcs_server")
@@ -90,8 +104,9 @@ def test_a_run_whose_driver_is_killed_and_loses_ray_ends_with_the_same_bytes(
 def test_ctrl_c_of_a_terminal_stops_supervisor_and_driver_after_a_fresh_checkpoint(
     scene: Path, tmp_path: Path
 ) -> None:
-    root = tmp_path / "run"
-    process = supervise(scene, root, "--iterations", "100000")
+    root, program = tmp_path / "run", tmp_path / "program.py"
+    program.write_text(WITHOUT_RAY)
+    process = supervise([str(program)], scene, root, "--iterations", "100000")
     driver_with(root, lambda state: state.task(COARSE).checkpoint, [])
     os.killpg(process.pid, signal.SIGINT)  # the driver gets it twice
     _, stderr = process.communicate(timeout=480)

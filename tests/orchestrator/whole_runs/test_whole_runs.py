@@ -1,4 +1,4 @@
-"""Whole runs through Ray, undisturbed and with killed workers, and without Ray: the same bytes."""
+"""Whole runs through Ray with killed workers, and without Ray undisturbed: the same bytes."""
 
 import json
 import shutil
@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import closing, nullcontext
 from pathlib import Path
+from subprocess import PIPE
 
 import psutil
 import pytest
@@ -15,15 +16,16 @@ from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.engine.cluster import connection
 from panolog.orchestrator.engine.driver.local_pool import LocalPool, local_pool
 from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.control import state_of
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines.nodes import Placement
 from panolog.orchestrator.runs.money.limits import Wanted
 from panolog.orchestrator.runs.money.prices import read_prices
 from panolog.orchestrator.runs.records import CheckpointSaved, RunBegan, Stored, TaskStarted
-from panolog.orchestrator.runs.state import RunState, replay
+from panolog.orchestrator.runs.state import RunState, ignore
 from panolog.orchestrator.runs.storage.layout import OBJECTS, current
 from panolog.orchestrator.runs.storage.lease import holder
-from panolog.orchestrator.runs.store import read_milestones, read_records
+from panolog.orchestrator.runs.store import read_records
 from panolog.scene.ply import ply_header
 from panolog.scene.stores.store import open_store
 from panolog.synthetic.make import make_town
@@ -92,27 +94,6 @@ app.main()
 ACCIDENTS = (("CheckpointSaved", "coarse"), ("CheckpointSaved", "block/000"), ("ViewEvaluated", "eval"))
 
 
-def launch(*arguments: object, accidents: Sequence[tuple[str, str]] = ()) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", SCRIPT, json.dumps(accidents), *map(str, arguments)]
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-
-
-Ended = subprocess.CompletedProcess[str]
-
-
-def end_of(process: subprocess.Popen[str]) -> Ended:
-    stdout, stderr = process.communicate(timeout=300)
-    return Ended(process.args, process.returncode, stdout, stderr)
-
-
-def state_of(root: Path) -> RunState:
-    """That of a run now; an empty one while it has no database."""
-    database = RunFolder(root).database
-    return replay(read_milestones(database)) if database.exists() else RunState()
-
-
 def wait_for_workers(root: Path) -> None:
     """Until no worker of the run is left; they die with their driver."""
     for stored in read_records(RunFolder(root).database):
@@ -121,28 +102,28 @@ def wait_for_workers(root: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended, Path]:
-    """An undisturbed run, what it said, and the folder of one whose workers were killed."""
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
+    """An undisturbed run without Ray, and one through Ray whose workers were killed, with what that said."""
     folder = tmp_path_factory.mktemp("recovery")
     scene = make_town(folder / "town", panoramas=9, width=64, points=300)
     calm, killed = folder / "calm", folder / "killed"
-    processes = [
-        launch("run", scene, "-o", calm, *SETTINGS),
-        launch("run", scene, "-o", killed, *SETTINGS, accidents=ACCIDENTS),
-    ]
-    calm_end, killed_end = map(end_of, processes)
-    assert (killed_end.returncode, killed_end.stdout) == (0, ""), killed_end.stderr
-    return calm, calm_end, killed
+    command = [sys.executable, "-c", SCRIPT, json.dumps(ACCIDENTS), "run", str(scene), "-o", str(killed)]
+    command += SETTINGS
+    with subprocess.Popen(command, stdout=PIPE, stderr=PIPE, text=True, start_new_session=True) as process:
+        with local_pool() as pool:
+            session.start(scene, calm, load_config(sets=SETS), None, ignore, pool)
+        stdout, stderr = process.communicate(timeout=300)
+    assert (process.returncode, stdout) == (0, ""), stderr
+    return calm, killed, stderr
 
 
-def test_a_run_says_where_everything_is_and_leaves_nothing_behind(runs: tuple[Path, Ended, Path]) -> None:
-    root, end, _ = runs
-    assert (end.returncode, end.stdout) == (0, ""), end.stderr
-    assert "Traceback" not in end.stderr
+def test_a_run_says_where_everything_is_and_leaves_nothing_behind(runs: tuple[Path, Path, str]) -> None:
+    _, root, said = runs
+    assert "Traceback" not in said
     folder = RunFolder(root)
     for path in (folder.point_cloud, folder.metrics, folder.images, folder.plan_picture, folder.report):
         assert path.exists()
-        assert str(path) in end.stderr
+        assert str(path) in said
     report = json.loads(folder.metrics.read_text())
     count, sky = ply_header(folder.point_cloud)
     assert (report["gaussians"], report["bytes"], sky) == (count, folder.point_cloud.stat().st_size, 100)
@@ -153,15 +134,14 @@ def test_a_run_says_where_everything_is_and_leaves_nothing_behind(runs: tuple[Pa
 
 
 def test_a_run_whose_workers_are_killed_in_each_stage_ends_with_the_same_bytes(
-    runs: tuple[Path, Ended, Path],
+    runs: tuple[Path, Path, str],
 ) -> None:
-    calm, _, killed = runs
+    calm, killed, _ = runs
     records = [stored.record for stored in read_records(RunFolder(killed).database)]
     starts = [record for record in records if isinstance(record, TaskStarted)]
     for task, iterations in ((COARSE, [0, 20]), (TaskId.block(0), [0, 20]), (EVAL, [0, 0])):
         assert [start.iteration for start in starts if start.task == task] == iterations
     same_bytes(killed, calm)
-    assert not list(killed.rglob("*.part"))
 
 
 def same_bytes(ours: Path, theirs: Path) -> None:
@@ -171,7 +151,7 @@ def same_bytes(ours: Path, theirs: Path) -> None:
 
 
 def test_a_limit_delivers_what_there_is_and_without_it_the_bytes_are_the_same(
-    runs: tuple[Path, Ended, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    runs: tuple[Path, Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calm, _, _ = runs
     root, prices = tmp_path / "run", tmp_path / "prices.toml"
@@ -214,16 +194,14 @@ def resumed(root: Path, *limit: object) -> str:
 
 
 class Interrupted(LocalPool):
-    """Ctrl-C when Stage I has ended."""
-
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         if spec.task.stage == Stage.BLOCK:
             raise KeyboardInterrupt
         super().start(placement, spec)
 
 
-def test_a_run_in_a_store_goes_on_in_an_empty_folder(
-    runs: tuple[Path, Ended, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_run_in_a_store_continues_in_an_empty_folder(
+    runs: tuple[Path, Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PANOLOG_STORE_CACHE", str(tmp_path / "cache"))
     calm, run = runs[0], f"file://{tmp_path}/store"
@@ -248,7 +226,7 @@ def test_a_run_in_a_store_goes_on_in_an_empty_folder(
     assert set(store.list(f"{OBJECTS}/coarse/model.ply")) == {manifest.files["coarse/model.ply"].key}
 
 
-def test_eval_reads_what_is_known_and_measures_what_is_not(runs: tuple[Path, Ended, Path]) -> None:
+def test_eval_reads_what_is_known_and_measures_what_is_not(runs: tuple[Path, Path, str]) -> None:
     root, _, _ = runs
     stored = json.loads(RunFolder(root).metrics.read_text())
     assert shown("eval", root) == stored
@@ -268,7 +246,7 @@ def test_eval_reads_what_is_known_and_measures_what_is_not(runs: tuple[Path, End
     assert RunFolder(root).metrics.exists()
 
 
-def test_a_plan_can_be_tried_without_training(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
+def test_a_plan_can_be_tried_without_training(runs: tuple[Path, Path, str], tmp_path: Path) -> None:
     root, _, _ = runs
     before = RunFolder(root).plan.read_bytes()
     plan = json.loads(before)
@@ -288,7 +266,7 @@ def test_a_plan_can_be_tried_without_training(runs: tuple[Path, Ended, Path], tm
 
 
 def test_the_example_without_ray_ends_with_the_same_bytes(
-    runs: tuple[Path, Ended, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    runs: tuple[Path, Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calm, _, _ = runs
     root = tmp_path / "run"

@@ -1,7 +1,8 @@
 """Files that several formats have: a PLY, JSON, a split, a COLMAP text model."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,14 @@ def write_json(path: Path, content: Any) -> None:
     """A JSON file, as people's programs write it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1))
+
+
+@contextmanager
+def changed_json(path: Path) -> Iterator[Any]:
+    """The content of a JSON file, which is written again as it is then."""
+    content = json.loads(path.read_text())
+    yield content
+    write_json(path, content)
 
 
 def write_colmap_text(

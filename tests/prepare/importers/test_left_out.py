@@ -1,6 +1,5 @@
 """What a source has besides poses and points is imported, or the report says that it was left out."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from panolog.scene.errors import InputError
 from panolog.scene.images import load_view
 from panolog.scene.read import read_scene
 from panolog.scene.write import read_offset
+from tests.prepare.importers.files import changed_json, write_json
 from tests.prepare.importers.known import Known
 from tests.prepare.importers.writers import WRITERS, metashape, nerfstudio, opensfm
 from tests.scenes import HEIGHT, WIDTH
@@ -28,12 +28,10 @@ def write_mask(path: Path) -> None:
 
 def name_masks(folder: Path, known: Known, pattern: str) -> None:
     """A path of a mask in each frame of a transforms.json."""
-    path = folder / "transforms.json"
-    content = json.loads(path.read_text())
-    for frame, name in zip(content["frames"], known.names, strict=True):
-        frame["mask_path"] = pattern.format(stem=Path(name).stem)
-        write_mask(folder / frame["mask_path"])
-    path.write_text(json.dumps(content))
+    with changed_json(folder / "transforms.json") as content:
+        for frame, name in zip(content["frames"], known.names, strict=True):
+            frame["mask_path"] = pattern.format(stem=Path(name).stem)
+            write_mask(folder / frame["mask_path"])
 
 
 CASES: list[tuple[str, str]] = [
@@ -71,14 +69,12 @@ def test_masks_are_imported(case: str, pattern: str, tmp_path: Path) -> None:
 def test_a_mask_is_not_that_of_two_panoramas(tmp_path: Path) -> None:
     """Cameras name files alike in each folder: without the folder a mask is of one of them, but of which?"""
     _, source = nerfstudio(tmp_path / "source")
-    path, images = source.path / "transforms.json", source.path / "images"
-    content = json.loads(path.read_text())
-    for number, frame in enumerate(content["frames"]):
-        name = f"day{number % 2}/{number // 2}.png"
-        (images / name).parent.mkdir(exist_ok=True)
-        (source.path / frame["file_path"]).rename(images / name)
-        frame["file_path"] = f"images/{name}"
-    path.write_text(json.dumps(content))
+    with changed_json(source.path / "transforms.json") as content:
+        for number, frame in enumerate(content["frames"]):
+            path = source.path / f"images/day{number % 2}/{number // 2}.png"
+            path.parent.mkdir(exist_ok=True)
+            (source.path / frame["file_path"]).rename(path)
+            frame["file_path"] = str(path.relative_to(source.path))
     write_mask(source.path / "masks" / "0.png")
     write_mask(source.path / "masks" / "day1" / "1.png")
     notes = import_scene(source, tmp_path / "scene").notes
@@ -124,10 +120,8 @@ def test_a_damaged_mask_is_refused_by_its_name(tmp_path: Path) -> None:
 def test_masks_that_a_file_names_wrongly(entry: object, words: str, tmp_path: Path) -> None:
     write_mask(tmp_path / "secret.png")
     _, source = nerfstudio(tmp_path / "source")
-    path = source.path / "transforms.json"
-    content = json.loads(path.read_text())
-    content["mask_path"] = entry
-    path.write_text(json.dumps(content))
+    with changed_json(source.path / "transforms.json") as content:
+        content["mask_path"] = entry
     with pytest.raises(InputError, match=f"transforms.json: mask_path: {words}"):
         import_scene(source, tmp_path / "scene")
 
@@ -135,20 +129,19 @@ def test_masks_that_a_file_names_wrongly(entry: object, words: str, tmp_path: Pa
 def test_nerfstudio_without_what_others_write(tmp_path: Path) -> None:
     """No camera model, no entry for the cloud, maps of depth: each is in the report."""
     known, source = nerfstudio(tmp_path / "source")
-    path = source.path / "transforms.json"
-    content = json.loads(path.read_text())
-    del content["camera_model"], content["ply_file_path"]
     (source.path / "sparse_pc.ply").rename(source.path / "pointcloud.ply")
-    for frame in content["frames"][:2]:
-        frame["depth_file_path"] = "depths/x.png"
-    content["train_filenames"] = [frame["file_path"] for frame in content["frames"]]
-    path.write_text(json.dumps(content))
+    with changed_json(source.path / "transforms.json") as content:
+        del content["camera_model"], content["ply_file_path"]
+        for frame in content["frames"][:2]:
+            frame["depth_file_path"] = "depths/x.png"
+        content["train_filenames"] = [frame["file_path"] for frame in content["frames"]]
     report = import_scene(source, tmp_path / "scene")
     assert report.points == len(known.points)
     assert "no camera_model: taken to be EQUIRECTANGULAR" in report.notes[0]
     assert "2 depth maps are left out" in report.notes[1]
     assert "the source's split is left out" in report.notes[-1]
-    path.write_text(json.dumps(content | {"camera_angle_x": 0.7}))
+    with changed_json(source.path / "transforms.json") as content:
+        content["camera_angle_x"] = 0.7
     with pytest.raises(InputError, match="camera_angle_x: a camera with a field of view"):
         import_scene(source, tmp_path / "other")
 
@@ -197,15 +190,15 @@ def test_components_share_a_world_only_if_they_have_a_place(placed: bool, tmp_pa
 def test_the_place_of_opensfm(tmp_path: Path) -> None:
     _, source = opensfm(tmp_path / "source")
     place = {"latitude": 47.3, "longitude": 8.5, "altitude": 0.0}
-    (source.path / "reference_lla.json").write_text(json.dumps(place))
+    write_json(source.path / "reference_lla.json", place)
     import_scene(source, tmp_path / "scene")
     found = read_offset(tmp_path / "scene")
     assert found is not None and found.origin is not None
     assert (found.frame, found.offset, found.origin.model_dump()) == ("ENU", (0, 0, 0), place)
-    (source.path / "reference_lla.json").write_text(json.dumps(dict.fromkeys(place, 0.0)))  # no GPS
+    write_json(source.path / "reference_lla.json", dict.fromkeys(place, 0.0))  # no GPS
     import_scene(source, tmp_path / "without")
     assert read_offset(tmp_path / "without") is None
-    (source.path / "reference_lla.json").write_text(json.dumps(place | {"latitude": 100}))
+    write_json(source.path / "reference_lla.json", place | {"latitude": 100})
     with pytest.raises(InputError, match=r"reference_lla\.json: is no place on the earth"):
         import_scene(source, tmp_path / "nowhere")
 

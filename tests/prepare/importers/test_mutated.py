@@ -1,10 +1,7 @@
 """Damaged files: an InputError that names the file, or a sound scene; never anything else."""
 
-import random
 import re
 import tracemalloc
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,48 +11,23 @@ from panolog.prepare.importers.import_scene import FORMATS
 from panolog.prepare.importers.interface import ImportedScene
 from panolog.scene.colmap import read_colmap
 from panolog.scene.errors import InputError
+from tests.data import mutated
 from tests.prepare.importers.writers import WRITERS
 from tests.scenes import write_scene
 
 ROUNDS = 24  # of each file
 NASTY = [b"null", b"-1", b"1e999", b"NaN", b"1e300", b"18446744073709551615", b'""', b"[]", b"{}", b"true"]
 NASTY += [b'"../../x"', b"9" * 400]
+VALUES = [re.compile(rb"-?\d+(\.\d+)?(e-?\d+)?"), re.compile(rb'"[^"]*"')]
 
 
-def _swap(pattern: re.Pattern[bytes], data: bytes, dice: random.Random) -> bytes:
-    where = dice.choice(list(pattern.finditer(data)) or [None])
-    return data if where is None else data[: where.start()] + dice.choice(NASTY) + data[where.end() :]
-
-
-def _flip(data: bytes, dice: random.Random) -> bytes:
-    changed = bytearray(data)
-    for _ in range(dice.randint(1, 4)):
-        changed[dice.randrange(len(changed))] = dice.randrange(256)
-    return bytes(changed)
-
-
-def _cut(data: bytes, dice: random.Random) -> bytes:
-    return data[: dice.randrange(len(data))]
-
-
-def _drop(data: bytes, dice: random.Random) -> bytes:
-    start = dice.randrange(len(data))
-    return data[:start] + data[start + dice.randint(1, 200) :]
-
-
-def _repeat(data: bytes, dice: random.Random) -> bytes:
-    start = dice.randrange(len(data))
-    return data[:start] + data[start : start + 300] * 2 + data[start + 300 :]
-
-
-MUTATIONS: list[Callable[[bytes, random.Random], bytes]] = [
-    partial(_swap, re.compile(rb"-?\d+(\.\d+)?(e-?\d+)?")),
-    partial(_swap, re.compile(rb'"[^"]*"')),
-    _flip,
-    _cut,
-    _drop,
-    _repeat,
-]
+def _changed(data: bytes, turn: int, dice: np.random.Generator) -> bytes:
+    """A number or a text replaced by a nasty one, or bytes changed."""
+    found = list(VALUES[turn % 3].finditer(data)) if turn % 3 < 2 else []
+    if not found:
+        return mutated(data, dice)
+    where = found[dice.integers(len(found))]
+    return data[: where.start()] + NASTY[dice.integers(len(NASTY))] + data[where.end() :]
 
 
 def _sound(parsed: ImportedScene) -> None:
@@ -80,11 +52,11 @@ def test_mutated_files(case: str, tmp_path: Path) -> None:
         for path in sorted((tmp_path / "source").rglob("*"))
         if path.suffix in (".json", ".xml", ".csv", ".txt", ".ply")
     ]
-    dice = random.Random(case)
+    dice = np.random.default_rng(list(case.encode()))
     for path in files:
         original = path.read_bytes()
         for turn in range(ROUNDS):
-            path.write_bytes(MUTATIONS[turn % len(MUTATIONS)](original, dice))
+            path.write_bytes(_changed(original, turn, dice))
             try:
                 _sound(FORMATS[kind].read(source))
             except InputError as error:
@@ -96,10 +68,10 @@ def test_mutated_files(case: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
 def test_mutated_binaries(name: str, tmp_path: Path) -> None:
     """Of a COLMAP model; counts that are too large take no memory."""
-    model, dice = write_scene(tmp_path) / "sparse" / "0", random.Random(1)
+    model, dice = write_scene(tmp_path) / "sparse" / "0", np.random.default_rng(1)
     data = (model / name).read_bytes()
-    for turn in range(2 * ROUNDS):
-        (model / name).write_bytes((_flip, _cut, _drop, _repeat)[turn % 4](data, dice))
+    for _ in range(2 * ROUNDS):
+        (model / name).write_bytes(mutated(data, dice))
         try:
             read_colmap(model)
         except InputError as error:

@@ -1,6 +1,5 @@
 """What is refused, and that the message says where and how to fix it."""
 
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,7 @@ from panolog.prepare.importers.import_scene import FORMATS, import_scene
 from panolog.prepare.importers.interface import ImportSource
 from panolog.scene.errors import InputError
 from tests.prepare.importers.colmap_writers import panorama_sfm
-from tests.prepare.importers.files import write_json
+from tests.prepare.importers.files import changed_json
 from tests.prepare.importers.writers import WRITERS, metashape, nerfstudio
 
 Change = Callable[[Any], object]  # of the content of a JSON file
@@ -33,10 +32,7 @@ def _mirrored(content: Any) -> None:
 
 
 OPENMVG: list[tuple[Change, str]] = [
-    *[
-        (_named(it), f"{it[:80]!r} is not a path inside")
-        for it in ("../secret.png", "a\0b", "x" * 2000, "..")
-    ],
+    *[(_named(it), f"{it[:80]!r} is not a path inside") for it in ("../secret.png", "a\0b", "x" * 2000)],
     (_named("/../x"), f"{_NAME}/../x is not in "),
     (_named(""), f"{_NAME}a text was expected"),
     (lambda p: p["extrinsics"][2]["value"]["center"].pop(), "extrinsics[2].value.center: 3 finite"),
@@ -48,9 +44,6 @@ OPENMVG: list[tuple[Change, str]] = [
     (lambda p: p["structure"][5]["value"].update(X=[1, 2, "y"]), "structure[5].value.X: 3 "),
     (lambda p: p["structure"][4]["value"].update(observations=7), f"{_SEEN}: a list"),
     (_seen(key=-1), f"{_SEEN}[0].key: a whole number"),
-    (_seen(key="a"), f"{_SEEN}[0].key: a whole number"),
-    (_seen(value={"x": [1]}), f"{_SEEN}[0].value.x: 2 finite"),
-    (_seen(value={"x": [1, "a"]}), f"{_SEEN}[0].value.x: 2 "),
     (_seen(value={"x": [1, 1e300]}), f"{_SEEN}[0].value.x: 2 finite"),
     (_seen(value={}), f"{_SEEN}[0].value: has no 'x'"),
     (_seen(value=5), f"{_SEEN}[0].value: an object"),
@@ -71,9 +64,8 @@ def test_errors_name_file_and_field(case: str, change: Change, words: str, tmp_p
     """Also where names leave the folder."""
     _, source = WRITERS[case][1](tmp_path)
     (path,) = tmp_path.glob("*.json")
-    content = json.loads(path.read_text())
-    change(content)
-    write_json(path, content)
+    with changed_json(path) as content:
+        change(content)
     with pytest.raises(InputError, match=re.escape(words)) as error:
         FORMATS[case].read(source)
     assert str(error.value).startswith(f"{path}: ")
@@ -81,10 +73,9 @@ def test_errors_name_file_and_field(case: str, change: Change, words: str, tmp_p
 
 def test_absolute_paths_among_relative_ones(tmp_path: Path) -> None:
     known, source = nerfstudio(tmp_path)
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    content["frames"][1]["file_path"] = str(tmp_path / "images" / known.names[1])
-    content["train_filenames"] = [frame["file_path"] for frame in content["frames"][:2]]
-    write_json(tmp_path / "transforms.json", content)
+    with changed_json(tmp_path / "transforms.json") as content:
+        content["frames"][1]["file_path"] = str(tmp_path / "images" / known.names[1])
+        content["train_filenames"] = [frame["file_path"] for frame in content["frames"][:2]]
     found = FORMATS["nerfstudio"].read(source)
     assert [image.name for image in found.images] == list(known.names)
     assert list(found.train) == [str(Path(name).with_suffix("")) for name in known.names[:2]]

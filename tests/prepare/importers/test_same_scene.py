@@ -12,7 +12,7 @@ from panolog.prepare.importers.interface import find_panorama
 from panolog.scene.errors import SceneError
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
-from tests.prepare.importers.files import write_ply
+from tests.prepare.importers.files import changed_json, write_ply
 from tests.prepare.importers.known import Known
 from tests.prepare.importers.writers import WITH_SPLIT, WITH_TRACKS, WRITERS
 
@@ -72,12 +72,10 @@ def test_far_from_the_origin(tmp_path: Path) -> None:
     """UTM coordinates: moved, so that float32 suffices, and the way back is kept."""
     known, source = WRITERS["nerfstudio"][1](tmp_path / "source")
     utm = np.array([512_345.25, 5_403_210.5, 300.0])
-    path = tmp_path / "source" / "transforms.json"
-    content = json.loads(path.read_text())
-    for frame in content["frames"]:
-        for row, shift in zip(frame["transform_matrix"], utm, strict=False):
-            row[3] += shift
-    path.write_text(json.dumps(content))
+    with changed_json(source.path / "transforms.json") as content:
+        for frame in content["frames"]:
+            for row, shift in zip(frame["transform_matrix"], utm, strict=False):
+                row[3] += shift
     write_ply(tmp_path / "source" / "sparse_pc.ply", known.points + utm, known.colors)
     report = import_scene(source, tmp_path / "scene", format="nerfstudio")
     assert "moved to the origin" in report.notes[0]

@@ -13,17 +13,21 @@ from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.prepare.world.georeference import georeference
 
 
+def in_a_row(rows: tuple[int, ...]) -> SparseModel:
+    """Panoramas, one unit apart, that see the same 40 points anywhere."""
+    random, points = np.random.default_rng(0), np.arange(40)
+    return SparseModel(
+        rows=rows,
+        rotations=np.stack([np.eye(3)] * len(rows)),
+        translations=np.array([[0.0, 0, -z] for z in range(len(rows))]),
+        points=random.normal(0, 3, (40, 3)),
+        sightings=tuple((points, random.uniform(0, 1, (40, 2))) for _ in rows),
+    )
+
+
 def faulty() -> SfmReport:
     """Four of five panoramas have a pose; two links are weak, one pair contradicts itself."""
-    random = np.random.default_rng(0)
-    rows = np.arange(40)
-    model = SparseModel(
-        rows=(0, 1, 2, 4),
-        rotations=np.stack([np.eye(3)] * 4),
-        translations=np.array([[0.0, 0, -z] for z in range(4)]),
-        points=random.normal(0, 3, (40, 3)),
-        sightings=tuple((rows, random.uniform(0, 1, (40, 2))) for _ in range(4)),
-    )
+    model = in_a_row((0, 1, 2, 4))
     found = Reconstruction(
         panoramas=tuple(PanoramaFile(Path(), f"{name}.jpg", Path(f"{name}.jpg")) for name in "abcde"),
         layers={},

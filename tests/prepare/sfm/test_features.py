@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from panolog.prepare.sfm import features
-from panolog.prepare.sfm.faces import BAND, DOWN, Faces
+from panolog.prepare.sfm.faces import BAND, Faces
 from panolog.prepare.sfm.features import Features, features_of, processes_for
 from panolog.prepare.sfm.workspace import silence_colmap
 from panolog.scene.errors import RunError
@@ -26,17 +26,6 @@ def panorama(tmp_path_factory: pytest.TempPathFactory) -> Path:
     blobs = sum(cv2.resize(it, (1024, 512), interpolation=cv2.INTER_CUBIC) for it in octaves) / len(octaves)
     cv2.imwrite(str(path), np.rint(blobs).clip(0, 255).astype(np.uint8))
     return path
-
-
-@pytest.mark.parametrize("face", [BAND, DOWN])
-def test_tiles_own_each_column_once(face: int) -> None:
-    faces = Faces(1024)
-    across, high = faces.size(face)
-    assert faces.tiles(face, across * high) == [(slice(0, across), slice(0, across))]
-    tiles = faces.tiles(face, across * high // 5)
-    assert [column for _, inner in tiles for column in range(inner.start, inner.stop)] == list(range(across))
-    for columns, inner in tiles[1:-1]:
-        assert inner.start - columns.start == columns.stop - inner.stop > 15
 
 
 def test_tiles_find_the_features_of_the_whole(panorama: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,27 +10,19 @@ import pytest
 
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
 from panolog.prepare.sfm.reconstruct import Reconstruction
-from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
+from tests.prepare.sfm.reports import in_a_row
 
 COUNT = 7
 
 
 def _in_parts(panoramas: Any, layers: Any, *_: object, **__: object) -> list[Reconstruction]:
     """Four panoramas and three, each part in a row."""
-    random = np.random.default_rng(0)
 
     def part(rows: tuple[int, ...], others: list[tuple[int, ...]]) -> Reconstruction:
-        seen = np.arange(40)
-        model = SparseModel(
-            rows=rows,
-            rotations=np.stack([np.eye(3)] * len(rows)),
-            translations=np.array([[0.0, 0, -row] for row in rows]),
-            points=random.normal(0, 3, (40, 3)),
-            sightings=tuple((seen, random.uniform(0, 1, (40, 2))) for _ in rows),
-        )
         missing = {row: (0, 0) for row in range(COUNT) if row not in rows}
+        model = in_a_row(rows)
         return Reconstruction(panoramas, layers, (128, 64), model, [], [], missing, others, 100, 9)
 
     return [part((0, 1, 2, 3), [(4, 5, 6)]), part((4, 5, 6), [(0, 1, 2, 3)])]

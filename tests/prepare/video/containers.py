@@ -70,17 +70,10 @@ def write_clip(
     container: str | None = None,
     lenses: int = 1,
 ) -> Path:
-    """Frames as a video.
+    """Frames, all of one size, as a video in the container of the suffix, unless another is given.
 
-    Args:
-        path: its suffix says the container, unless `container` does.
-        frames: N, all of one size.
-        encoding: how.
-        times: N milliseconds, ascending; None for 30 frames per second.
-        colours, range_: the tags; None for none.
-        transfer: the transfer characteristics, by their number in H.273.
-        container: FFmpeg's name of it.
-        lenses: tracks with these frames.
+    Args: times, N ascending milliseconds, or 30 frames per second; colours, range_, the tags, None = none;
+    transfer, by its number in H.273; lenses, tracks with these frames.
     """
     height, width = frames[0][0].shape
     with av.open(str(path), "w", format=container) as file:
@@ -205,13 +198,9 @@ def turn(path: Path, matrix: tuple[int, int, int, int]) -> Path:
 
 
 def add_track(path: Path, kind: bytes, samples: Sequence[tuple[int, bytes]], duration: int) -> Path:
-    """A track of metadata, such as camm and gpmd.
+    """A track of metadata in an MP4, such as camm and gpmd: `kind` of its sample entry.
 
-    Args:
-        path: an MP4.
-        kind: of its sample entry.
-        samples: when each begins, in milliseconds, ascending from 0, and its bytes.
-        duration: of all, in milliseconds.
+    Args: samples, when each begins, in milliseconds, ascending from 0, and its bytes; duration of all.
     """
     starts = [time for time, _ in samples]
     assert starts[0] == 0

@@ -34,6 +34,7 @@ from tests.prepare.video.containers import (
 pytestmark = pytest.mark.system
 
 Floats = NDArray[np.float64]
+Change = Callable[[Path], Path]
 TIMES = [0, 40, 73, 140, 141, 300]  # milliseconds: a variable frame rate
 _LUMA = {"bt709": (0.2126, 0.0722), "bt601": (0.299, 0.114), "bt2020": (0.2627, 0.0593)}  # of red, of blue
 
@@ -164,48 +165,47 @@ def test_hdr_is_refused(transfer: int, name: str, tmp_path: Path) -> None:
         open_video(path).__enter__()
 
 
-@pytest.mark.parametrize(
-    ("matrix", "size", "change"),
-    [
-        ((-1, 0, 0, -1), (512, 256), lambda it: it[::-1, ::-1]),
-        ((-1, 0, 0, 1), (512, 256), lambda it: it[:, ::-1]),
-        ((1, 0, 0, -1), (512, 256), lambda it: it[::-1]),
-        ((0, 1, -1, 0), (256, 512), lambda it: np.rot90(it, -1)),  # clockwise
-        ((0, -1, 1, 0), (256, 512), lambda it: np.rot90(it, 1)),
-        ((0, 1, 1, 0), (256, 512), lambda it: it.swapaxes(0, 1)),
-        ((0, 1, -1, 0), (512, 256), lambda it: it),  # upright it would be no panorama
-    ],
-)
-def test_the_display_matrix(
-    matrix: tuple[int, int, int, int],
-    size: tuple[int, int],
-    change: Callable[[Floats], Floats],
-    tmp_path: Path,
-) -> None:
-    frames = known_frames(1, size=size)
-    with open_video(turn(write_clip(tmp_path / "clip.mov", frames), matrix)) as video:
-        assert list(video.frames()) == [0]
-        assert (video.width, video.height) == (512, 256)
-        assert same(video.picture(), change(expected(frames[0])))
+LAYOUTS: dict[str, tuple[tuple[int, int], Change, Callable[[Floats], Floats]]] = {
+    "upside down": ((512, 256), lambda it: turn(it, (-1, 0, 0, -1)), lambda it: it[::-1, ::-1]),
+    "mirrored": ((512, 256), lambda it: turn(it, (-1, 0, 0, 1)), lambda it: it[:, ::-1]),
+    "flipped": ((512, 256), lambda it: turn(it, (1, 0, 0, -1)), lambda it: it[::-1]),
+    "clockwise": ((256, 512), lambda it: turn(it, (0, 1, -1, 0)), lambda it: np.rot90(it, -1)),
+    "anticlockwise": ((256, 512), lambda it: turn(it, (0, -1, 1, 0)), lambda it: np.rot90(it, 1)),
+    "transposed": ((256, 512), lambda it: turn(it, (0, 1, 1, 0)), lambda it: it.swapaxes(0, 1)),
+    "no panorama if it were upright": ((512, 256), lambda it: turn(it, (0, 1, -1, 0)), lambda it: it),
+    "left eye on top": ((512, 512), lambda it: add_spherical(it, stereo=1), lambda it: it[:8]),
+    "left eye on the left": ((1024, 256), lambda it: add_spherical(it, stereo=2), lambda it: it[:, :16]),
+    "left eye on the right": ((1024, 256), lambda it: add_spherical(it, stereo=4), lambda it: it[:, 16:]),
+    "one eye": ((512, 256), lambda it: add_spherical(it, stereo=0), lambda it: it),
+    "eyes of a turned picture": (
+        (512, 512),
+        lambda it: turn(add_spherical(it, stereo=1), (-1, 0, 0, -1)),
+        lambda it: it[::-1, ::-1][:8],
+    ),
+}
 
 
-@pytest.mark.parametrize(
-    ("size", "stereo", "rows", "columns"),
-    [
-        ((512, 512), 1, slice(0, 8), slice(None)),  # the left eye on top
-        ((1024, 256), 2, slice(None), slice(0, 16)),  # on the left
-        ((1024, 256), 4, slice(None), slice(16, 32)),  # on the right
-        ((512, 256), 0, slice(None), slice(None)),
-    ],
-)
-def test_the_left_eye_is_taken(
-    size: tuple[int, int], stereo: int, rows: slice, columns: slice, tmp_path: Path
+@pytest.mark.parametrize(("size", "change", "shown"), LAYOUTS.values(), ids=LAYOUTS)
+def test_the_layout_of_the_pictures(
+    size: tuple[int, int], change: Change, shown: Callable[[Floats], Floats], tmp_path: Path
 ) -> None:
     frames = known_frames(1, size=size)
-    with open_video(add_spherical(write_clip(tmp_path / "clip.mp4", frames), stereo=stereo)) as video:
+    with open_video(change(write_clip(tmp_path / "clip.mov", frames))) as video:
         assert list(video.frames()) == [0]
         assert (video.width, video.height) == (512, 256)
-        assert same(video.picture(), expected(frames[0])[rows, columns])
+        assert same(video.picture(), shown(expected(frames[0])))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_the_pose_of_version_2_counts_not_where_a_viewer_looks(version: int, tmp_path: Path) -> None:
+    path = write_clip(tmp_path / "clip.mp4", known_frames(1, size=(512, 512)))
+    if version == 1:
+        add_spherical_xml(path, StereoMode="top-bottom", InitialViewPitchDegrees=30)
+    else:
+        add_spherical(path, stereo=1, pose=(10.0, 20.0, -5.0))
+    with open_video(path) as video:
+        assert video.height == 256 and video.spherical is not None
+        assert (video.spherical.pitch, video.spherical.roll) == ((0, 0) if version == 1 else (20, 5))
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -226,23 +226,6 @@ def test_a_cropped_panorama_is_placed(version: int, tmp_path: Path) -> None:
         mask = video.layout.mask()
         assert (mask[64:320, 256:768] == 255).all() and mask.sum() == 255 * 256 * 512
         assert not picture[mask == 0].any()
-
-
-@pytest.mark.parametrize(("suffix", "version"), [("mp4", 1), ("mp4", 2), ("mov", 1), ("insv", 2)])
-def test_eyes_of_a_turned_picture_in_each_container(suffix: str, version: int, tmp_path: Path) -> None:
-    """The pose of version 2 counts, and not where a viewer looks first by version 1."""
-    frames = known_frames(2, size=(512, 512))
-    path = tmp_path / f"clip.{suffix}"
-    write_clip(path, frames, container="mov" if suffix == "mov" else "mp4")
-    if version == 1:
-        add_spherical_xml(path, StereoMode="top-bottom", InitialViewPitchDegrees=30)
-    else:
-        add_spherical(path, stereo=1, pose=(10.0, 20.0, -5.0))
-    with open_video(turn(path, (-1, 0, 0, -1))) as video:
-        for number in video.frames():
-            assert same(video.picture(), expected(frames[number])[::-1, ::-1][:8])
-        assert video.spherical is not None
-        assert (video.spherical.pitch, video.spherical.roll) == ((0, 0) if version == 1 else (20, 5))
 
 
 def test_matroska_says_the_same(tmp_path: Path) -> None:
@@ -276,7 +259,7 @@ def test_matroska_says_the_same(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_panorama_is_refused_with_what_to_do(
-    size: tuple[int, int], change: Callable[[Path], Path], said: str, tmp_path: Path
+    size: tuple[int, int], change: Change, said: str, tmp_path: Path
 ) -> None:
     path = change(write_clip(tmp_path / "clip.mp4", known_frames(1, size=size)))
     with pytest.raises(
@@ -306,7 +289,7 @@ def test_a_video_for_each_lens_is_refused(suffix: str, tmp_path: Path) -> None:
         ),
     ],
 )
-def test_damaged_metadata_is_none(damage: Callable[[Path], Path], tmp_path: Path) -> None:
+def test_damaged_metadata_is_none(damage: Change, tmp_path: Path) -> None:
     frames = known_frames(1)
     with open_video(damage(write_clip(tmp_path / "clip.mp4", frames))) as video:
         assert list(video.frames()) == [0]

@@ -138,12 +138,6 @@ def test_few_boxes_are_looked_at() -> None:
     assert list(reader.children(Box(b"moov", 0, len(data)))) == []  # that was all
 
 
-def test_a_box_is_read_in_part() -> None:
-    data = box(b"uuid", bytes(3_000_000))
-    reader = BoxReader(io.BytesIO(data), len(data))
-    assert len(reader.read(reader.find(reader.file, "uuid")[0])) == 2**20
-
-
 def test_nested_boxes_and_elements(whole: bytes, tmp_path: Path) -> None:
     path = tmp_path / "clip.mp4"
     deep = b""

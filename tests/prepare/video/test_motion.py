@@ -6,10 +6,8 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from panolog.prepare.video.motion import MotionTracker, Piece, sharpness
-from panolog.prepare.video.parallax import turn_between
 from panolog.prepare.video.selection import choose_frames
 from tests.prepare.video.videos import HEIGHT, WIDTH, Image, Shot, render, turn, walk
 
@@ -38,23 +36,6 @@ def test_equal_steps_are_equal_parallax_and_turns_are_none() -> None:
     steps = np.diff(piece.positions)
     assert steps[:11].std() < 0.2 * steps[:11].mean()
     assert np.abs(steps[11:]).max() < 0.3
-
-
-def test_the_turn_is_told_from_the_motion_though_one_side_is_nearer() -> None:
-    random = np.random.default_rng(5)
-    before = random.normal(size=(400, 3)) * (1, 0.4, 1)
-    before /= np.linalg.norm(before, axis=1, keepdims=True)
-    before[:300, 0] = np.abs(before[:300, 0])
-    distance = np.where(before[:, 0] > 0, 3.0, 20.0)
-    turned = Rotation.from_euler("YXZ", (3.0, -2.0, 1.0), degrees=True).as_matrix()
-    for moved in ((0.0, 0.0, 0.2), (0.1, -0.05, 0.1), (0.0, 0.0, 0.0)):
-        after = (before * distance[:, None] - moved) @ turned.T
-        after /= np.linalg.norm(after, axis=1, keepdims=True)
-        after += random.normal(0, 0.001, after.shape)
-        after[::5] += random.normal(0, 0.1, (80, 3))  # what moves by itself
-        after /= np.linalg.norm(after, axis=1, keepdims=True)
-        off = Rotation.from_matrix(turned.T @ turn_between(before, after)).magnitude()
-        assert np.rad2deg(off) < 0.1, moved
 
 
 def test_a_whip_turn_too_blurred_to_follow_is_no_motion() -> None:

@@ -1,6 +1,8 @@
 """GPS and gravity of a video's telemetry, at the times of its frames, and as its frames carry them."""
 
-import struct
+import json
+import shutil
+import subprocess
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -189,20 +191,6 @@ def test_damaged_payloads_hold_nothing_or_something(seed: int) -> None:
     assert len(parse_payload(bytes(whole)).places) == 40
 
 
-@pytest.mark.parametrize(
-    "key", [b"GPSF", b"GPSP", b"SCAL", b"GPS5", b"ORIN", b"ACCL", b"STRM", b"TYPE", b"GPS9"]
-)
-def test_entries_with_other_types_and_sizes(key: bytes) -> None:
-    ups, places = np.stack([up(0.0)] * 3), np.stack([place(0.0)] * 3)
-    whole = payload(gps5(places), gps9(places), accl(ups, "zxY"))
-    at = whole.index(key) + 4
-    for head in ("\0", "L", "c", "?", "d", "J", "x"):
-        for size in (0, 1, 2, 8, 255):
-            for count in (0, 1, 0xFFFF):
-                changed = whole[:at] + struct.pack(">cBH", head.encode(), size, count) + whole[at + 4 :]
-                parse_payload(changed)
-
-
 def test_a_stamp_is_read_as_it_was_written(tmp_path: Path) -> None:
     jpeg = bytes(cv2.imencode(".jpg", np.zeros((64, 128, 3), np.uint8))[1])
     path, now = tmp_path / "a.jpg", datetime(2024, 5, 1, 12, 0, 3, 41_667)
@@ -223,6 +211,21 @@ def test_a_stamp_is_read_as_it_was_written(tmp_path: Path) -> None:
             assert found.fix.altitude == fix.altitude
         assert decode(path, cv2.IMREAD_COLOR).shape == (64, 128, 3)
     assert stamped(jpeg, fix=None, attitude=None, taken=None) == jpeg
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(shutil.which("exiftool") is None, reason="no exiftool: libimage-exiftool-perl")
+def test_exiftool_reads_the_stamp_of_a_frame(tmp_path: Path) -> None:
+    jpeg, path = bytes(cv2.imencode(".jpg", np.zeros((64, 128, 3), np.uint8))[1]), tmp_path / "a.jpg"
+    fix, attitude = GpsFix(-33.1234567, -70.5, -12.25), Attitude(None, 10.5, -3.25)
+    taken = datetime(2024, 5, 1, 12, 0, 3, 41_667)
+    path.write_bytes(stamped(jpeg, fix=fix, attitude=attitude, taken=taken, exposure=(0.01, 200)))
+    command = ["exiftool", "-ee", "-n", "-j", str(path)]
+    (found,) = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    assert (found["GPSLatitude"], found["GPSLongitude"]) == pytest.approx((-33.1234567, -70.5), abs=1e-9)
+    assert (found["GPSAltitude"], found["ExposureTime"], found["ISO"]) == (-12.25, 0.01, 200)
+    assert found["SubSecDateTimeOriginal"] == "2024:05:01 12:00:03.041667+00:00"
+    assert (found["PosePitchDegrees"], found["PoseRollDegrees"]) == (10.5, -3.25)
 
 
 @pytest.mark.system

@@ -1,14 +1,11 @@
 """Stills as cameras and stitchers write them: EXIF and XMP in every format, by Pillow or by exiftool."""
 
-import shutil
-import subprocess
 from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from PIL.PngImagePlugin import PngInfo
@@ -104,13 +101,4 @@ def write_still(
         image.save(path, exif=tags, lossless=True, exact=True, **more)
     else:
         image.save(path, exif=tags, quality=100, subsampling=0, **more)
-    return path
-
-
-def exiftool(path: Path, *options: str) -> Path:
-    """Writes tags with exiftool; skips the test where it is not installed."""
-    program = shutil.which("exiftool")
-    if program is None:
-        pytest.skip("no exiftool: libimage-exiftool-perl")
-    subprocess.run([program, "-q", "-overwrite_original", *options, str(path)], check=True)
     return path

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from panolog.prepare.world.exif import Attitude, Crop, Exif, GpsFix, read_exif
 from panolog.scene.errors import InputError
+from tests.data import mutated
 from tests.prepare.world.stills import BASE, CAMERA, GPS, PLACE, SUFFIXES, crop, gpano, write_still
 
 FIX = GpsFix(47 + 22 / 60 + 39.12 / 3600, 8 + 32.5 / 60, 408.5)
@@ -188,13 +189,7 @@ def test_mutations_never_raise(tmp_path: Path, suffix: str) -> None:
     random = np.random.default_rng(0)
     path = tmp_path / "mutated"
     for _ in range(200):
-        data = bytearray(whole)
-        for at in random.integers(len(data), size=random.integers(1, 12)):
-            data[at] = (0, 255, 127, int(random.integers(256)))[random.integers(4)]
-        if random.random() < 0.3:
-            at, length = random.integers(len(data)), int(random.integers(1, 200))
-            data[at : at + length] = b"" if random.random() < 0.5 else bytes(data[at : at + length]) * 2
-        path.write_bytes(data)
+        path.write_bytes(mutated(mutated(whole, random) or whole, random))
         found = read_exif(path)
         if found.fix is not None:
             assert abs(found.fix.latitude) <= 90

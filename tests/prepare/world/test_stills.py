@@ -4,7 +4,6 @@ import math
 import os
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -12,10 +11,10 @@ from numpy.typing import NDArray
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
 from panolog.prepare.world.cropped import complete_panoramas
-from panolog.prepare.world.exif import Attitude, Crop, read_exif
+from panolog.prepare.world.exif import read_exif
 from panolog.scene.errors import InputError
 from panolog.scene.image_files import decode_with_alpha
-from tests.prepare.world.stills import SUFFIXES, crop, exiftool, write_still
+from tests.prepare.world.stills import SUFFIXES, crop, write_still
 
 STOPS = math.log2(1 / 250 * 200 / 100 / 2.1**2)
 FULL, PART = (128, 64), (96, 40)  # a panorama, and what of it is there from (16, 8) on
@@ -128,20 +127,3 @@ def test_sfm_reads_the_metadata_first(tmp_path: Path) -> None:
         write_still(tmp_path / "place" / f"{index}.jpg", noise(FULL, index), orientation=3)
     with pytest.raises(InputError, match=r"0\.jpg: its EXIF orientation 3"):
         make_scene(tmp_path / "place", tmp_path / "scene", SfmSettings(), lambda *_: None)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_what_exiftool_writes(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a{suffix}"
-    cv2.imwrite(str(path), noise(PART))
-    options = [f"-XMP-GPano:{name}={value}" for name, value in {**POSE, **CROP}.items()]
-    exiftool(path, *options, "-ExposureTime=1/250", "-FNumber=2.1", "-ISO=200", "-Orientation#=8")
-    found = read_exif(path)
-    assert found.exposure_stops == pytest.approx(STOPS)
-    assert found.attitude == Attitude(225.5, 3, -2)
-    assert (found.crop, found.orientation) == (Crop(FULL, 16, 8, PART), 8)
-    exiftool(path, "-Orientation=")
-    whole = completed(path, tmp_path / "whole")
-    assert decode_with_alpha(whole)[0].shape == (64, 128, 3)
-    assert read_exif(whole).exposure_stops == pytest.approx(STOPS)

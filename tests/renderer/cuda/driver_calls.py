@@ -8,21 +8,19 @@ SIZES: the bytes of each parameter of each kernel. Prints the names of the kerne
 import ast
 import ctypes
 import itertools
-import math
 import struct
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from unittest import mock
 
 import torch
 from torch import Tensor
 
-from panolog.renderer.baked import Baked
-from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import iteration, launches, nvrtc, parts
 from panolog.renderer.cuda.card import Kernels
 from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.cuda.parts import Argument
+from tests.renderer.cuda.machine import surrounded
 from tests.renderer.hard_scenes import camera, cloud
 
 STREAM = 0x5EED
@@ -85,15 +83,6 @@ def expected(argument: Argument) -> bytes:
             return struct.pack("=q", argument)
 
 
-def surrounded(exact: bool, at: Camera) -> Baked:
-    """An exterior of one splat and one tile."""
-    tiles = math.prod(parts.tiles_of(at.width, at.height))
-    splat, layer = torch.zeros(parts.SPLAT_FLOATS), torch.zeros(1, 5, parts.TILE, parts.TILE).half()
-    places = torch.full((tiles,), -1, dtype=torch.int32)
-    fronts, spans = torch.zeros(1, dtype=torch.int64), torch.zeros(tiles, 2)
-    return Baked(splat, splat[: len(splat) * exact], places, spans, fronts, layer, layer, 1.0)
-
-
 def every_kernel(launch: Checked) -> None:
     """Iterations of both projections, with and without mask, depth and exterior, tiles as int16 and int32."""
     at, scene = camera(), cloud(40)
@@ -101,6 +90,8 @@ def every_kernel(launch: Checked) -> None:
     mask, depth = torch.ones(at.height, at.width, dtype=torch.bool), torch.zeros(at.height, at.width)
     status = torch.zeros(1, dtype=torch.int32)
     moments = [torch.zeros_like(scene.means) for _ in range(2)]
+    own = torch.arange(20)
+    around = [surrounded(replace(scene, exact=exact), at, own)[1] for exact in (False, True)]
     variants = ((None, True, 0), (50, False, 9999), (60, True, 0), (70, True, 9999))
     for (room, full, narrow), exact in itertools.product(variants, (False, True)):
         absolute = full and not exact
@@ -118,7 +109,7 @@ def every_kernel(launch: Checked) -> None:
             exact=exact,
             share=torch.ones((), dtype=torch.float64) if full else None,
             depth_share=torch.ones((), dtype=torch.float64) if full else None,
-            exterior=surrounded(exact, at) if full else None,
+            exterior=around[exact] if full else None,
             moving=full,
             absolute=absolute,
             exposure=torch.ones(2, 3) if full else None,

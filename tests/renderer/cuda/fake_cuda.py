@@ -1,4 +1,4 @@
-"""A torch whose GPU is the CPU, for `scene.tensors.transfer`: it says in which order things happen."""
+"""A torch whose GPU is the CPU, for transfers and checkpoints: it says in which order things happen."""
 
 import threading
 from types import SimpleNamespace
@@ -30,19 +30,22 @@ class Memory:
 
 
 class Torch:
-    """As much of torch as `CudaMover` uses; everything else is torch's own."""
+    """As much of torch as `CudaMover` and `Staging` use; everything else is torch's own."""
 
     def __init__(self) -> None:
         self.log: list[str] = []
-        self.pinned: list[int] = []  # sizes of the pinned buffers
+        self.pinned: list[int] = []  # sizes of the pinned buffers, 0 where unused ones are given back
         self.cuda = SimpleNamespace(
             Stream=lambda _: "uploads",
             Event=self._event,
             stream=self._switched,
-            current_stream=lambda _: SimpleNamespace(
-                wait_event=lambda _: self.log.append("training waits"), __str__=lambda: "training"
+            current_stream=lambda *_: SimpleNamespace(
+                wait_event=lambda _: self.log.append("training waits"),
+                synchronize=lambda: self.log.append("the host waits"),
+                __str__=lambda: "training",
             ),
         )
+        self.accelerator = SimpleNamespace(empty_host_cache=lambda: self.pinned.append(0))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(torch, name)
@@ -50,9 +53,8 @@ class Torch:
     def empty(self, size: int, *, pin_memory: bool = False, device: Any = "cpu", **options: Any) -> Any:
         if pin_memory:
             self.pinned.append(size)
-            return torch.empty(size, **options)
-        assert str(device) == "cuda"
-        return Memory(torch.empty(size, **options), self.log)
+        made = torch.empty(size, **options)
+        return Memory(made, self.log) if str(device) == "cuda" else made
 
     def _event(self, *, blocking: bool) -> SimpleNamespace:
         assert blocking  # who waits sleeps

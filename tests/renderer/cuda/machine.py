@@ -149,10 +149,11 @@ def check_adam(machine: Machine, moving: int, *, apart: bool = False) -> None:
     at = None if units is None else units.to(machine.device)
     for step in range(1, 6):
         gradient = torch.randn(200, 3, generator=rng)
-        settings = (moving, 0.01, 0.9, 0.999, 1e-15, step)
-        moved = gradient.to(machine.device)
-        launches.adam(machine.launch, ours[0], moved, ours[1], ours[2], *settings, at)
-        ops.adam(theirs[0], gradient, theirs[1], theirs[2], *settings, units)
+        settings = {"count": moving, "lr": 0.01, "beta1": 0.9, "beta2": 0.999, "eps": 1e-15, "step": step}
+        names = ("parameter", "exp_avg", "exp_avg_sq")
+        mine, other = (dict(zip(names, state, strict=True)) | settings for state in (ours, theirs))
+        launches.adam(machine.launch, gradient=gradient.to(machine.device), units=at, **mine)
+        ops.adam(gradient=gradient, units=units, **other)
     for one, two in zip(ours, theirs, strict=True):
         assert torch.allclose(one.cpu(), two, atol=1e-6)
         assert torch.equal(one.cpu().flatten()[moving:], two.flatten()[moving:])

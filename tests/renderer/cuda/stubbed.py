@@ -28,6 +28,11 @@ def without_pairs(kernel: str, grid: tuple[int, int], block: int, /, **arguments
             tensor.zero_()
 
 
+def _run(launch: Launch, op: str, *arguments: Any) -> Any:
+    """As `renderer.cuda.card.run`."""
+    return getattr(launches, op)(launch, **ops.named(op, arguments))
+
+
 @contextmanager
 def stubbed(launch: Launch) -> Iterator[None]:
     """Within it, ops and trainers on the CPU run as they do on a card, their kernels by `launch`."""
@@ -36,7 +41,7 @@ def stubbed(launch: Launch) -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what is overridden
             for name in OPS:
-                library.impl(name, partial(getattr(launches, name), launch), "CPU", allow_override=True)
+                library.impl(name, partial(_run, launch, name), "CPU", allow_override=True)
         with mock.patch.object(ops, "launcher", return_value=launch):
             yield
     finally:

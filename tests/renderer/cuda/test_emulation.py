@@ -10,8 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from panolog.renderer.cuda.nvrtc import CSRC
-from tests.renderer.cuda.emulation import EmulatedLaunch, KernelError, build, has_fused_multiply_add
+from tests.renderer.cuda.emulation import EmulatedLaunch, KernelError, has_fused_multiply_add
 
 KERNELS = """
 #include "common.cuh"
@@ -78,13 +77,6 @@ def test_what_a_card_would_not_report(name: str, launch: EmulatedLaunch) -> None
         launch(f"probe_{name}", grid, 64, n=wrong, out=torch.zeros(128))
 
 
-def test_the_line_is_that_of_the_access(launch: EmulatedLaunch) -> None:
-    with pytest.raises(KernelError) as error:
-        launch("probe_unset", (1, 1), 64, n=0, out=torch.zeros(64))
-    for number in re.findall(r"probe\.cu:(\d+)", str(error.value)):
-        assert "values[" in KERNELS.splitlines()[int(number) - 1]
-
-
 def turns(folder: Path, seed: int) -> list[float]:
     """When each thread of two blocks ran."""
     out = torch.zeros(129)
@@ -98,13 +90,6 @@ def test_the_order_of_threads_and_blocks_depends_on_the_seed_alone(launch: Emula
     assert len(set(map(tuple, orders))) == len(orders)
     assert len({order[0] < order[64] for order in orders}) == 2
     assert turns(launch.folder, 3) == orders[3]
-
-
-def test_arguments_that_the_kernel_does_not_take(launch: EmulatedLaunch) -> None:
-    with pytest.raises(KernelError, match="arguments are fp, the kernel takes ip"):
-        launch("probe_half", (1, 1), 64, n=1.0, out=torch.zeros(64))
-    with pytest.raises(KernelError, match="arguments are b8p, the kernel takes ip"):
-        launch("probe_half", (1, 1), 64, n=bytes(8), out=torch.zeros(64))
 
 
 def test_memory_that_torch_leaves_empty(launch: EmulatedLaunch) -> None:
@@ -141,9 +126,3 @@ def test_rounding_as_on_a_card(launch: EmulatedLaunch, monkeypatch: pytest.Monke
     if has_fused_multiply_add():
         contracted = rounding(EmulatedLaunch(launch.folder, contract=True, into=launch.into))
         assert contracted[0] != 0 and contracted[1] > 0
-
-
-def test_a_build_depends_on_every_header() -> None:
-    names = {path.name for path in build.included(CSRC / "cuda" / "composite.cu", (CSRC,))}
-    headers = {"footprint.h", "formulas.h", "gradients.h", "rays.h"}
-    assert names == {"composite.cu", "views.cuh", "common.cuh", *headers}

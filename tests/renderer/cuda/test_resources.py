@@ -13,31 +13,16 @@ pytest.importorskip("cuda.core", reason="CUDA: no cuda-core")
 
 # Of a thread. An SM has 65,536, given out in groups of eight for each thread: with 48 it holds five blocks of
 # 256 threads, with 64 four (all that sm_75 can hold); with 96 five blocks of 128, with 104 to 128 four.
-REGISTERS = {
-    "project_forward": 96,
-    "project_exterior": 40,
-    "project_backward": 120,
-    "project_absolute_backward": 120,
-    "project_ray_forward": 96,
-    "project_ray_exterior": 64,
-    "project_ray_backward": 120,
-    "project_motion": 64,
-    "bin_narrow": 64,
-    "bin_wide": 64,
-    "bin_ray_narrow": 64,
-    "bin_ray_wide": 64,
-    "composite_forward": 48,
-    "composite_backward": 48,
-    "composite_absolute_backward": 48,
-    "composite_ray_forward": 64,
-    "composite_ray_backward": 64,
-    "loss_similarity": 64,
-    "loss_gradient": 64,
-    "loss_absolute": 32,
-    "adam_step": 32,
-    "iteration_guard": 40,
-    "iteration_statistics": 32,
+LIMITS = {
+    32: "loss_absolute adam_step iteration_statistics",
+    40: "project_exterior iteration_guard",
+    48: "composite_forward composite_backward composite_absolute_backward",
+    64: "project_ray_exterior project_motion bin_narrow bin_wide bin_ray_narrow bin_ray_wide"
+    " composite_ray_forward composite_ray_backward loss_similarity loss_gradient",
+    96: "project_forward project_ray_forward",
+    120: "project_backward project_absolute_backward project_ray_backward",
 }
+REGISTERS = {name: limit for limit, names in LIMITS.items() for name in names.split()}
 SHARED = 48 << 10  # bytes of a block that need no opt-in
 LAST_SUM = 12  # instructions in double precision: loads, additions and the store of the sum over a block
 STACK = 128  # bytes of a thread: arrays of projection with indices that are not constants; no spills

@@ -49,12 +49,3 @@ def test_other_gradients_are_the_same_bytes_with_it(exact: bool) -> None:
         gradients.append([leaf.grad for leaf in leaves.tensors().values()])
     for one, two in zip(*gradients, strict=True):
         assert one is not None and two is not None and one.any() and torch.equal(one, two)
-
-
-def test_motions_compose_with_poses() -> None:
-    at, point = wide(camera()), np.array([0.3, -0.2, 1.5])
-    motion = np.array([0.01, -0.02, 0.03, 0, 0, np.pi / 2])
-    rotation, translation = moved(at.rotation.numpy(), at.translation.numpy(), motion)
-    before = at.rotation.numpy() @ point + at.translation.numpy()
-    expected = np.array([-before[1], before[0], before[2]]) + motion[:3]
-    assert rotation @ point + translation == pytest.approx(expected)

@@ -63,21 +63,12 @@ def tell_apart(panorama: Grey) -> None:
     assert "one above the other" in (describe_picture(above) or "")
 
 
-def test_pictures_that_show_nothing_are_not_taken_for_anything() -> None:
-    for shape in ((32, 64), (64, 64), (64, 32), (1, 2), (48, 64)):
-        assert describe_picture(np.zeros(shape, np.uint8)) is None
-        assert describe_picture(np.full(shape, 90, np.uint8)) is None
-
-
-def test_a_panorama_without_its_nadir_or_of_the_night_is_one() -> None:
+def test_pictures_that_are_not_taken_for_anything_else() -> None:
+    """Plain ones, the night, and light that rises and falls twice: front and back differ in details."""
     night = np.zeros((2 * SIDE, 4 * SIDE), np.uint8)
     night[SIDE - 30 : SIDE + 30] = np.random.default_rng(0).integers(0, 255, (60, 4 * SIDE))
-    assert describe_picture(night) is None
-
-
-def test_light_that_rises_and_falls_twice_is_no_pair_of_eyes() -> None:
-    """Front and back are equal but for details."""
     light = 120 + 45 * np.sin(np.arange(4 * SIDE) * 2 * np.pi / SIDE / 2)
-    plain = np.repeat(light[None], 2 * SIDE, axis=0)
-    noise = np.random.default_rng(0).normal(0, 4, plain.shape)
-    assert describe_picture((plain + noise).clip(0, 255).astype(np.uint8)) is None
+    noise = np.random.default_rng(0).normal(0, 4, (2 * SIDE, 4 * SIDE))
+    twice = (light + noise).clip(0, 255).astype(np.uint8)
+    plain = [np.full(shape, 90, np.uint8) for shape in ((32, 64), (64, 64), (64, 32), (1, 2), (48, 64))]
+    assert [describe_picture(picture) for picture in (night, twice, *plain, 0 * plain[0])] == [None] * 8

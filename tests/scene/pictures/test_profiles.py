@@ -11,7 +11,7 @@ import pytest
 from PIL import Image, ImageCms
 
 from panolog.orchestrator.watch.views.site.photographs import small_copy
-from panolog.scene.image_files import decode_colors, decode_panorama, decode_with_alpha
+from panolog.scene.image_files import decode_colors, decode_panorama
 from panolog.scene.pictures.profiles import embedded_profile, to_srgb
 
 ADOBE = ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06))  # chromaticities of Adobe RGB (1998), whose gamma is 2.2
@@ -37,20 +37,22 @@ def profile(primaries: tuple[tuple[float, float], ...] = ADOBE, gamma: float = 2
     white = matrix_of(primaries).sum(axis=1)
     scale = np.diag((bradford @ D50) / (bradford @ white))
     adapted = np.linalg.inv(bradford) @ scale @ bradford @ matrix_of(primaries)
-    text = b"text\0\0\0\0none\0"
     curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(gamma * 256)) + bytes(2)
-    tags = {b"cprt": text + bytes(-len(text) % 4), b"wtpt": b"XYZ \0\0\0\0" + s15(*D50)}
-    tags[b"desc"] = b"desc\0\0\0\0" + struct.pack(">I", 2) + b"x\0" + bytes(78 + 4)
+    tags = {b"rTRC": curve, b"gTRC": curve, b"bTRC": curve}
     for name, column in zip((b"rXYZ", b"gXYZ", b"bXYZ"), adapted.T, strict=True):
         tags[name] = b"XYZ \0\0\0\0" + s15(*column)
-    tags |= {b"rTRC": curve, b"gTRC": curve, b"bTRC": curve}
+    return icc(b"RGB ", tags)
+
+
+def icc(space: bytes, tags: dict[bytes, bytes]) -> bytes:
+    """A profile of colours of a space, with its white point and other tags."""
+    tags = tags | {b"wtpt": b"XYZ \0\0\0\0" + s15(*D50)}
     at, table, body = 128 + 4 + 12 * len(tags), struct.pack(">I", len(tags)), b""
     for name, data in tags.items():
         table += name + struct.pack(">II", at + len(body), len(data))
         body += data
-    head = (
-        struct.pack(">I4x", at + len(body)) + bytes([2, 0x10, 0, 0]) + b"mntrRGB XYZ " + bytes(12) + b"acsp"
-    )
+    kind = b"mntr" + space + b"XYZ " + bytes(12) + b"acsp"
+    head = struct.pack(">I4x", at + len(body)) + bytes([2, 0x10, 0, 0]) + kind
     return head.ljust(68, b"\0") + s15(*D50) + bytes(48) + table + body
 
 
@@ -79,60 +81,22 @@ def test_eight_bits_in_every_format(kind: str, tmp_path: Path) -> None:
     assert np.abs(decode_panorama(plain)[3, 5].astype(int) - SHOWN).max() > 15
 
 
-@pytest.mark.parametrize("kind", ["png", "tiff"])
-def test_sixteen_bits(kind: str, tmp_path: Path) -> None:
+def test_sixteen_bits(tmp_path: Path) -> None:
     pixels = np.full((32, 64, 3), in_adobe(SHOWN, 65535)[::-1], np.uint16)
-    data = bytes(cv2.imencode(f".{kind}", pixels, [cv2.IMWRITE_TIFF_COMPRESSION, 1])[1])
-    if kind == "png":
-        named = b"x\0\0" + zlib.compress(profile())
-        chunk = struct.pack(">I", len(named)) + b"iCCP" + named
-        data = data[:33] + chunk + struct.pack(">I", zlib.crc32(b"iCCP" + named)) + data[33:]
-    else:
-        data = with_tag(data, profile())
+    data = bytes(cv2.imencode(".png", pixels)[1])
+    named = b"x\0\0" + zlib.compress(profile())
+    chunk = struct.pack(">I", len(named)) + b"iCCP" + named
+    data = data[:33] + chunk + struct.pack(">I", zlib.crc32(b"iCCP" + named)) + data[33:]
     (tmp_path / "a").write_bytes(data)
     assert np.abs(decode_panorama(tmp_path / "a")[3, 5].astype(int) - SHOWN).max() <= 2
 
 
-def with_tag(tiff: bytes, content: bytes) -> bytes:
-    """A little-endian TIFF with the tag of a profile in its first directory, which is moved to the end."""
-    (at,) = struct.unpack_from("<I", tiff, 4)
-    (count,) = struct.unpack_from("<H", tiff, at)
-    entries = [tiff[at + 2 + 12 * i : at + 14 + 12 * i] for i in range(count)]
-    where = len(tiff) + len(tiff) % 2
-    entries.append(struct.pack("<HHII", 34675, 7, len(content), where))
-    entries.sort(key=lambda entry: struct.unpack_from("<H", entry)[0])
-    end = where + len(content) + len(content) % 2
-    body = tiff[:4] + struct.pack("<I", end) + tiff[8:]
-    body = body.ljust(where, b"\0") + content
-    return body.ljust(end, b"\0") + struct.pack("<H", count + 1) + b"".join(entries) + bytes(4)
-
-
 def test_grey_with_a_gamma_of_its_own(tmp_path: Path) -> None:
     """Its profile has one curve: a linear grey of a quarter is much lighter in sRGB."""
-    curve = b"curv\0\0\0\0" + struct.pack(">I", 0)
-    tags = {b"wtpt": b"XYZ \0\0\0\0" + s15(*D50), b"kTRC": curve}
-    at = 128 + 4 + 24
-    table, body = struct.pack(">I", 2), b""
-    for name, data in tags.items():
-        table += name + struct.pack(">II", at + len(body), len(data))
-        body += data
-    head = (
-        struct.pack(">I4x", at + len(body)) + bytes([2, 0x10, 0, 0]) + b"mntrGRAYXYZ " + bytes(12) + b"acsp"
-    )
-    grey = head.ljust(68, b"\0") + s15(*D50) + bytes(48) + table + body
+    grey = icc(b"GRAY", {b"kTRC": b"curv\0\0\0\0" + struct.pack(">I", 0)})
     Image.new("L", (64, 32), 64).save(tmp_path / "a.png", icc_profile=grey)
     expected = 255 * (1.055 * (64 / 255) ** (1 / 2.4) - 0.055)
     assert np.abs(decode_panorama(tmp_path / "a.png")[3, 5] - expected).max() <= 2
-
-
-def test_what_is_transparent_and_what_is_mixed(tmp_path: Path) -> None:
-    pixels = np.zeros((32, 64, 4), np.uint8)
-    pixels[:, :, :3] = in_adobe(SHOWN, 255)
-    pixels[:, 32:, 3] = 255
-    Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=profile())
-    found, used = decode_with_alpha(tmp_path / "a.png")
-    assert used is not None and used[:, 32:].all() and not used[:, :32].any()
-    assert np.abs(found[3, 50].astype(int) - SHOWN).max() <= 2
 
 
 def test_profiles_that_change_nothing_or_are_damaged() -> None:

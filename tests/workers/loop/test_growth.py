@@ -104,18 +104,6 @@ def test_resets_clamp_opacities_and_moments_of_the_scene() -> None:
     assert moments(leaves, optimizer, "opacities")[-SKY:].any()
 
 
-def test_what_is_not_finite_is_removed() -> None:
-    leaves, optimizer = start()
-    growth = Clone3DGS(CENTERS, 20, sky=SKY, gradient=1e9, prune_opacity=0.0, **OFTEN)
-    for iteration in (1, 2):
-        raster = step(leaves, optimizer)
-        with torch.no_grad():
-            leaves["means"][3] = torch.nan
-        growth.step(leaves, optimizer, raster, iteration)
-    assert len(leaves["means"]) == 69
-    assert torch.isfinite(leaves["means"]).all()
-
-
 def test_it_says_what_is_missing() -> None:
     leaves, optimizer = start()
     with pytest.raises(ValueError, match="no_such_setting"):
@@ -123,12 +111,3 @@ def test_it_says_what_is_missing() -> None:
     raster = rasterized(leaves, camera(64))
     with pytest.raises(ValueError, match="call backward"):
         Clone3DGS(CENTERS, 20, sky=SKY).step(leaves, optimizer, raster, 1)
-
-
-def test_a_sky_never_grows() -> None:
-    """Its gradients would make clones of it."""
-    leaves, optimizer = start()
-    growth = Clone3DGS(CENTERS, 20, sky=len(leaves["means"]) - 5, gradient=1e-9, percent_dense=1.0, **OFTEN)
-    for iteration in (1, 2):
-        growth.step(leaves, optimizer, step(leaves, optimizer), iteration)
-    assert 70 < len(leaves["means"]) <= 75

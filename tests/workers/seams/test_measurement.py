@@ -18,7 +18,7 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import exposed, exposure_affine
 from panolog.scene.model import Panorama, Scene
 from panolog.workers.events import Evaluated, Event, SeamMeasured
-from panolog.workers.seams.measurement import Seams, block_in_coarse
+from panolog.workers.seams.measurement import Seams
 from panolog.workers.specs import Value
 from panolog.workers.training.initialise import isotropic
 from tests.workers.trainings import evaluation_of, progress_of
@@ -146,16 +146,6 @@ def test_a_step_of_a_known_size_is_found(scene: Scene, plan: Plan, flat: list[Ev
     assert known(without.seam.difference.color) < 0.02
     assert event.seam.difference.depth == pytest.approx(0.0, abs=1e-3)
     assert event.seam.virtual > 0
-
-
-def test_a_block_shows_stage_one_elsewhere(plan: Plan) -> None:
-    merged, coarse = models(0.1)
-    shown = block_in_coarse(plan.cell(1), merged, coarse)
-    assert len(shown) == len(merged)
-    inside = plan.cell(1).contains(shown.means.numpy())
-    own = plan.cell(1).contains(merged.means.numpy())
-    torch.testing.assert_close(shown.sh0[inside], merged.sh0[own])
-    torch.testing.assert_close(shown.sh0[~inside], coarse.sh0[~own])
 
 
 def test_its_pictures_show_the_face(scene: Scene, plan: Plan) -> None:

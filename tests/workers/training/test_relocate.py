@@ -193,6 +193,20 @@ def test_the_budget_rises_evenly_and_ends_where_preflight_says() -> None:
     assert capped.budget(1500, 1000, 32_768) == 1200 and capped.budget(1500, 1300, 32_768) == 1300
 
 
+@pytest.mark.parametrize(
+    ("iterations", "refine", "factor"),
+    [(500, False, 1), (1_500, False, 1), (6_000, False, 2), (30_000, False, 20**0.5), (30_000, True, 1)],
+)
+def test_the_budget_follows_the_length_of_a_long_stage_one(
+    iterations: int, refine: bool, factor: float
+) -> None:
+    """A block begins with what a long Stage I has grown."""
+    config = TrainConfig(densify=DensifyConfig(method="relocate", growth=1.0, long_runs=0.5))
+    schedule = Schedule(config, iterations, extent=1.0, refine=refine)
+    added = 1000 * (0.85 + 0.5 * math.log(32.768))
+    assert schedule.budget(iterations, 1000, 32_768) == 1000 + int(factor * added)
+
+
 def test_training_ends_with_the_budget(tmp_path: Path) -> None:
     config = settings(sky={"count": 20}, densify=RELOCATED)
     coarse = coarse_of(small_scene(tmp_path, points=60), config)

@@ -4,8 +4,6 @@ import threading
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -18,31 +16,10 @@ from panolog.workers.training import checkpoint, saving
 from panolog.workers.training.saving import Outbox, Saver, Staging
 from panolog.workers.training.task_config import CheckpointConfig
 from tests.on_device import needs_a_card
+from tests.renderer.cuda.fake_cuda import Torch
 
 ONE = {"means": torch.rand(7, 3), "views": torch.arange(7), "sky": torch.tensor(2), "none": torch.rand(0, 3)}
 OTHER = {name: tensor + 1 for name, tensor in ONE.items()}
-
-
-class Torch:
-    """A torch whose pinned memory is memory, and which counts it, its copies and its waits."""
-
-    def __init__(self) -> None:
-        self.pinned: list[int] = []  # sizes of pinned buffers, 0 where unused ones are given back
-        self.waits = 0
-        stream = SimpleNamespace(synchronize=self._wait)
-        self.cuda = SimpleNamespace(current_stream=lambda: stream)
-        self.accelerator = SimpleNamespace(empty_host_cache=lambda: self.pinned.append(0))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(torch, name)
-
-    def empty(self, size: int, *, pin_memory: bool = False, **options: Any) -> Tensor:
-        if pin_memory:
-            self.pinned.append(size)
-        return torch.empty(size, **options)
-
-    def _wait(self) -> None:
-        self.waits += 1
 
 
 @pytest.fixture
@@ -71,7 +48,7 @@ def test_copies_share_one_pinned_buffer_and_one_wait(cuda: Torch) -> None:
     staging = Staging()
     assert same(staging.copied(ONE), ONE)
     assert same(staging.copied(OTHER), OTHER)
-    assert cuda.waits == 2
+    assert cuda.log.count("the host waits") == 2
     _, size = cuda.pinned
     assert size <= 2 * packed_bytes(ONE)
     larger = {"means": torch.rand(100, 3)}
@@ -89,7 +66,7 @@ def test_a_worker_on_a_gpu_that_sees_the_run_folder_writes_from_pinned_memory(
         assert isinstance(event, CheckpointWritten)
         found = checkpoint.load(outbox.folder / event.name)
         assert found.iteration == iteration and same(found.tensors, tensors)
-    assert (len(cuda.pinned), cuda.waits) == (2, 2)  # one buffer for both
+    assert (len(cuda.pinned), cuda.log.count("the host waits")) == (2, 2)  # one buffer for both
 
 
 def test_training_continues_while_a_file_is_written(

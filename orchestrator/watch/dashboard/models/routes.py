@@ -7,12 +7,18 @@ from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Request
 from fastapi.responses import Response
-from pydantic import BaseModel, ConfigDict
 
 from panolog.export.site.write import DESCRIPTION
 from panolog.orchestrator.watch.dashboard import maps
 from panolog.orchestrator.watch.dashboard.api import scene_of
-from panolog.orchestrator.watch.dashboard.dependencies import Registry, Run, body_of, fresh_watch, respond
+from panolog.orchestrator.watch.dashboard.dependencies import (
+    Body,
+    Registry,
+    Run,
+    body_of,
+    fresh_watch,
+    respond,
+)
 from panolog.orchestrator.watch.dashboard.models.downloads import Downloads, Kind
 from panolog.orchestrator.watch.dashboard.models.pages import ModelPages, page_policy
 from panolog.orchestrator.watch.dashboard.registry import RunRegistry
@@ -24,19 +30,15 @@ from panolog.scene.errors import InputError
 router = APIRouter()
 
 
-class ViewerRequest(BaseModel):
+class ViewerRequest(Body):
     """The body of a POST to /viewer."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
 
     task: str | None = None
     camera: str | None = None
 
 
-class DownloadRequest(BaseModel):
+class DownloadRequest(Body):
     """The body of a POST to /downloads."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
 
     kind: Kind
 

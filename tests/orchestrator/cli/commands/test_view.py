@@ -6,22 +6,21 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from threading import Thread
 
 import httpx
 import pytest
 
-from panolog.orchestrator.cli.commands.view import Site, SiteServer, site_of
+from panolog.orchestrator.cli.commands.view import SiteServer, site_of
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.cli.program import call
+from tests.orchestrator.history import begun
 from tests.orchestrator.watch.dashboard.served import raw
-from tests.orchestrator.watch.views.models import make_run, save_model, save_plan
+from tests.orchestrator.watch.views.models import save_model, save_plan
+from tests.orchestrator.watch.views.sites import serving
 from tests.scenes import write_scene
 
 
@@ -30,28 +29,15 @@ def folder(tmp_path: Path) -> RunFolder:
     """A run with a model and a scene whose panoramas are those of its plan."""
     names = [f"pano_{i}.jpg" for i in range(6)]
     write_scene(tmp_path / "scene", names=names)
-    folder = make_run(tmp_path / "a <run>", tmp_path / "scene")
+    folder = begun(tmp_path / "a <run>", scene=tmp_path / "scene")
     save_model(folder, COARSE)
     save_plan(folder, names)
     return folder
 
 
-@contextmanager
-def serving(site: Site) -> Iterator[SiteServer]:
-    server = SiteServer(site)
-    thread = Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield server
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
-
-
 def test_the_files_of_the_page_are_served_and_photographs_of_the_scene(folder: RunFolder) -> None:
-    with site_of(folder.root, Wanted()) as site, serving(site) as server:
-        with httpx.Client(base_url=server.url) as client:
+    with site_of(folder.root, Wanted()) as site, serving(site) as address:
+        with httpx.Client(base_url=address) as client:
             page = client.get("/")
             assert page.headers["content-type"] == "text/html; charset=utf-8"
             assert "default-src 'none'" in page.headers["content-security-policy"]
@@ -73,8 +59,8 @@ def test_nothing_is_served_to_other_sites_and_from_other_folders(folder: RunFold
     with site_of(folder.root, Wanted()) as site:
         (tmp_path / "secret").write_text("secret")
         (site.folder / "link").symlink_to(tmp_path / "secret")
-        with serving(site) as server:
-            url = server.url.rstrip("/")
+        with serving(site) as address:
+            url = address.rstrip("/")
             host = url.removeprefix("http://").encode()
 
             def answer(line: bytes, host: bytes = host) -> tuple[bytes, bytes]:
@@ -82,15 +68,8 @@ def test_nothing_is_served_to_other_sites_and_from_other_folders(folder: RunFold
                 said = raw(url, line + b" HTTP/1.1\r\nHost: " + host + b"\r\nConnection: close\r\n\r\n")
                 return said.split(b" ")[1], said
 
-            for path in (
-                b"/../secret",
-                b"/%2e%2e/secret",
-                b"/link",
-                b"//etc/passwd",
-                b"/\x00",
-                b"/%00",
-                b"/.",
-            ):
+            outside = b"/../secret", b"/%2e%2e/secret", b"/link", b"//etc/passwd", b"/\x00", b"/%00", b"/."
+            for path in outside:
                 status, said = answer(b"GET " + path)
                 assert status in (b"404", b"400"), path
                 assert b"secret" not in said

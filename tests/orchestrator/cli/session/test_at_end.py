@@ -1,8 +1,8 @@
-"""`--at-end`: when its command is carried out, and what its environment has."""
+"""What follows a run: files for viewers, and the command of `--at-end`."""
 
+import json
 import subprocess
 import sys
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,26 +11,21 @@ import pytest
 from panolog.orchestrator.cli.session import at_end, supervise
 from panolog.orchestrator.cli.session.at_end import when_ended
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.orchestrator.runs.money.records import BudgetReached, BudgetSet
-from panolog.orchestrator.runs.records import Outcome, Record, RunBegan, RunEnded
+from panolog.orchestrator.runs.records import Delivered, Noticed, Outcome, Record, RunBegan, RunEnded
 from panolog.orchestrator.runs.storage.state import MirrorState, write_state
-from panolog.orchestrator.runs.store import Database
-from tests.orchestrator.cli.program import begun, call
+from panolog.scene.ply import read_ply, read_sky
+from panolog.workers.tasks import DELIVER, EVAL
+from tests.orchestrator.cli.program import call
+from tests.orchestrator.fakes import Harness
+from tests.orchestrator.history import begun
 
 URL = "s3://bucket/run"
 BEGAN = RunBegan("host", 7, resumed=False)
 DONE = (BEGAN, RunEnded(Outcome.DONE))
 LIMITED = (BEGAN, BudgetSet(deadline=5.0), BudgetReached("the limit of 5 USD"), RunEnded(Outcome.LIMITED))
 FAILED = (BEGAN, RunEnded(Outcome.FAILED, "block 3 has failed"))
-
-
-def run_of(root: Path, *records: Record) -> RunFolder:
-    """A run with that history, of a scene that is gone."""
-    folder = begun(root)
-    with closing(Database(folder.database)) as database:
-        database.append(records)
-    return folder
 
 
 class End:
@@ -53,11 +48,16 @@ def end(tmp_path: Path) -> End:
     return End(tmp_path)
 
 
+def drive(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
+    """Lets a supervisor run drivers that are these lines of Python."""
+    monkeypatch.setattr(supervise, "_PROGRAM", (sys.executable, "-c", program))
+
+
 @pytest.mark.parametrize(("records", "outcome"), [(DONE, "done|"), (LIMITED, "limited|the limit of 5 USD")])
 def test_it_follows_the_end_of_a_run(
     tmp_path: Path, end: End, records: tuple[Record, ...], outcome: str
 ) -> None:
-    folder = run_of(tmp_path / "run", *records)
+    folder = begun(tmp_path / "run", *records)
     result = call("resume", folder.root, *end.option)
     assert result.exit_code == 0, result.output
     assert end.said == [[*outcome.split("|"), str(folder.root)]]
@@ -67,7 +67,7 @@ def test_it_follows_the_end_of_a_run(
 def test_a_run_that_fails_or_is_refused_is_told_apart(tmp_path: Path, end: End) -> None:
     """The scene is gone, so neither can be resumed."""
     for name, records, outcome in (("a", FAILED, "failed"), ("b", (BEGAN,), "refused")):
-        folder = run_of(tmp_path / name, *records)
+        folder = begun(tmp_path / name, *records)
         assert call("resume", folder.root, *end.option).exit_code == 2
         (found, reason, run) = end.said[-1]
         assert (found, run) == (outcome, str(folder.root)) and "/gone" in reason
@@ -83,36 +83,27 @@ def test_a_run_that_is_refused_before_there_is_a_folder(tmp_path: Path, end: End
 def test_a_supervisor_carries_it_out_once_when_it_gives_up(
     tmp_path: Path, end: End, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = run_of(tmp_path / "run", BEGAN)
+    folder = begun(tmp_path / "run", BEGAN)
     monkeypatch.setattr(supervise, "_FIRST_S", 0.0)
-    killed = "import os; os.kill(os.getpid(), 9)"
-    monkeypatch.setattr(supervise, "_PROGRAM", (sys.executable, "-c", killed))
-    options = ("--supervise", "--max-resumes", 2, *end.option)
-    assert call("resume", folder.root, *options).exit_code == 1
+    drive(monkeypatch, "import os; os.kill(os.getpid(), 9)")
+    assert call("resume", folder.root, "--supervise", "--max-resumes", 2, *end.option).exit_code == 1
     assert end.said == [["failed", "exit code 1", str(folder.root)]]
 
 
-@pytest.mark.parametrize("code", [0, 1, 2])
-def test_a_supervisor_carries_it_out_when_its_driver_has_ended(
-    tmp_path: Path, end: End, monkeypatch: pytest.MonkeyPatch, code: int
+@pytest.mark.parametrize(
+    ("code", "said"), [(0, ["done"]), (1, ["failed"]), (2, ["refused"]), (130, [])], ids=str
+)
+def test_a_supervisor_carries_it_out_unless_its_driver_was_stopped(
+    tmp_path: Path, end: End, monkeypatch: pytest.MonkeyPatch, code: int, said: list[str]
 ) -> None:
-    folder = run_of(tmp_path / "run", BEGAN)
-    monkeypatch.setattr(supervise, "_PROGRAM", (sys.executable, "-c", f"import sys; sys.exit({code})"))
+    folder = begun(tmp_path / "run", BEGAN)
+    drive(monkeypatch, f"import sys; sys.exit({code})")
     assert call("resume", folder.root, "--supervise", *end.option).exit_code == code
-    assert [said[0] for said in end.said] == [("done", "failed", "refused")[code]]
-
-
-def test_a_run_that_is_stopped_keeps_its_machine(
-    tmp_path: Path, end: End, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = run_of(tmp_path / "run", BEGAN)
-    monkeypatch.setattr(supervise, "_PROGRAM", (sys.executable, "-c", "import sys; sys.exit(130)"))
-    assert call("resume", folder.root, "--supervise", *end.option).exit_code == 130
-    assert end.said == []
+    assert [outcome for outcome, *_ in end.said] == said
 
 
 def test_another_driver_keeps_its_machine(tmp_path: Path, end: End) -> None:
-    folder = run_of(tmp_path / "run", BEGAN)
+    folder = begun(tmp_path / "run", BEGAN)
     with lock.hold(folder.lock):
         result = call("resume", folder.root, *end.option)
     assert result.exit_code == 2 and end.said == []
@@ -120,7 +111,7 @@ def test_another_driver_keeps_its_machine(tmp_path: Path, end: End) -> None:
 
 
 def test_a_run_that_is_not_all_in_its_store_keeps_its_machine(tmp_path: Path, end: End) -> None:
-    folder = run_of(tmp_path / "run", *DONE)
+    folder = begun(tmp_path / "run", *DONE)
     said: list[str] = []
     for state, count in ((MirrorState(URL, problem="no access"), 0), (MirrorState(URL, complete=True), 1)):
         write_state(folder.mirror, state)
@@ -131,7 +122,7 @@ def test_a_run_that_is_not_all_in_its_store_keeps_its_machine(tmp_path: Path, en
 
 
 def test_a_command_that_fails_or_hangs_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, file = run_of(tmp_path / "run", *DONE), tmp_path / "goes on"
+    folder, file = begun(tmp_path / "run", *DONE), tmp_path / "goes on"
     result = call("resume", folder.root, "--at-end", "exit 3")
     assert (result.exit_code, "has failed (code 3)" in result.stderr) == (0, True)
     started: list[subprocess.Popen[bytes]] = []
@@ -147,3 +138,62 @@ def test_a_command_that_fails_or_hangs_is_said(tmp_path: Path, monkeypatch: pyte
     assert "it goes on by itself" in result.stderr
     file.touch()
     assert started[0].wait(timeout=300) == 7
+
+
+def delivering(folder: Path) -> Harness:
+    """A run with run.json, which names the scene."""
+    harness = Harness(folder, deliver=True)
+    scene = harness.job.scene
+    reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
+    write_info(harness.folder, make_info(reference, harness.job.config))
+    return harness
+
+
+def test_files_for_viewers(tmp_path: Path) -> None:
+    harness = delivering(tmp_path)
+    state = harness.drive()
+    assert state.outcome == "done"
+    folder, (record,) = harness.folder, harness.records(Delivered)
+    whole = read_ply(folder.point_cloud)
+    sky = read_ply(folder.sky)
+    assert (len(sky), sky.sky) == (whole.sky, whole.sky)
+    assert (sky.means == read_sky(folder.point_cloud).means).all()
+    place = json.loads(folder.georeference.read_bytes())
+    assert place["provenance"]["scene"] == harness.job.scene.fingerprint
+    assert place["provenance"]["settings"]["width"] == harness.job.config.width
+    page = json.loads((folder.web / "scene.json").read_bytes())
+    assert page["total"] == len(whole)
+    assert [camera["name"] for camera in page["cameras"]]
+    assert (folder.web / page["model"]).is_file() and (folder.web / "index.html").is_file()
+    files = [folder.sky, folder.georeference, folder.page, *folder.web.rglob("*")]
+    assert b"engine.js" in folder.page.read_bytes()
+    assert record.size == sum(file.stat().st_size for file in files if file.is_file())
+    assert state.task(DELIVER).status == "done"
+
+
+def test_a_resumed_run_has_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    whole, killed = delivering(tmp_path / "a"), delivering(tmp_path / "b")
+    whole.drive()
+
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("panolog.orchestrator.cli.session.delivery.write_json", die)
+        with pytest.raises(KeyboardInterrupt):
+            killed.drive()
+    assert killed.state.task(EVAL).status == "done" != killed.state.task(DELIVER).status
+    assert killed.drive(resumed=True).outcome == "done"
+    for name in ("web/scene.json", "web/model.sog", "sky.ply"):
+        assert (whole.folder.root / name).read_bytes() == (killed.folder.root / name).read_bytes()
+
+
+def test_a_place_that_is_wrong_is_a_notice(tmp_path: Path) -> None:
+    harness = delivering(tmp_path)
+    (harness.job.scene.root / "offset.json").write_text("{}")
+    assert harness.drive().outcome == "done"
+    (notice,) = (record for record in harness.records(Noticed) if record.task == DELIVER)
+    assert "no files for viewers" in notice.message and "offset.json: offset" in notice.message
+    assert not harness.folder.web.exists()

@@ -31,7 +31,6 @@ from panolog.workers.specs import TaskSpec
 from tests.orchestrator.calibrated import says
 from tests.orchestrator.cli.program import call, shown
 from tests.orchestrator.fakes import DIED, MACHINE, CrashError, FakePool, well
-from tests.scenes import write_scene
 
 pytestmark = pytest.mark.system
 
@@ -60,11 +59,6 @@ def resume(root: Path, action: Callable[[], object] = ignore) -> None:
 
 def status(root: Path) -> Any:
     return shown("status", root)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scene"))
 
 
 @pytest.fixture(scope="module")

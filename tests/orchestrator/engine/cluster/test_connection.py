@@ -4,15 +4,18 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
+import ray
 from ray.exceptions import RaySystemError
 
 from panolog.orchestrator.engine.cluster.connection import connect
 from panolog.orchestrator.engine.cluster.failures import reported
-from panolog.scene.errors import ClusterLostError, ConfigError
+from panolog.scene.errors import ClusterError, ClusterLostError, ConfigError
 from tests.ray_head import wait_until
 
 pytestmark = pytest.mark.system
@@ -65,15 +68,37 @@ def test_nothing_is_left_and_workers_have_the_priority_that_is_wanted(
     assert not [path for path in shared if Path(path).exists()]
 
 
-def test_nice_is_refused_with_a_cluster(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--nice 5: only for runs on this machine"):
-        connect("auto", tmp_path, nice=5).__enter__()
-
-
-def test_a_priority_that_is_no_number_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("address", "nice", "why"),
+    [
+        ("auto", 5, "--nice 5: only for runs on this machine"),
+        (None, None, "^RAY_worker_niceness=low: give a number from 0 to 19"),
+    ],
+)
+def test_a_priority_that_cannot_be_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, address: str | None, nice: int | None, why: str
+) -> None:
     monkeypatch.setenv("RAY_worker_niceness", "low")
-    with pytest.raises(ConfigError, match=r"^RAY_worker_niceness=low: give a number from 0 to 19"):
-        connect(None, tmp_path).__enter__()
+    with pytest.raises(ConfigError, match=why):
+        connect(address, tmp_path, nice=nice).__enter__()
+
+
+@pytest.mark.parametrize("slow", [1, 3])
+def test_a_machine_too_busy_to_start_ray_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow: int
+) -> None:
+    start, failed = ray.init, iter(range(slow))
+
+    def init(**options: Any) -> None:
+        if next(failed, None) is not None:
+            message = "The current node timed out during startup. This could\nhappen"
+            raise Exception(message)  # of that class
+        start(**options)
+
+    monkeypatch.setattr(ray, "init", init)
+    late = pytest.raises(ClusterError, match=r"^Ray does not start .* \(The current .* could\); end other")
+    with late if slow == 3 else nullcontext(), connect(None, tmp_path):
+        assert ray.is_initialized()
 
 
 def test_a_failure_of_ray_is_a_lost_cluster() -> None:

@@ -56,8 +56,6 @@ Share = Callable[[Path], NodeFiles]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Yields(Scripted):
-    """Yields events."""
-
     events: Callable[[], Iterator[Event]]
 
     def run(self) -> Iterator[Event]:
@@ -75,7 +73,7 @@ def share(sharing: FileSharing, monkeypatch: pytest.MonkeyPatch) -> Share:
     return share_file
 
 
-def test_a_file_that_is_there_is_read_where_it_is_and_nothing_is_told(
+def test_a_file_that_is_there_is_read_where_it_is_and_nothing_is_reported(
     sharing: FileSharing, image: Path
 ) -> None:
     files = sharing.share_files([image], [])
@@ -216,7 +214,7 @@ def test_a_value_that_the_machine_has_does_not_travel(sharing: FileSharing) -> N
     assert node_files.received_bytes() == 0
 
 
-def test_bytes_are_told_with_milestones_and_when_they_have_doubled(share: Share, image: Path) -> None:
+def test_bytes_are_reported_with_milestones_and_when_they_have_doubled(share: Share, image: Path) -> None:
     files = share(image)
     progress = Progress(COARSE, 1, 9, 1.0)
     checkpoint = Checkpoint(COARSE, 1, {"x": torch.zeros(5)})

@@ -19,10 +19,10 @@ import pytest
 from panolog.orchestrator.engine.cluster.jobs import RUN_KEY, Cluster, ClusterJob
 from panolog.orchestrator.runs import log
 from panolog.orchestrator.runs.config import as_settings, load_config
+from panolog.orchestrator.runs.control import state_of
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import TaskStarted
-from panolog.orchestrator.runs.state import RunState, replay
-from panolog.orchestrator.runs.store import read_milestones, read_records
+from panolog.orchestrator.runs.store import read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.cli.program import call, one_line
@@ -35,8 +35,6 @@ SMALL = "--device cpu --blocks 2x1x1 --set sky.count=50 --set checkpoint.every=5
 
 
 class Ended(NamedTuple):
-    """How a command has ended in another process; the same names as in typer's `Result`."""
-
     exit_code: int
     stdout: str
     stderr: str
@@ -85,7 +83,6 @@ def over(head: Head, job: str) -> bool:
 
 
 def shown(ended: Any) -> Any:
-    """What it printed as JSON."""
     assert ended.exit_code == 0, ended.output
     return json.loads(ended.stdout)
 
@@ -103,11 +100,6 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[str]]:
 
     monkeypatch.setattr("panolog.orchestrator.engine.cluster.jobs.connect", lambda _: Recorder())
     return begun
-
-
-def state_of(root: Path) -> RunState:
-    database = RunFolder(root).database
-    return replay(read_milestones(database)) if database.exists() else RunState()
 
 
 @pytest.mark.nightly

@@ -36,7 +36,6 @@ class Spot:
     service: Metadata
 
     def begin(self) -> None:
-        """Starts a task there that runs until it is requested to stop."""
         self.pool.start(Placement(self.node, 1.0, 2**30), Works())
         assert isinstance(self.message(), Hello)
 
@@ -45,7 +44,6 @@ class Spot:
         return self.pool.take(TASK)
 
     def end(self) -> None:
-        """Requests the task to stop, which saves a checkpoint first."""
         self.pool.stop(TASK)
         messages = [self.message()]
         while not isinstance(messages[-1], Ended):
@@ -60,7 +58,6 @@ class Spot:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
-    """A head without cores, which this process is connected to."""
     head = {"num_cpus": 0, "include_dashboard": False}
     found = Cluster(initialize_head=True, head_node_args=head)
     try:

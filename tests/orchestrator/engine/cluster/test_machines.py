@@ -84,18 +84,15 @@ class Cluster:
         self.environment = cluster_environment()
 
     def start(self) -> None:
-        """Returns when all three have said that they run."""
         self._ray("head", HEAD, "--head", "--port=6379", "--num-cpus=0", "--include-dashboard=false")
         for host, address in WORKERS.items():
             self._ray(host, address, f"--address={ADDRESS}", "--num-cpus=1")
         wait_until(lambda: all(self.starts(host) for host in ("head", *WORKERS)), "three hosts with Ray", 240)
 
     def starts(self, host: str) -> int:
-        """How often Ray has been started there."""
         return self.log(host).read_text().count("Ray runtime started")
 
     def log(self, host: str) -> Path:
-        """What Ray says there."""
         return self.folder / f"{host}.log"
 
     def drive(self, *arguments: object, errors: Path) -> int:

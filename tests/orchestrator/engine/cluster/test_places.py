@@ -9,7 +9,6 @@ CORES, GPUS = Node("c", "cores", 8, 2**40), Node("g", "gpus", 8, 2**40, (Gpu(),)
 
 @pytest.fixture
 def free(monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, float]]:
-    """What Ray says is free."""
     values = {"c": {"CPU": 8.0}, "g": {"CPU": 8.0, "GPU": 4.0}}
     monkeypatch.setattr(places, "available_resources_per_node", lambda: values)
     return values

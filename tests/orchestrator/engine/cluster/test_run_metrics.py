@@ -33,7 +33,6 @@ def after(*records: Record) -> tuple[RunState, list[Stored]]:
 
 
 def standing(*records: Record) -> dict[str, float]:
-    """The gauges after those records."""
     found = list(gauges(after(*records)[0]))
     assert {(sample.task, sample.node) for sample in found} <= {(str(BLOCK), "Nürnberg")}
     return {sample.metric: sample.value for sample in found}
@@ -79,7 +78,7 @@ class Fake:
     inc = set
 
 
-def test_gauges_are_told_again_and_counters_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gauges_are_set_again_and_counters_once(monkeypatch: pytest.MonkeyPatch) -> None:
     made: dict[str, Fake] = {}
 
     def make(name: str, description: str, tag_keys: tuple[str, ...]) -> Fake:

@@ -53,15 +53,12 @@ BLOCK = TaskId.block(1)
 
 
 class Limited(Harness):
-    """A job whose stages take as long as its clock says, with a budget."""
-
     def __init__(self, folder: Path, budget: BudgetSet, **settings: Any) -> None:
         super().__init__(folder, **settings)
         self.clock = SetClock()
         self.begin(budget)
 
     def begin(self, budget: BudgetSet | None = None) -> None:
-        """What `session` records before the driver."""
         with closing(Database(self.folder.database, self.clock)) as database:
             lost = lost_with_driver(self.state)
             new = [] if self.state.began else [PreflightSaved("preflight.json", dict(AFTER))]
@@ -73,7 +70,6 @@ class Limited(Harness):
 
 
 def slow(harness: Limited, seconds: dict[TaskId, float], step: float = 1.0) -> Any:
-    """All goes well, but tasks take so long; one that is stopped saves a checkpoint first."""
 
     def script(spec: TaskSpec) -> Iterator[Event]:
         left = seconds.get(spec.task, 0.0)

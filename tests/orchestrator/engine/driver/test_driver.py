@@ -199,19 +199,3 @@ def test_a_shard_is_scored_with_what_its_cameras_can_distinguish(tmp_path: Path,
         assert len(model) < len(coarse)
         assert sizes == tuple(read_plan(harness.folder.plan).gaussians)
         assert not list((harness.folder.root / "partition").rglob("*.ply"))
-
-
-def test_another_attempt_at_a_block_starts_from_the_same(tmp_path: Path) -> None:
-    harness, starts = Harness(tmp_path, stage2={"exterior": "frozen", "detail": 20.0}), []
-
-    def script(spec: TaskSpec) -> Iterator[Event]:
-        if spec.task == TaskId.block(0):
-            starts.append(harness.folder.initial(TaskId.block(0)).read_bytes())
-            raise CrashError(DIED)
-        yield from well(spec)
-
-    for resumed in (False, True):
-        with pytest.raises(RunError):
-            harness.drive(script, resumed=resumed)
-        harness.folder.initial(TaskId.block(0)).unlink()
-    assert len(starts) > 2 and len(set(starts)) == 1

@@ -32,8 +32,6 @@ Action = Callable[..., Any]
 
 
 class Refusing:
-    """Raises an error in the first calls of an action."""
-
     def __init__(self, action: Action, error: Exception, times: int, when: Callable[..., bool] | None = None):
         self.action, self.error, self.left = action, error, times
         self.when = when or (lambda *_: True)
@@ -47,7 +45,6 @@ class Refusing:
 
 @pytest.fixture
 def quick(tmp_path: Path) -> Harness:
-    """It tries again at once."""
     return Harness(tmp_path, **QUICK)
 
 

@@ -1,6 +1,7 @@
-"""The spec of a task names its own files and no others."""
+"""What tasks get and demand: their files and no others, their image cache and memory."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,15 +10,24 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array
 
+from panolog.orchestrator.engine.driver.demands import Sizes, image_cache
 from panolog.orchestrator.engine.driver.job import Job, Specs
+from panolog.orchestrator.engine.estimates import estimate
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.machines.nodes import Gpu, Node, Placement
+from panolog.orchestrator.runs.records import BlockPlan, Merged
+from panolog.orchestrator.runs.state import RunState
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
 from panolog.partition.faces import Plane
+from panolog.scene.ply import write_ply
 from panolog.workers.evaluation import EvaluateSpec
+from panolog.workers.growth import Period, population
 from panolog.workers.specs import ModelFile
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from panolog.workers.training.initialise import scene_gaussians
+from panolog.workers.training.task_config import CacheConfig
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.fakes import Noting
 from tests.workers.small import WIDTH, small_scene
@@ -30,8 +40,6 @@ FACES = (Plane(0, 1, 0, 0.5, (0.5, 0.0, 0.0), (0.5, 1.0, 1.0)),)
 
 
 class Offer(Noting):
-    """The files and specs of a job whose Stage I and plan are done."""
-
     def __init__(self, folder: Path, **settings: Any) -> None:
         super().__init__()
         (folder / "scene").mkdir()
@@ -84,16 +92,73 @@ def test_a_block_also_gets_the_panoramas_that_it_is_compared_on(
     assert offer.scene == offer.images((*BLOCK, *compared))
 
 
-def test_an_evaluation_fits_poses_where_stage_one_has_refined_them(offer: Offer) -> None:
-    spec, test = offer.specs.of(EVAL), offer.job.scene.test
-    assert isinstance(spec, EvaluateSpec) and spec.pose_fit is None
-    assert not len(spec.scene.load().points)
-    offer.job.folder.root.mkdir(exist_ok=True)
-    offer.job.folder.poses.write_text("{}")
-    spec = offer.specs.of(EVAL)
-    assert isinstance(spec, EvaluateSpec) and spec.pose_fit == offer.job.config.loss.lambda_ssim
-    scene = spec.scene.load()
-    for row in test:
-        panorama, known = scene.panoramas[row], offer.job.scene.panoramas[row]
-        assert len(panorama.observed)
-        assert (scene.points[panorama.observed] == offer.job.scene.points[known.observed]).all()
+GIB = 2**30
+NODE = Node("a", "host", cpus=16, memory=64 * GIB, gpus=(Gpu(memory=24 * GIB), Gpu(memory=24 * GIB)))
+HALF = Placement("a", cpus=8.0, memory=24 * GIB, gpus=1.0, gpu=0, kind="GPU")  # one of its two GPUs
+SET = CacheConfig(memory=5.0, device=1.0)
+LEAST = CacheConfig().memory
+
+
+@pytest.mark.parametrize(
+    ("cache", "where", "memory", "need", "shortages", "expected"),
+    [
+        (CacheConfig(), replace(HALF, gpu=None), 64, 6, 0, (LEAST, None)),  # on the CPU the settings hold
+        (SET, replace(HALF, gpu=None), 64, 6, 0, (5.0, 1.0)),
+        (CacheConfig(), HALF, 64, 6, 0, (64 / 2 / 2, 0.9 * 24 - 6)),  # on a GPU, what is free
+        (CacheConfig(), HALF, 64, 40, 0, (64 / 2 / 2, 0.0)),
+        (CacheConfig(), HALF, 0, 6, 0, (LEAST, 0.9 * 24 - 6)),  # a small machine
+        (SET, HALF, 64, 6, 0, (5.0, 1.0)),
+        (SET, HALF, 64, 6, 1, (1.25, 0.0)),  # after a shortage nothing on the GPU
+    ],
+)
+def test_the_image_cache_is_as_set_or_what_its_place_leaves(
+    cache: CacheConfig,
+    where: Placement,
+    memory: int,
+    need: int,
+    shortages: int,
+    expected: tuple[float, float | None],
+) -> None:
+    found = image_cache(cache, where, replace(NODE, memory=memory * GIB), need * GIB, shortages)
+    assert (found.memory, found.device) == pytest.approx(expected)
+
+
+def test_the_growth_of_few_blocks_is_forecast_for_thousands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forecasts: list[int] = []
+
+    def counted(start: int, *rest: Any) -> list[Period]:
+        forecasts.append(start)
+        return population(start, *rest)
+
+    monkeypatch.setattr(estimate, "population", counted)
+    scene, folder = small_scene(tmp_path), RunFolder(tmp_path / "run")
+    folder.model(COARSE).parent.mkdir(parents=True)
+    write_ply(folder.model(COARSE), scene_gaussians(scene))
+    blocks = tuple(BlockPlan(i, 3, 1000 + i, train=True) for i in range(3000))
+    sizes = Sizes(Job(folder, scene, RunConfig(width=WIDTH, device="cpu")))
+    state = RunState(plan=blocks)
+    bytes_ = [sizes.of(TaskId.block(block.block), state) for block in blocks]
+    assert bytes_ == sorted(bytes_) and bytes_[0] < bytes_[-1]
+    assert len(forecasts) < 100
+
+
+def test_shards_demand_what_their_cameras_distinguish(tmp_path: Path) -> None:
+    """Here of a cloud whose points lie where others do, so that few are enough."""
+    scene, count = small_scene(tmp_path), 100_000
+    folder = RunFolder(tmp_path / "run")
+    folder.model(COARSE).parent.mkdir(parents=True)
+    dense = replace(scene, points=scene.points.repeat(count // len(scene.points), axis=0))
+    cloud = scene_gaussians(small_scene(tmp_path / "many", points=count))
+    write_ply(folder.model(COARSE), cloud)
+    state = RunState(merged=Merged("point_cloud.ply", count, 0, 1, 0.1))
+    sizes = {}
+    for detail in (0.0, 2.0):
+        settings = {"width": WIDTH, "device": "cpu", "sky": {"count": 0}, "stage2": {"detail": detail}}
+        config = RunConfig.model_validate(settings)
+        of = Sizes(Job(folder, dense, config)).of
+        sizes[detail] = [of(task, state) for task in (EVAL, TaskId.shard(0), TaskId.measure(0))]
+    whole, score, measure = sizes[2.0]
+    assert sizes[0.0][:2] == [whole, whole]
+    assert max(score, measure) < whole - count * 300

@@ -37,7 +37,6 @@ class Copies:
     content: object = None  # of the newest one
 
     def database(self, path: Path, clock: Clock) -> Database:
-        """The database of a run of which copies are made."""
         copies = self
 
         class Copied(Database):
@@ -61,7 +60,6 @@ class Copies:
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    """All files of a run but its history, and what says which driver is at work."""
     files = (path for path in root.rglob("*") if path.is_file() and path.suffix != ".part")
     return {
         str(path.relative_to(root)): path.read_bytes()

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import psutil
 import pytest
+import torch
 
 from panolog.orchestrator.engine.driver.local_pool import LocalPool, local_pool
 from panolog.orchestrator.engine.scheduling.pool import Ended, Failed, Hello, Message
@@ -15,7 +16,7 @@ from panolog.orchestrator.runs.records import Failure
 from panolog.workers.events import Checkpoint, Notice
 from panolog.workers.specs import TaskSpec
 from tests.orchestrator import scripted
-from tests.orchestrator.scripted import TASK, Fails, HangsAtExit, SendsMuch, Works
+from tests.orchestrator.scripted import TASK, Fails, HangsAtExit, SendsMuch, Short, Works
 
 pytestmark = pytest.mark.system
 
@@ -27,7 +28,6 @@ def pool() -> Iterator[LocalPool]:
 
 
 def messages(pool: LocalPool, spec: TaskSpec) -> Iterator[Message]:
-    """The messages of a task on this machine."""
     return scripted.messages(pool, spec, Placement(pool.nodes()[0].id, cpus=1.0, memory=2**30))
 
 
@@ -68,6 +68,13 @@ def test_a_killed_worker_is_lost_or_had_no_memory(
     *_, failed = running
     assert isinstance(failed, Failed)
     assert failed.kind == kind
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_worker_looks_at_its_card_before_it_begins(pool: LocalPool) -> None:
+    half = Placement(pool.nodes()[0].id, 1.0, 2**30, gpus=0.5)
+    _, failed = scripted.messages(pool, Short(device="cuda"), half)
+    assert isinstance(failed, Failed) and ("CUDA" in failed.reason or "NVIDIA" in failed.reason)
 
 
 def test_a_task_that_is_stopped_yields_a_checkpoint_and_ends(pool: LocalPool) -> None:

@@ -125,35 +125,23 @@ def test_a_block_is_part_of_a_model_from_its_union_on() -> None:
     assert after(STAGE_ONE, PLANNED, *MODELS, MERGED).joined(block)
 
 
-def test_nothing_starts_while_the_stage_before_runs() -> None:
-    running = started(TaskId.block(0))
-    assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS[1:], running) == ()
-    assert end(STAGE_ONE, *SCORES, PLANNED, *MODELS[1:], running) is None
-
-
-def test_a_block_that_has_failed_for_good_holds_nobody_up() -> None:
+def test_nothing_starts_while_the_stage_before_runs_but_what_has_failed_for_good_holds_nothing_up() -> None:
+    running = STAGE_ONE, *SCORES, PLANNED, *MODELS[1:], started(TaskId.block(0))
+    assert (next_tasks(*running), end(*running)) == ((), None)
     failed = TaskFailed(TaskId.block(1), 3, "out of memory", final=True)
     records: list[Record] = [STAGE_ONE, *SCORES, PLANNED, MODELS[0], failed]
     assert next_tasks(*records) == (TaskId.block(3),)
     assert next_tasks(*records, MODELS[2]) == (MERGE,)
-    assert end(*records, MODELS[2], MERGED, EVALUATED) == (
-        "failed",
-        "block 1 failed and keeps its Stage I Gaussians",
-    )
 
 
-def test_of_very_many_failed_blocks_the_first_are_named() -> None:
+def test_failures_end_the_run_and_of_many_failed_blocks_the_first_are_named() -> None:
+    assert end(TaskFailed(COARSE, 3, "NaN", final=True)) == ("failed", "coarse failed: NaN")
+    assert end(TaskFailed(COARSE, 1, "NaN", final=False)) is None
     blocks = tuple(BlockPlan(block, 5, 5, train=True) for block in range(500))
     failed = [TaskFailed(TaskId.block(block.block), 3, "out of memory", final=True) for block in blocks]
     ended = end(STAGE_ONE, *SCORES, PlanSaved("partition/plan.json", blocks), *failed, MERGED, EVALUATED)
     reason = "block 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 490 more failed and keeps its Stage I Gaussians"
     assert ended == ("failed", reason)
-
-
-def test_other_failures_end_the_run_and_success_too() -> None:
-    assert end(TaskFailed(COARSE, 3, "NaN", final=True)) == ("failed", "coarse failed: NaN")
-    assert end(TaskFailed(COARSE, 1, "NaN", final=False)) is None
-    assert end(STAGE_ONE, *SCORES, PLANNED, *MODELS, MERGED, EVALUATED) == ("done", "")
 
 
 GIB = 2**30
@@ -168,25 +156,23 @@ def finals(failure: Failure, **counts: Any) -> bool:
     return consequence(TaskState(TaskId.block(0), **counts), failure).final
 
 
-def test_retries_are_limited() -> None:
+def test_retries_are_limited_and_a_death_is_none_but_counts_too() -> None:
     assert [finals(Failure.ERROR, errors=errors) for errors in range(4)] == [False, False, True, True]
+    assert not finals(Failure.LOST, errors=2)
+    assert not finals(Failure.ERROR, losses=LOSSES - 1)
+    assert [finals(Failure.LOST, losses=losses) for losses in range(LOSSES + 1)] == [False] * LOSSES + [True]
 
 
 def test_input_is_wrong_once_a_second_node_or_attempt_has_confirmed_it() -> None:
     found = TaskState(COARSE, errors=1, failures=(Misfortune(Failure.INPUT, ("a", "")),))
-    assert not consequence(TaskState(COARSE), Failure.INPUT).final
+    again = Consequence(False, "tried again before the input counts as wrong")
+    assert consequence(TaskState(COARSE), Failure.INPUT) == again
     assert not consequence(found, Failure.INPUT, node="a").final
     assert consequence(found, Failure.INPUT, node="b").final
     assert consequence(found, Failure.INPUT, node="a", others=False).final
     assert not consequence(
         replace(found, failures=(Misfortune(Failure.ERROR, ("b", "")),)), Failure.INPUT
     ).final
-
-
-def test_a_death_is_not_held_against_the_task_but_not_for_ever() -> None:
-    assert not finals(Failure.LOST, errors=2)
-    assert not finals(Failure.ERROR, losses=LOSSES - 1)
-    assert [finals(Failure.LOST, losses=losses) for losses in range(LOSSES + 1)] == [False] * LOSSES + [True]
 
 
 @pytest.mark.parametrize(
@@ -223,9 +209,5 @@ def test_memory_gets_shorter_step_by_step() -> None:
     assert (second.final, "larger device" in second.then) == (False, True)
     nowhere = consequence(task, Failure.MEMORY, memory=24 * GIB, largest=24 * GIB)
     assert (nowhere.final, "no device has more memory" in nowhere.then) == (True, True)
-
-
-def test_a_new_driver_holds_nothing_against_a_task() -> None:
-    failed = TaskFailed(COARSE, 1, "out of memory", final=False, kind=Failure.MEMORY, memory=8 * GIB)
-    task = after(failed, failed, AGAIN).task(COARSE)
-    assert (task.errors, task.shortages, task.starved, task.retries) == (0, 0, 0, 2)
+    anew = after(failed, failed, AGAIN).task(COARSE)  # a new driver holds nothing against a task
+    assert (anew.errors, anew.shortages, anew.starved, anew.retries) == (0, 0, 0, 2)

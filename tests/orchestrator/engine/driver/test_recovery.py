@@ -1,14 +1,15 @@
-"""Where tasks start, and what a run does about lack of memory, deaths and Ctrl-C, without Ray."""
+"""Where tasks start, what a run does about lack of memory, deaths and Ctrl-C, and how it ends."""
 
 import math
+import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from rich.console import Console
 
 from panolog.orchestrator.engine.driver import driver as driver_module
 from panolog.orchestrator.engine.driver import saving, writers
@@ -24,16 +25,15 @@ from panolog.orchestrator.runs.records import (
     TaskFailed,
     TaskStarted,
 )
-from panolog.orchestrator.runs.state import Status
-from panolog.orchestrator.watch.views.terminal import table
-from panolog.scene.errors import RunError
-from panolog.scene.ply import ply_header
+from panolog.orchestrator.runs.store import Database, read_records
+from panolog.scene.errors import ClusterLostError, InputError, RunError, RunLockedError
 from panolog.workers.events import Calibration, Checkpoint, Event, Progress, Trained
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
+from panolog.workers.tasks import COARSE, EVAL, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
 from panolog.workers.training.task_config import CacheConfig
-from tests.orchestrator.fakes import LOST_NODE, CrashError, Harness, Script, SetClock, begins, fails, well
+from tests.orchestrator.fakes import LOST_NODE, CrashError, Harness, Script, SetClock, begins, well
+from tests.orchestrator.history import AGAIN
 
 GIB = 2**30
 NO_MEMORY = Failed("out of memory: CUDA out of memory. Tried to allocate 2.00 GiB", Failure.MEMORY)
@@ -47,15 +47,6 @@ def with_gpu(name: str, gib: int, count: int = 1) -> Node:
 
 
 # Where and when tasks start
-
-
-def test_a_task_starts_only_where_there_is_a_place_and_none_waits_beside_a_free_one(tmp_path: Path) -> None:
-    harness = Harness(tmp_path, [with_gpu("a", 0, count=2)], device="cuda", blocks="2x2x2")
-    assert harness.drive().outcome == "done"
-    blocks = [place for place, spec in harness.pool.started if spec.task.stage is Stage.BLOCK]
-    assert len(blocks) > 4
-    assert {(place.gpus, place.gpu) for place in blocks} == {(1.0, 0), (1.0, 1)}
-    assert harness.pool.most == 2
 
 
 def test_the_order_of_blocks_follows_what_was_measured(tmp_path: Path) -> None:
@@ -74,14 +65,6 @@ def test_the_order_of_blocks_follows_what_was_measured(tmp_path: Path) -> None:
     order = [blocks[task] for task in harness.tasks if task in blocks]
     assert order[0] == max(order)
     assert order[4:] == sorted(order[4:])
-
-
-def test_a_machine_that_joins_is_used(tmp_path: Path) -> None:
-    harness = Harness(tmp_path, [with_gpu("a", 24)], device="cuda")
-    joins = begins(TaskId.shard(0), lambda: harness.pool.join(with_gpu("b", 24)))
-    assert harness.drive(joins).outcome == "done"
-    blocks = [place for place, spec in harness.pool.started if spec.task.stage is Stage.BLOCK]
-    assert {place.node for place in blocks} == {"a", "b"}
 
 
 # Deaths
@@ -125,31 +108,6 @@ def test_a_block_that_runs_out_of_memory_gets_less_cache_then_a_larger_gpu(tmp_p
     assert [s.cache for s in harness.records(TaskStarted) if s.task == TaskId.block(0)] == caches
     why = "tried again with a smaller image cache and nothing else on its device"
     assert harness.state.task(TaskId.block(0)).reasons[0] == f"{NO_MEMORY.reason}; {why}"
-
-
-def test_a_block_for_which_no_gpu_is_large_enough_is_reported_and_the_rest_merged(tmp_path: Path) -> None:
-    harness = Harness(tmp_path, [with_gpu("a", 8), with_gpu("b", 24)], device="cuda", retries=9)
-    with pytest.raises(RunError, match="block 0 failed and keeps its Stage I Gaussians"):
-        harness.drive(fails(TaskId.block(0), NO_MEMORY, 99))
-    last = harness.attempts(TaskId.block(0))[-1][0]
-    assert (last.node, len(harness.attempts(TaskId.block(0))) <= 3) == ("b", True)
-    task = harness.state.task(TaskId.block(0))
-    assert "no device has more memory" in task.reasons[-1]
-    with (console := Console(width=200)).capture() as shown:
-        console.print(table(harness.state, root=harness.folder.root, running=False, wide=True))
-    assert f"block 0: {task.reasons[-1]}" in shown.get()
-    assert (task.status, harness.state.status(TaskId.block(1))) == (Status.FAILED, Status.DONE)
-    assert ply_header(harness.folder.point_cloud) == (202, 2)
-    assert [f.kind for f in harness.records(TaskFailed)] == [Failure.MEMORY] * len(
-        harness.attempts(TaskId.block(0))
-    )
-
-
-def test_on_the_cpu_too_the_second_attempt_has_the_machine_to_itself(harness: Harness) -> None:
-    harness.drive(fails(TaskId.block(0), NO_MEMORY, 1))
-    first, second = (place for place, _ in harness.attempts(TaskId.block(0)))
-    assert (first.threads, second.threads) == (1, 2)
-    assert second.memory > first.memory
 
 
 # Ctrl-C
@@ -223,12 +181,44 @@ def test_ctrl_c_where_nothing_trains_ends_at_once(harness: Harness) -> None:
     assert harness.pool.stopped == set()
 
 
-def test_a_merge_is_interrupted_at_once(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
-    merge = "panolog.orchestrator.engine.driver.results.merge_run"
-    monkeypatch.setattr(merge, lambda *_: harness.stop.signal())
-    with pytest.raises(KeyboardInterrupt):
-        harness.drive()
-    assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]
-    monkeypatch.undo()
+# However a driver ends, the run's history has its end and why
+
+
+@pytest.mark.parametrize(
+    ("error", "raised", "reason", "transient"),
+    [
+        (ValueError("bad"), ValueError, "internal error: ValueError: bad", True),
+        (SystemExit(3), SystemExit, "internal error: SystemExit: 3", True),
+        (ClusterLostError("Ray: no head"), ClusterLostError, "Ray: no head", True),
+        (OSError("EIO"), RunError, "EIO", True),
+        (sqlite3.OperationalError("locked"), RunError, "locked", True),
+        (InputError("a.jpg is truncated"), InputError, "a.jpg is truncated", False),
+    ],
+    ids=str,
+)
+def test_an_error_of_the_pool_leaves_its_record(
+    harness: Harness, error: BaseException, raised: type[BaseException], reason: str, transient: bool
+) -> None:
+    with pytest.raises(raised):
+        harness.drive(begins(COARSE, Progress(COARSE, 1, 2, 3.0), error))
+    (ended,) = harness.records(RunEnded)
+    assert (ended.outcome, ended.reason, ended.transient) == (Outcome.FAILED, reason, transient)
+    assert ("fakes.py" in ended.detail) == reason.startswith("internal error")
+    assert harness.state.transient == transient
     assert harness.drive(resumed=True).outcome == "done"
-    assert harness.tasks == [EVAL]
+    assert not harness.state.transient
+
+
+def test_a_driver_whose_run_another_has_taken_over_ends_without_a_record(harness: Harness) -> None:
+    """Where locks do not work."""
+
+    def take_over() -> None:
+        with closing(Database(harness.folder.database)) as database:
+            database.append([AGAIN])
+
+    steps = Progress(COARSE, 1, 2, 3.0), take_over, Progress(COARSE, 2, 2, 3.0)
+    with pytest.raises(RunLockedError, match="another driver has taken the run over"):
+        harness.drive(begins(COARSE, *steps))
+    *_, last = read_records(harness.folder.database)
+    assert last.record == AGAIN
+    assert harness.drive(resumed=True).outcome == "done"

@@ -19,11 +19,8 @@ from panolog.orchestrator.runs import thinning
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.orchestrator.runs.machines.nodes import Gpu, Node
-from panolog.scene.images import MOST_THREADS, passing_views
-from panolog.workers import device_memory
 from panolog.workers.device_memory import CONTEXT
 from panolog.workers.events import IterationCost
-from panolog.workers.metrics import LPIPS_BYTES
 from panolog.workers.tasks import Stage
 from panolog.workers.training.exterior import BAKED, PASSING, READING
 from tests.orchestrator.calibrated import MEBI, calibrated
@@ -158,16 +155,6 @@ def test_a_block_with_a_baked_exterior_trains_what_its_cell_has(tmp_path: Path) 
     few, many = (own.block(50_000, gaussians, 4) for gaussians in (1_000, 20_000))
     assert few.gaussians < many.gaussians and few.host < many.host
     assert whole.block(50_000, 1_000, 4) == whole.block(50_000, 20_000, 4), "it trains with all of Stage I"
-
-
-def test_what_was_not_measured_is_counted_on_a_gpu(tmp_path: Path) -> None:
-    job = estimator(tmp_path, device="cuda")
-    job = replace(job, basis=assumed(job.scene, job.config))
-    pixels, views = 64 * 32, passing_views(MOST_THREADS) * 9 * 64 * 32
-    assert job.device(1_000_000) == device_memory.training(1_000_000, pixels) + views + CONTEXT
-    assert job.scoring(1_000_000, 0)[1] == device_memory.scoring(1_000_000, pixels) + views + CONTEXT
-    rendering = device_memory.rendering(1_000_000, pixels) + LPIPS_BYTES
-    assert job.rendering(1_000_000, 0)[1] == rendering + views + CONTEXT
 
 
 def test_disk_is_taken_by_models_and_checkpoints_that_stay(tmp_path: Path) -> None:

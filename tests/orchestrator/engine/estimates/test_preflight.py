@@ -1,6 +1,8 @@
+"""A job before it starts: where it is calibrated, whether it fits, and how it is divided."""
+
 import re
 import socket
-from collections.abc import Iterator, Set
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,22 +11,24 @@ import numpy as np
 import pytest
 
 from panolog.orchestrator.engine.estimates import calibration, suggestions
-from panolog.orchestrator.engine.estimates.calibration import Basis, assumed, calibrate
+from panolog.orchestrator.engine.estimates.calibration import Basis, assumed, await_machine, calibrate
 from panolog.orchestrator.engine.estimates.estimate import Estimator
 from panolog.orchestrator.engine.estimates.preflight import Preflight, choose_blocks, examine, require_memory
 from panolog.orchestrator.engine.estimates.suggestions import DETAIL, problem
+from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
 from panolog.orchestrator.engine.scheduling.pool import NONE, Failed
+from panolog.orchestrator.engine.scheduling.scaling import Group, Growth
 from panolog.orchestrator.runs.config import RunConfig, change
 from panolog.orchestrator.runs.machines.nodes import Node
-from panolog.orchestrator.runs.records import Failure
-from panolog.scene.errors import InputError
+from panolog.orchestrator.runs.records import Failure, Leaving
+from panolog.scene.errors import ClusterError, InputError
 from panolog.scene.model import Scene
 from panolog.workers.events import Calibration, IterationCost, Notice
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import CALIBRATE, Stage, TaskId
 from tests.orchestrator.calibrated import MEBI, calibrated, says
 from tests.orchestrator.fakes import FakePool, SetClock, fails
-from tests.workers.small import small_scene
+from tests.workers.small import WIDTH, small_scene
 
 PLENTY = 2**50
 TIMES = 50  # as many points as the scene has
@@ -314,3 +318,71 @@ def test_a_number_of_blocks_is_balanced(scene: Scene) -> None:
 def test_more_blocks_than_there_are_cameras_for_are_refused(scene: Scene) -> None:
     with pytest.raises(InputError, match=r"4 training panoramas are enough for --blocks 1 .* not for 7"):
         examined(scene, blocks="7")
+
+
+# Where a job is calibrated
+
+
+NODES = [Node(name, name, 2, 2**40) for name in ("a", "b")]
+
+
+@pytest.mark.parametrize(("leaving", "where"), [([], "a"), (["a"], "b"), (["a", "b"], "a")])
+def test_a_node_that_leaves_is_not_calibrated_on_if_another_stays(
+    leaving: list[str], where: str, tmp_path: Path
+) -> None:
+    pool = FakePool(says, NODES)
+    pool.leaving = {name: LeaveNotice(Leaving.PREEMPTION, 60) for name in leaving}
+    calibrate(pool, small_scene(tmp_path), RunConfig(width=WIDTH, device="cpu"))
+    assert [placement.node for placement, _ in pool.started] == [where]
+
+
+class ComingPool(FakePool):
+    """A machine joins when the driver has waited twice."""
+
+    def __init__(self, groups: tuple[Group, ...]) -> None:
+        super().__init__(says, [])
+        self.groups, self.left = groups, 2
+        self.requests: list[dict[str, int]] = []
+        self.when_waiting(self._wait)
+
+    def _wait(self) -> None:
+        self.left -= 1
+        if not self.left:
+            self.join(NODES[0])
+
+    def growth(self) -> Growth:
+        return Growth(self.groups, trouble="no spot machines" if self.left == 1 else "")
+
+    def request(self, wanted: Mapping[str, int]) -> None:
+        self.requests.append(dict(wanted))
+
+
+def test_without_a_machine_one_is_requested_and_waited_for() -> None:
+    small, large = Group("small", 4, 2, memory=2**33), Group("large", 4, 8, memory=2**36)
+    pool, said = ComingPool((large, small)), list[str]()
+    assert await_machine(pool, lambda: 2**30, said.append, cuda=False) is not None
+    assert pool.requests == [{"small": 1}, {"small": 1}, {}]
+    requested = "waiting for a machine: small (2 cores, 8.0 GiB) is requested from Ray's autoscaler"
+    assert said == [requested, f"{requested}; it reports: no spot machines", ""]
+    pool = ComingPool((large, small))
+    await_machine(pool, lambda: 2**34, said.append, cuda=False)
+    assert pool.requests[0] == {"large": 1}
+
+
+def test_where_none_can_be_started_one_may_join() -> None:
+    pool, said = ComingPool(()), list[str]()
+    assert await_machine(pool, lambda: 0, said.append, cuda=False) is None
+    assert said == ["waiting for a machine with a core: the cluster has none", ""]
+
+
+def test_a_cluster_that_stays_empty_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration, "_JOIN_S", 0.0)
+    with pytest.raises(ClusterError, match="no node of the cluster has a core for tasks"):
+        await_machine(FakePool(says, []), lambda: 0, lambda _: None, cuda=False)
+
+
+def test_where_there_is_a_machine_nothing_is_requested() -> None:
+    pool = ComingPool((Group("small", 4, 2),))
+    pool.join(NODES[1])
+    assert await_machine(pool, lambda: 0, lambda _: None, cuda=False) is None
+    assert pool.requests in ([], [{}])

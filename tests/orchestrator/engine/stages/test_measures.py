@@ -212,7 +212,7 @@ def test_seams_are_written_with_their_pictures_and_count_for_completeness(tmp_pa
     assert list(evaluation.report()["left_out"].values()) == ["damaged"]
 
 
-def test_what_is_measured_at_fitted_poses_stands_beside_the_metrics(tmp_path: Path) -> None:
+def test_what_is_measured_at_fitted_poses_stands_next_to_the_metrics(tmp_path: Path) -> None:
     scene, folder = small_scene(tmp_path), RunFolder(tmp_path / "run")
     write_ply(tmp_path / "model.ply", scene_gaussians(scene))
     shards, whole = [TaskId.measure(0), TaskId.measure(1)], replace(scene, test=(3, 4))

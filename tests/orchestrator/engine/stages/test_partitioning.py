@@ -1,25 +1,74 @@
-"""Districts of Stage I and their union; which blocks of a plan a run trains. Without Ray."""
+"""A place before and as it is partitioned: its outline, districts, blocks, and levels of detail of all."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from scipy.sparse import csr_array
 
-from panolog.orchestrator.engine.stages.partitioning import plan_records
+from panolog.orchestrator.engine.stages import surroundings
+from panolog.orchestrator.engine.stages.outline import write_outline
+from panolog.orchestrator.engine.stages.partitioning import block_labels, plan_records
+from panolog.orchestrator.engine.stages.surroundings import Surroundings
+from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import ModelSaved, Noticed, PlanSaved
+from panolog.orchestrator.watch.views.plan_map import read_points
 from panolog.partition.cells import Grid
-from panolog.partition.plan import PartitionConfig, make_plan
-from panolog.scene.ply import read_ply
+from panolog.partition.levels import make_levels
+from panolog.partition.plan import PartitionConfig, make_plan, read_plan
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.model import Scene
+from panolog.scene.ply import read_ply, write_ply
 from panolog.workers.events import Event, Trained
 from panolog.workers.merge import retained
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.training.initialise import scene_gaussians, scene_length
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.fakes import Harness, trained, well
+from tests.workers.small import WIDTH, small_scene
+
+CONFIG = RunConfig(width=64, blocks="2x1x1")
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    (tmp_path / "scene").mkdir()
+    return small_scene(tmp_path / "scene")
+
+
+def test_the_outline_of_a_place_is_a_plan_of_one_block(scene: Scene, tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run")
+    write_outline(folder, scene, CONFIG)
+    plan = read_plan(folder.known_plan)
+    assert (plan.grid.count, plan.rows) == (1, scene.train)
+    assert plan.names == tuple(scene.panoramas[row].name for row in scene.train)
+    np.testing.assert_array_equal(plan.centers, scene.centers[list(scene.train)])
+    np.testing.assert_allclose(read_points(folder.outline_points), scene.points, atol=1e-6)
+    written = folder.outline.read_bytes()
+    write_outline(folder, replace(scene, train=scene.train[:3]), CONFIG)
+    assert folder.outline.read_bytes() == written  # a resumed run keeps it
+
+
+def test_of_many_points_some_are_kept(scene: Scene, tmp_path: Path) -> None:
+    folder, many = RunFolder(tmp_path / "run"), scene.points.repeat(600, axis=0)
+    write_outline(folder, replace(scene, points=many), CONFIG)
+    assert 30_000 < len(read_points(folder.outline_points)) <= 50_000
+
+
+def test_cameras_that_bound_no_place_have_no_outline(scene: Scene, tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run")
+    write_outline(folder, replace(scene, train=scene.train[:1]), CONFIG)
+    assert not folder.known_plan.exists() and not folder.outline.parent.exists()
+
+
+# Districts of Stage I and their union; which blocks of a plan a run trains
+
 
 BOTH = TaskId.district(0), TaskId.district(1)
 
@@ -87,3 +136,38 @@ def test_a_block_of_one_camera_is_not_trained_and_a_notice_says_so(tmp_path: Pat
         assert [block.train for block in saved.blocks] == train
         lines = [record.message for record in notices if isinstance(record, Noticed)]
         assert any("block 0 has 1 camera, fewer than" in line for line in lines) == (least > 1)
+
+
+# Levels of detail
+
+
+@pytest.mark.parametrize("rows", [7, 10_000])
+def test_they_are_those_of_each_block_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int
+) -> None:
+    monkeypatch.setattr(surroundings, "_ROWS", rows)
+    scene, path = small_scene(tmp_path / "scene"), tmp_path / "model.ply"
+    start = scene_gaussians(scene)
+    model = Gaussians(**start.tensors(), sky=11, exact=True)
+    write_ply(path, model)
+    config = RunConfig.model_validate({"blocks": "2x2x1", "stage2": {"exterior": "baked", "detail": 6.0}})
+    found = Surroundings(scene, path, config, WIDTH)
+
+    means = model.means[model.scene].numpy()
+    labels = torch.from_numpy(block_labels(scene, means, config))
+    sizes = torch.bincount(labels, minlength=4)
+    assert found.sizes == tuple(sizes.tolist()) and sizes.min() > 0
+    angle, cameras = 6.0 * 2 * math.pi / WIDTH, scene.train[:2]
+    inside = torch.cat([labels, torch.full((model.sky,), -1)])
+    parts = []
+    for block in range(4):
+        own = Gaussians(**model.select(inside == block).tensors(), sky=0, exact=True)
+        levels = make_levels(own, angle * scene_length(scene), surroundings._LOW_PASS / 6.0)
+        parts.append(levels.rows(levels.cut(scene.centers[list(cameras)], angle)))
+    blocks = found.write_seen(tmp_path / "seen.ply", scene.centers[list(cameras)])
+    seen = read_ply(tmp_path / "seen.ply")
+    assert blocks.tolist() == np.repeat(range(4), list(map(len, parts))).tolist()
+    assert seen.exact and seen.sky == 11 and len(seen) < len(model)
+    for name, tensor in seen.tensors().items():
+        expected = [*(part.tensors()[name] for part in parts), model.tensors()[name][model.scene.stop :]]
+        assert torch.equal(tensor, torch.cat(expected)), name

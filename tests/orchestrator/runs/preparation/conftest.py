@@ -32,7 +32,6 @@ def sfm(town: Path, monkeypatch: pytest.MonkeyPatch) -> FakeSfm:
 
 @pytest.fixture(scope="module")
 def calm(town: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """An undisturbed run of the raw panoramas."""
     folder = tmp_path_factory.mktemp("calm")
     copytree(town / "images", folder / "raw")
     with pytest.MonkeyPatch.context() as patch:

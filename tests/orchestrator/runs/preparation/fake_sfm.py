@@ -33,8 +33,6 @@ Hook = Callable[[str], object]
 
 @dataclass
 class Report:
-    """What `make_scene` returns."""
-
     def lines(self) -> list[str]:
         return ["9 of 10 panoramas have a pose", "contradiction: a and b"]
 

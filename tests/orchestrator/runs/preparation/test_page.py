@@ -22,8 +22,9 @@ from panolog.orchestrator.runs.store import read_milestones
 from panolog.orchestrator.watch.views.preparation import prepared_share, view_preparation
 from panolog.orchestrator.watch.views.timing import progress_of
 from panolog.workers.tasks import PREPARE
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.browser import PHONE, opened
-from tests.orchestrator.watch.dashboard.served import EVIL, POST, Served, append, serving, write_run
+from tests.orchestrator.watch.dashboard.served import EVIL, POST, Served, serving, write_run
 from tests.visual import legible
 
 COUNTS = Counts(panoramas=12, registered=10, points=3_000, weak_links=0, contradictions=2)

@@ -91,36 +91,29 @@ def test_a_run_killed_in_a_step_ends_with_the_same_bytes(
     assert not workspace_folder(same.scene.resolve()).exists()
 
 
-def test_ctrl_c_in_the_preparation_is_resumed(
-    calm: RunFolder, raw: Path, sfm: FakeSfm, tmp_path: Path
+@pytest.mark.parametrize("how", ["Ctrl-C", "panolog stop"])
+def test_a_stop_in_the_preparation_is_resumed(
+    how: str, calm: RunFolder, raw: Path, sfm: FakeSfm, tmp_path: Path
 ) -> None:
-    def interrupt(at: str) -> None:
-        if at == "poses":
-            os.kill(os.getpid(), signal.SIGINT)
-
-    sfm.at = interrupt
-    with pytest.raises(KeyboardInterrupt):
-        start(raw, tmp_path / "run")
-    status = shown("status", tmp_path / "run")
-    assert (status["status"], status["stage"]) == ("interrupted", "prepare")
-    sfm.at = ignore
-    resume(tmp_path / "run")
-    assert sfm.done == ["features", "poses"]
-    assert RunFolder(tmp_path / "run").point_cloud.read_bytes() == calm.point_cloud.read_bytes()
-
-
-def test_a_request_to_stop_is_taken_in_the_preparation(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
-    root, waited = tmp_path / "run", threading.Event()
+    folder = RunFolder(tmp_path / "run")
 
     def stop(at: str) -> None:
-        if at == "poses":
-            control.send(RunFolder(root), "stop")
-            waited.wait(300)  # a signal ends it
+        if at == "poses" and how == "Ctrl-C":
+            os.kill(os.getpid(), signal.SIGINT)
+        elif at == "poses":
+            control.send(folder, "stop")
+            threading.Event().wait(300)  # a signal ends it
 
     sfm.at = stop
     with pytest.raises(KeyboardInterrupt):
-        start(raw, root)
-    assert list(RunFolder(root).control.iterdir()) == []
+        start(raw, folder.root)
+    assert list(folder.control.iterdir()) == []
+    status = shown("status", folder.root)
+    assert (status["status"], status["stage"]) == ("interrupted", "prepare")
+    sfm.at = ignore
+    resume(folder.root)
+    assert sfm.done == ["features", "poses"]
+    assert folder.point_cloud.read_bytes() == calm.point_cloud.read_bytes()
 
 
 def test_status_shows_how_far_the_preparation_is_and_no_other_process_joins(
@@ -159,21 +152,14 @@ def with_masks(town: Path, source: Path, count: int) -> Path:
     return source
 
 
-def test_masks_of_the_source_are_kept_as_they_are(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:
-    start(with_masks(town, tmp_path / "source", 9), tmp_path / "run")
-    settings = read_settings(RunFolder(tmp_path / "run"))
-    assert settings is not None
-    assert settings.steps() == (Step.SFM, Step.CHECK)
-
-
-def test_one_mask_in_the_source_switches_nothing_off_for_the_others(
-    town: Path, sfm: FakeSfm, tmp_path: Path
+@pytest.mark.parametrize(("count", "first"), [(1, Step.MASKS), (8, Step.MASKS), (9, Step.SFM)])
+def test_only_masks_for_all_panoramas_of_the_source_are_kept_as_they_are(
+    town: Path, tmp_path: Path, count: int, first: Step
 ) -> None:
-    """The operator was trained in all panoramas that have none."""
-    for count in (1, 8):
-        settings = settings_of(with_masks(town, tmp_path / str(count), count), Options())
-        assert settings is not None
-        assert (settings.nadir, settings.static) == (10, True)
+    """The operator was trained in all panoramas that had none, as soon as one had a mask."""
+    settings = settings_of(with_masks(town, tmp_path, count), Options())
+    assert settings is not None and settings.steps()[0] == first
+    assert first == Step.SFM or (settings.nadir, settings.static) == (10, True)
 
 
 def test_masks_of_the_source_are_joined_with_what_is_wanted(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:

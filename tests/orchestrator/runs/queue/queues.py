@@ -42,12 +42,10 @@ class Scripted:
 
     @property
     def folder(self) -> Path:
-        """That of the queue."""
         return self.root / "queue"
 
     @property
     def log(self) -> Path:
-        """What the stand-ins did, in order."""
         return self.root / "log"
 
     def add(self, name: str, scene: str = "scene", needs: Needs | None = ANY, *, held: bool = False) -> int:
@@ -66,12 +64,10 @@ class Scripted:
         return found
 
     def entries(self) -> list[Entry]:
-        """All of them."""
         with closing(Queue(self.folder)) as queue:
             return queue.entries(removed=True)
 
     def states(self) -> list[State]:
-        """How each stands, in order."""
         return [entry.state for entry in self.entries()]
 
     def lines(self) -> list[list[str]]:
@@ -79,7 +75,6 @@ class Scripted:
         return [line.split() for line in self.log.read_text().splitlines()] if self.log.exists() else []
 
     def start(self) -> "subprocess.Popen[str]":
-        """A runner."""
         boot = self.root / "boot_id"
         boot.write_text(f"boot-{self.boots}\n")
         program = (sys.executable, "-S", str(STAND_IN), str(self.log))

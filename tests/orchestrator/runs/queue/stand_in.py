@@ -20,7 +20,6 @@ LOCK = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
 
 
 def main(log: str, words: list[str]) -> int:
-    """Returns its exit code."""
     resumed = words[0] == "resume"
     run = Path(words[1] if resumed else words[words.index("--output") + 1])
     scene = "" if resumed else words[1]

@@ -33,24 +33,6 @@ def ended(runner: "subprocess.Popen[str]") -> tuple[int, list[str]]:
     return runner.returncode, output.splitlines()
 
 
-def test_runs_are_done_one_after_another_in_order(tmp_path: Path) -> None:
-    queue = Scripted(tmp_path)
-    for name in ("a", "b", "c"):
-        queue.add(name)
-    with closing(Queue(queue.folder)) as opened:
-        opened.move(3, before=1)
-    code, said = ended(queue.start())
-    assert code == 0
-    words = [f"{word} {run}" for word, run, _ in queue.lines()]
-    assert words == ["begins c", "done c", "begins a", "done a", "begins b", "done b"]
-    assert said == [
-        f"{word} {id}: {tmp_path / name}"
-        for id, name in ((3, "c"), (1, "a"), (2, "b"))
-        for word in ("started", "done")
-    ]
-    assert queue.states() == [State.DONE] * 3
-
-
 def test_every_end_has_its_state_and_reason_and_the_next_run_starts(tmp_path: Path) -> None:
     queue = Scripted(tmp_path)
     queue.add("wrong", "refused")

@@ -1,7 +1,6 @@
 """What each run of a queue gets of the machine: never one GPU twice, in order, and no more than there is."""
 
 import json
-import os
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -156,14 +155,3 @@ def test_four_gpus_are_given_out_in_order(tmp_path: Path, monkeypatch: pytest.Mo
     assert code == 1
     assert queue.entries()[2].reason == ""
     assert "3: waits for 2 GPUs: 1 of 4 free" in said
-
-
-def test_one_at_a_time_has_the_whole_machine(tmp_path: Path) -> None:
-    queue = Scripted(tmp_path)
-    queue.add("a")
-    queue.add("b", needs=Needs(cores=1, memory=GIB))
-    assert ended(queue.start())[0] == 0
-    nothing = {"CUDA_VISIBLE_DEVICES": os.environ.get("CUDA_VISIBLE_DEVICES")}
-    cores = sorted(os.sched_getaffinity(0))
-    assert queue.share("a") == {**nothing, "PANOLOG_MEMORY": None, "cores": cores}
-    assert queue.share("b") == {**nothing, "PANOLOG_MEMORY": "1.0", "cores": cores[:1]}

@@ -12,7 +12,6 @@ FROM_STORE = re.compile(r"store\.remove\(|\brm_file\(|\.rm\(")
 
 
 def modules(pattern: re.Pattern[str]) -> set[str]:
-    """The modules of the product with a line that matches."""
     folders = ("orchestrator", "workers", "scene", "prepare", "export", "renderer", "partition", "synthetic")
     paths = (path for folder in folders for path in (ROOT / folder).rglob("*.py"))
     return {path.relative_to(ROOT).as_posix() for path in paths if pattern.search(path.read_text())}

@@ -13,7 +13,6 @@ from tests.orchestrator.runs.storage.stored_runs import Driver, fetched, mirror_
 
 
 def names(store: Store) -> dict[str, bytes | None]:
-    """All objects, but for leases."""
     return {name: store.read(name) for name in store.list() if not name.startswith(LEASES)}
 
 

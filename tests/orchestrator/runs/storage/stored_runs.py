@@ -32,7 +32,6 @@ class Driver:
         self.iteration = 0
 
     def save(self) -> None:
-        """One checkpoint, whose content is its iteration."""
         with self._lock:
             self.iteration += 1
             path = self.folder.checkpoint(COARSE)
@@ -75,8 +74,6 @@ def fetched(store: Store, root: Path) -> RunFolder:
 
 
 class Watched(Store):
-    """A store that calls a function after each change."""
-
     after: Callable[[], None] = staticmethod(lambda: None)
 
     def put(self, path: Path, name: str) -> None:

@@ -35,7 +35,6 @@ def blocked(path: Path) -> set[int]:
 
 
 def mirror() -> psutil.Process:
-    """The process of the mirror that is a child of this one."""
     (found,) = living("panolog.orchestrator.runs.storage")
     return found
 

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -36,28 +37,33 @@ from tests.object_store import ObjectStore, object_store
 from tests.orchestrator.runs.storage.stored_runs import Driver, Watched, fetched, mirror_of, rounds
 
 
-def test_the_store_is_whole_after_every_change(tmp_path: Path) -> None:
+@pytest.mark.parametrize("outcomes", [[Outcome.DONE], [Outcome.LIMITED, Outcome.DONE]], ids=str)
+def test_the_store_is_whole_after_every_change(tmp_path: Path, outcomes: list[Outcome]) -> None:
+    """Also while a run that a limit has ended is completed, whose results are replaced."""
     store = Watched(open_store(f"file://{tmp_path}/store").url)
-    driver, seen = Driver(tmp_path / "run"), [0]
+    driver, seen, works = Driver(tmp_path / "run"), count(), [True]
 
     def look() -> None:
-        driver.save()  # the driver proceeds within every round
+        if works[0]:
+            driver.save()  # the driver proceeds within every round
         if current(store) is not None:
-            seen[0] += 1
-            fetched(store, tmp_path / f"fresh{seen[0]}")
+            fetched(store, tmp_path / f"fresh{next(seen)}")
 
-    mirror, _ = mirror_of(driver, store)
-    store.after = look
-    for _ in range(3):
-        mirror.round()
-    store.after = lambda: None
-    driver.end()
-    rounds(mirror)
-    assert seen[0] > 10
-    assert mirror.state.complete
+    for outcome in outcomes:
+        mirror, lease = mirror_of(driver, store)
+        works[0], store.after = True, look
+        for _ in range(3):
+            mirror.round()
+        works[0] = False
+        driver.end(outcome)
+        rounds(mirror)
+        store.after = lambda: None
+        lease.release()
+        assert mirror.state.complete
+        assert store.read("point_cloud.ply") == driver.folder.point_cloud.read_bytes()
+    assert next(seen) > 10
     fresh = fetched(store, tmp_path / "last")
-    assert files(fresh.root) == files(driver.folder.root)
-    assert len(files(fresh.root)) == 3
+    assert files(fresh.root) == files(driver.folder.root) and len(files(fresh.root)) == 3
 
 
 def stored(tmp_path: Path) -> tuple[Driver, Store, Mirror]:
@@ -99,29 +105,6 @@ def test_nothing_that_was_replaced_is_removed_and_results_have_their_names(tmp_p
     third.round()
     assert {name for name in was if store.read(name) != was[name]} == {max(store.list(LEASES))}
     assert len(store.list(POINTERS)) == 2  # of drivers that had something to publish
-
-
-def test_results_of_a_run_that_a_limit_has_ended_are_replaced_when_it_is_completed(tmp_path: Path) -> None:
-    store = Watched(open_store(f"file://{tmp_path}/store").url)
-    driver, seen = Driver(tmp_path / "run"), 0
-    for outcome in (Outcome.LIMITED, Outcome.DONE):
-
-        def look() -> None:
-            nonlocal seen
-            if current(store) is not None:
-                seen += 1
-                fetched(store, tmp_path / f"fresh{seen}")  # whatever is in force has the bytes that it names
-
-        mirror, lease = mirror_of(driver, store)
-        store.after = look
-        driver.save()
-        driver.end(outcome)
-        rounds(mirror)
-        store.after = lambda: None
-        lease.release()
-        assert store.read("point_cloud.ply") == driver.folder.point_cloud.read_bytes()
-    assert seen > 10
-    assert files(fetched(store, tmp_path / "last").root) == files(driver.folder.root)
 
 
 def test_a_run_that_was_refused_leaves_nothing(tmp_path: Path) -> None:

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from adlfs import AzureBlobFileSystem
-from gcsfs import GCSFileSystem
+from fsspec import get_filesystem_class
 
 from panolog.orchestrator.runs.storage.lease import holder
 from panolog.scene.errors import StoreError
@@ -143,10 +142,10 @@ def test_credentials_that_azure_refuses_are_the_users_at_once(
 ) -> None:
     words = server.environment["AZURE_STORAGE_CONNECTION_STRING"]
     monkeypatch.setenv("AZURE_STORAGE_CONNECTION_STRING", words.replace(SECRET, key))
-    AzureBlobFileSystem.clear_instance_cache()
+    get_filesystem_class("abfs").clear_instance_cache()
     with pytest.raises(StoreError, match=r"no access .*; set the provider's credentials"):
         open_store(server.url("refused")).read("a")
-    AzureBlobFileSystem.clear_instance_cache()
+    get_filesystem_class("abfs").clear_instance_cache()
 
 
 @pytest.mark.parametrize("server", ["gs"], indirect=True)
@@ -156,8 +155,8 @@ def test_an_answer_of_google_that_refuses_access_is_the_users_at_once(
 ) -> None:
     with receiver([status] * 9) as google:
         monkeypatch.setenv("STORAGE_EMULATOR_HOST", google.url)
-        GCSFileSystem.clear_instance_cache()
+        get_filesystem_class("gs").clear_instance_cache()
         with pytest.raises(StoreError, match=r"no access .*; set the provider's credentials"):
             open_store(server.url("refused")).list()
-        GCSFileSystem.clear_instance_cache()
+        get_filesystem_class("gs").clear_instance_cache()
     assert capfd.readouterr().err == ""

@@ -3,7 +3,7 @@
 import json
 import socket
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
@@ -15,9 +15,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from panolog.orchestrator.engine.stages.partitioning import plan_records, write_plan
-from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.orchestrator.runs.records import (
     CheckpointSaved,
     Merged,
@@ -31,11 +29,11 @@ from panolog.orchestrator.runs.records import (
     TaskStarted,
     ViewEvaluated,
 )
-from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.dashboard import server
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.history import append, begun
 
 PATIENCE_S = 120.0  # for what a machine under load does at last
 POST = {"X-PanoLOG": "1", "Content-Type": "application/json"}
@@ -45,17 +43,9 @@ EVIL = '<script>alert("x")</script>&\'"'
 
 def write_run(root: Path, records: Sequence[Record] = (), scene: str = "/scenes/town") -> RunFolder:
     """A run folder with that history."""
-    folder = RunFolder(root)
-    root.mkdir(parents=True, exist_ok=True)
-    write_info(folder, make_info(SceneRef(path=scene, fingerprint="f"), RunConfig(width=64, iterations=100)))
+    folder = begun(root, scene=scene, iterations=100)
     append(folder, *records)
     return folder
-
-
-def append(folder: RunFolder, *records: Record) -> None:
-    """What a driver does with its records."""
-    with closing(Database(folder.database)) as database:
-        database.append(records)
 
 
 def started(task: TaskId, iteration: int = 0) -> TaskStarted:

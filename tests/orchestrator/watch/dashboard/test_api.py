@@ -1,4 +1,4 @@
-"""The JSON of a run for the pages."""
+"""The JSON of a run, and of a comparison, for the pages."""
 
 import base64
 import gzip
@@ -17,12 +17,16 @@ from panolog.orchestrator.engine.stages.partitioning import write_plan
 from panolog.orchestrator.runs.config import RunConfig, change, load_config
 from panolog.orchestrator.runs.folder import write_json
 from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
-from panolog.orchestrator.runs.records import Noticed, Outcome, Record, RunBegan, RunEnded
+from panolog.orchestrator.runs.records import Noticed, Outcome, Record, RunBegan, RunEnded, ViewEvaluated
 from panolog.orchestrator.watch.views import queries
+from panolog.orchestrator.watch.views.comparison.compare import compare
+from panolog.orchestrator.watch.views.comparison.reading import read_runs
 from panolog.orchestrator.watch.views.pages.shell import STATIC
-from panolog.workers.tasks import COARSE
+from panolog.workers.tasks import COARSE, EVAL
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard import api_types
 from tests.orchestrator.watch.dashboard.served import (
+    EVIL,
     SCORES,
     Served,
     plan,
@@ -32,6 +36,8 @@ from tests.orchestrator.watch.dashboard.served import (
     write_run,
     write_whole_run,
 )
+from tests.orchestrator.watch.views.comparison.runs import metrics, write, write_picture
+from tests.visual.compare import expand
 from tests.workers.small import small_scene
 
 
@@ -215,11 +221,8 @@ def test_pictures(served: Served) -> None:
         assert answer.headers["content-type"] == "image/jpeg"
         assert answer.content.startswith(b"\xff\xd8")
     assert served.errors(f"{path}/previews/{view['number']}", 404)
-    whole, render = (
-        cv2.imdecode(np.frombuffer(served.client.get(f"{path}/{name}").content, np.uint8), cv2.IMREAD_COLOR)
-        for name in (f"views/{view['number']}", covers[1])
-    )
-    assert whole is not None and render is not None
+    names = f"views/{view['number']}", covers[1]
+    whole, render = (expand(served.client.get(f"{path}/{name}").content) for name in names)
     assert render.shape[:2] == (whole.shape[0] // 2, whole.shape[1])
 
 
@@ -261,28 +264,105 @@ def test_what_was_measured_and_its_pictures_are_of_the_run_alone(tmp_path: Path)
     folder = write_run(tmp_path / "run")
     with serving(tmp_path) as server:
         path = f"/api/runs/{server.id('run')}/findings"
-        empty: dict[str, Any] = {
-            "metrics": None,
-            "seams": [],
-            "colors": [],
-            "moves": [],
-            "movers": [],
-            "pictures": [],
-        }
-        assert server.get(path) == empty
-        write_json(
-            folder.metrics, {"mean": {"psnr": 20.0}, "views": {"a.jpg": {"psnr": 20.0, "lpips": None}}}
-        )
+        assert not any(server.get(path).values())
+        values = {"psnr": 20.0, "lpips": None}
+        write_json(folder.metrics, {"mean": {"psnr": 20.0}, "views": {"a.jpg": values}})
         write_json(folder.mover_shares, {"panoramas": [{"name": f"{i}.jpg", "share": 0.1} for i in range(2)]})
         folder.mover_picture("0.jpg").parent.mkdir(parents=True)
         cv2.imwrite(str(folder.mover_picture("0.jpg")), np.zeros((8, 16, 3), np.uint8))
         (tmp_path / "secret.jpg").write_bytes(folder.mover_picture("0.jpg").read_bytes())
         folder.mover_picture("1.jpg").symlink_to(tmp_path / "secret.jpg")
         found = server.get(path)
-        assert found["metrics"]["views"] == {"a.jpg": {"psnr": 20.0, "lpips": None}}
+        assert found["metrics"]["views"] == {"a.jpg": values}
         assert found["pictures"] == ["mover-0.jpg"]
         assert server.client.get(f"{path}/mover-0.jpg").headers["content-type"] == "image/jpeg"
         for name in ("mover-1.jpg", "mover-7.jpg", "..%2Frun.json"):
             assert server.client.get(f"{path}/{name}").status_code == 404
         folder.metrics.write_bytes(b'{"mean": 3}')
         assert "metrics.json: is damaged" in server.errors(path, 404)
+
+
+NONE = "0123456789abcdef"
+
+
+@pytest.fixture(scope="module")
+def compared_runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Two runs, one of which has a picture, and one that cannot be read."""
+    root = tmp_path_factory.mktemp("folder")
+    first = write(root / "a", measured=metrics())
+    write(root / "b", measured=metrics({"a.jpg": 21.0, "b.jpg": 23.0, "c.jpg": 31.0}), seed=5)
+    write_picture(first, "b.jpg", 10, 200)
+    append(first, ViewEvaluated(EVAL, "b.jpg", {"ws_psnr": 24.0}))
+    write(root / "broken").info.write_text("{")
+    with serving(root) as server:
+        yield server
+
+
+def compared(served: Served, *names: str) -> Any:
+    return served.get("/api/compare", run=[served.id(name) for name in names])
+
+
+def test_it_is_what_the_command_line_has(compared_runs: Served) -> None:
+    served = compared_runs
+    sent = compared(served, "a", "b")
+    root = Path(served.get("/api/runs")["folder"])
+    own = compare(read_runs([root / "a", root / "b"])).model_dump(mode="json")
+    assert [run["name"] for run in sent["runs"]] == ["a", "b"]
+    for key in ("metrics", "stages", "measured", "seconds", "gaussians", "memory", "color"):
+        assert [run[key] for run in sent["runs"]] == [run[key] for run in own["runs"]]
+    assert (sent["settings"], sent["warnings"]) == (own["settings"], own["warnings"])
+    assert sent["runs"][1]["metrics"]["ws_psnr"]["better"] == 2
+    views = {view["name"]: view for view in sent["views"]}
+    url, none = views["b.jpg"]["pictures"]
+    assert (views["b.jpg"]["truth"], none) == (url, None)
+    assert url.startswith(f"/api/runs/{served.id('a')}/views/")
+    assert served.client.get(url).content.startswith(b"\xff\xd8\xff")
+    assert views["a.jpg"]["pictures"] == [None, None]
+
+
+def test_a_run_that_cannot_be_read_is_shown_as_such(compared_runs: Served) -> None:
+    served = compared_runs
+    sent = served.get("/api/compare", run=[served.id("broken"), NONE, served.id("a"), served.id("b")])
+    broken, none, first, _ = sent["runs"]
+    assert (broken["name"], broken["status"]) == ("broken", "unreadable")
+    assert "is not JSON" in broken["error"]
+    assert "no such run" in none["error"]
+    assert (sent["first"], first["error"]) == (2, None)
+    assert sent["runs"][3]["metrics"]["ws_psnr"]["better"] == 2
+    curves = served.get("/api/compare/curves", run=[NONE, served.id("b"), served.id("a")])["runs"]
+    assert "no such run" in curves[0]["error"]
+    assert [run["id"] for run in curves[1:]] == [served.id("b"), served.id("a")]
+    assert [stage["label"] for stage in curves[1]["stages"]] == ["Stage I", "Stage II"]
+
+
+@pytest.mark.parametrize("path", ["/api/compare", "/api/compare/curves"])
+def test_what_is_refused(compared_runs: Served, path: str) -> None:
+    served = compared_runs
+    id = served.id("a")
+    assert served.errors(path, 422)
+    assert served.errors(path, 422, run=[id])
+    assert served.errors(path, 422, run=[id] * 9)
+    for wrong in ("../a", "A" * 16, f"{id}0", "", EVIL, f"{id}\n"):
+        assert served.errors(path, 422, run=[id, wrong])
+    assert served.errors(path, 404, run=[NONE, "f" * 16]) == "there are no such runs"
+    assert len(served.get(path, run=[id, id])["runs"]) == 1
+
+
+def test_metrics_that_are_none_or_not_the_runs_own_are_a_warning(tmp_path: Path) -> None:
+    outside = write(tmp_path / "outside", measured=metrics())
+    good, damaged, link, folder, large = (
+        write(tmp_path / "folder" / name, measured=metrics())
+        for name in ("good", "damaged", "link", "folder", "large")
+    )
+    damaged.metrics.write_text("{")
+    link.metrics.unlink()
+    link.metrics.symlink_to(outside.metrics)
+    folder.metrics.unlink()
+    folder.metrics.mkdir()
+    large.metrics.write_bytes(b" " * 17_000_000)
+    with serving(tmp_path / "folder") as served:
+        for odd in (damaged, link, folder, large):
+            sent = compared(served, good.root.name, odd.root.name)
+            assert (sent["runs"][1]["measured"], sent["runs"][1]["metrics"]) == (None, {})
+            (line,) = sent["warnings"]
+            assert re.match(rf"{odd.root.name}: (eval/)?metrics\.json", line)

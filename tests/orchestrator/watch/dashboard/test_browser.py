@@ -1,9 +1,9 @@
-"""The pages in a real browser: what they show, to everybody, on a phone and on a desk."""
+"""The pages in a real browser: what they show, also of machines and the store, on a phone and on a desk."""
 
 import socket
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -13,21 +13,36 @@ from playwright.sync_api import Browser, Page, expect
 from scipy.sparse import csr_array
 
 from panolog.orchestrator.engine.stages.partitioning import plan_records, write_plan
-from panolog.orchestrator.runs.records import Noticed, PreviewSaved, RunBegan, TaskFailed
+from panolog.orchestrator.runs import control, lock
+from panolog.orchestrator.runs.control import Action, ControlRequest
+from panolog.orchestrator.runs.records import (
+    Leaving,
+    NodeLeaving,
+    NodeLeft,
+    NodeQuarantined,
+    NodeReleased,
+    Noticed,
+    PreviewSaved,
+    RunBegan,
+    TaskFailed,
+)
+from panolog.orchestrator.runs.storage.state import MirrorState, write_state
+from panolog.orchestrator.runs.store import Database
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.workers.tasks import COARSE, TaskId
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.browser import DESK, PATIENCE_MS, PHONE, SMALL, opened, unreachable
 from tests.orchestrator.watch.dashboard.served import (
     EVIL,
     Served,
-    append,
     progressed,
     serving,
     started,
     write_run,
     write_whole_run,
 )
+from tests.visual import legible
 
 pytestmark = pytest.mark.system
 
@@ -106,25 +121,6 @@ def test_the_map_fills_its_card_and_all_is_reached_by_keyboard(browser: Browser,
             page.set_viewport_size({"width": other, "height": 850})
             fills_its_card(page)
         assert unreachable(page) == []
-
-
-# How many rows the entries of the legends have.
-ROWS = """() => new Set([...document.querySelectorAll("#charts .legendtext")].map((node) =>
-  node.getBoundingClientRect().bottom)).size"""
-
-
-def test_the_legend_has_room_in_a_window_that_was_made_narrow(browser: Browser, tmp_path: Path) -> None:
-    rates = dict.fromkeys(("means", "scales", "quats", "opacities", "sh0", "shN"), 1e-3)
-    made = (replace(progressed(COARSE, iteration), rates=rates) for iteration in (10, 20))
-    write_run(tmp_path / "run", [started(COARSE), *made])
-    with (
-        serving(tmp_path) as served,
-        opened(browser, f"{served.url}/runs/{served.id('run')}", width=DESK) as page,
-    ):
-        expect(page.locator("#charts .legendtext")).to_have_count(len(rates))
-        assert page.evaluate(ROWS) == 2
-        page.set_viewport_size({"width": PHONE, "height": 850})
-        page.wait_for_function(f"() => ({ROWS})() === 3", timeout=PATIENCE_MS)
 
 
 def test_runs_are_found_and_sorted_in_a_theme_that_stays(browser: Browser, shown: Served) -> None:
@@ -291,3 +287,49 @@ def test_a_thousand_blocks_cost_no_more_rows_than_are_seen(browser: Browser, tmp
         expect(page.locator("#block-table tr[data-block]")).to_have_count(1)
         append(folder, started(TaskId.block(999)), progressed(TaskId.block(999), 40))
         expect(page.locator("#block-table tr[data-block]")).to_contain_text("40 / 100")
+
+
+GIB = 2**30
+REASON = "3 tasks have failed there in a row, the last one, block/001: CUDA error"
+QUARANTINED = NodeQuarantined("3f2a81c4d5e6", "gpu-07", REASON, 2e9)
+LEAVES = NodeLeaving("7f2a81c4d5e6", "gpu-08", Leaving.PREEMPTION, 120.0)
+
+
+def test_machines_and_the_store_are_shown_and_a_machine_is_released(browser: Browser, tmp_path: Path) -> None:
+    folder = write_whole_run(tmp_path / "run")
+    append(folder, RunBegan(socket.gethostname(), 1, resumed=True), LEAVES, QUARANTINED)
+    gpu = {"name": "A", "utilization": None, "memory_used": 22 * GIB, "memory_total": 24 * GIB}
+    used = {"cpu": 0.63, "memory_used": 5 * GIB, "memory_total": 8 * GIB, "disk_used": 0, "disk_total": GIB}
+    with closing(Database(folder.database)) as database:
+        database.put_usage(socket.gethostname(), used | {"gpus": [gpu, gpu]})
+    place, since = "s3://reconstructions-of-the-city/2026/street/run", time.time() - 1500
+    why = f"{place}/.panolog/objects/blocks/000/checkpoint.safetensors/18b2: the store fails (Slow down.)"
+    behind = MirrorState(place, "m", since=since, pending_files=12, pending_bytes=8 * GIB, problem=why)
+    write_state(folder.mirror, behind)
+    control.begin(folder)
+    with (
+        lock.hold(folder.lock),
+        serving(tmp_path) as server,
+        opened(browser, f"{server.url}/runs/{server.id('run')}") as page,
+    ):
+        settled(page)
+        full = [f"GPU {number} memory22 GiB of 24 GiB" for number in (0, 1)]
+        expect(page.locator(".meters [data-full='true']")).to_have_text(full)
+        fact = page.locator("#facts div", has_text="Object store")
+        expect(fact).to_contain_text("12 files (8.0 GiB) to go")
+        expect(fact).to_contain_text("Slow down.")
+        leaving, held = (page.locator("#nodes li", has_text=name) for name in ("gpu-08", "gpu-07"))
+        expect(leaving).to_contain_text("leaves")
+        expect(leaving).to_contain_text("its provider takes it away; tasks there save a checkpoint and move")
+        expect(held).to_contain_text("quarantined")
+        expect(held).to_contain_text(REASON)
+        assert legible.hard_to_read(page, PHONE) == []
+        append(folder, NodeLeft(LEAVES.node, LEAVES.host))
+        expect(leaving).to_have_count(0)
+        held.get_by_role("button", name="Release").click()
+        expect(page.locator("#confirm")).to_contain_text("Release gpu-07?")
+        page.locator("#confirm-yes").click()
+        expect(page.locator("#confirm")).to_be_hidden()
+        assert control.take(folder) == [ControlRequest(Action.RELEASE, node=QUARANTINED.node)]
+        append(folder, NodeReleased(QUARANTINED.node, QUARANTINED.host, "a user has released it"))
+        expect(held).to_have_count(0)

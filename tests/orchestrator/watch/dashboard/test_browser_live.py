@@ -37,16 +37,9 @@ from panolog.orchestrator.runs.records import (
 )
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.browser import AWAY, opened
-from tests.orchestrator.watch.dashboard.served import (
-    SCORES,
-    append,
-    plan,
-    progressed,
-    serving,
-    started,
-    write_run,
-)
+from tests.orchestrator.watch.dashboard.served import SCORES, plan, progressed, serving, started, write_run
 from tests.orchestrator.watch.dashboard.test_browser import fills_its_card
 from tests.orchestrator.watch.views.models import some
 

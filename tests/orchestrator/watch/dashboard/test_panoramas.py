@@ -19,10 +19,11 @@ from panolog.orchestrator.watch.views.site import photographs
 from panolog.scene.read import read_scene
 from panolog.scene.stores.cache import FOLDER
 from panolog.workers.tasks import COARSE
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.browser import PHONE, opened
-from tests.orchestrator.watch.dashboard.served import Served, append, serving, write_whole_run
+from tests.orchestrator.watch.dashboard.served import Served, serving, write_whole_run
 from tests.scenes import write_scene
-from tests.visual import legible
+from tests.visual.compare import expand
 
 NAMES = [f"{number}.jpg" for number in range(4)]  # as in the plan of `write_whole_run`
 
@@ -48,8 +49,7 @@ def test_a_panorama_is_sent_small(served: Served) -> None:
     for _ in range(2):  # made, then from the cache
         answer = served.client.get(f"{path}/panorama")
         assert answer.headers["content-type"] == "image/jpeg"
-        picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)
-        assert picture is not None
+        picture = expand(answer.content)
         assert picture.shape == (512, 1024, 3)
         assert np.abs(picture.mean(axis=(0, 1)) - [200, 60, 20]).max() < 3
 
@@ -120,9 +120,7 @@ def test_a_panorama_in_a_store_comes_through_the_cache(
         read_scene(url)
         assert server.get(f"{path}/1")["no_picture"] is None
         for _ in range(2):  # fetched, then kept
-            answer = server.client.get(f"{path}/1/panorama")
-            picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)
-            assert picture is not None
+            picture = expand(server.client.get(f"{path}/1/panorama").content)
             assert np.abs(picture[300:500].mean(axis=(0, 1)) - [200, 60, 20]).max() < 3
         assert len(list((tmp_path / "cache" / "objects").iterdir())) == 1
         os.utime(tmp_path / "scene" / "images" / "2.jpg", (1, 1))
@@ -170,4 +168,3 @@ def test_a_camera_shows_its_picture_and_a_block_its_cameras(browser: Browser, se
         expect(panel.get_by_role("button", name="Stage I, iteration 100")).to_be_visible()
         assert panel.locator("img").first.evaluate(loaded) == 1024
         expect(panel.get_by_role("button", name="Open in 3D from here")).to_be_enabled()
-        assert legible.hard_to_read(page, PHONE) == []

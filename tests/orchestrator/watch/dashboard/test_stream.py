@@ -18,8 +18,8 @@ from panolog.orchestrator.runs.thinning import DENSE
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.dashboard.watch import Watch
 from panolog.workers.tasks import COARSE, TaskId
+from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.served import (
-    append,
     progressed,
     serving,
     started,

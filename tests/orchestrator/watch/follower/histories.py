@@ -3,9 +3,7 @@
 from contextlib import closing
 from pathlib import Path
 
-from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.orchestrator.runs.records import (
     CheckpointSaved,
     EvaluationSaved,
@@ -21,6 +19,7 @@ from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.queries import series
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.fakes import SetClock
+from tests.orchestrator.history import begun
 
 BLOCK = TaskId.block(0)
 Curves = dict[tuple[str, str], list[tuple[int, float]]]  # by task and name: iteration and value
@@ -60,14 +59,13 @@ def parts() -> list[list[Record]]:
     ]
 
 
-def write(root: Path, begun: int = 0, until: int = 3, *, clock: SetClock | None = None) -> RunFolder:
+def write(root: Path, first: int = 0, until: int = 3, *, clock: SetClock | None = None) -> RunFolder:
     """Adds what some of the drivers record to the run at `root`."""
     folder = RunFolder(root)
     if not folder.info.exists():
-        root.mkdir(exist_ok=True)
-        write_info(folder, make_info(SceneRef(path="/gone", fingerprint="f"), RunConfig(width=64)))
+        begun(root)
     with closing(Database(folder.database, clock or SetClock())) as database:
-        for records in parts()[begun:until]:
+        for records in parts()[first:until]:
             for record in records:
                 database.append([record])
     return folder

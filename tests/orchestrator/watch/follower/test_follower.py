@@ -24,18 +24,6 @@ from tests.ray_head import living, wait_until
 pytestmark = pytest.mark.system
 
 FOLLOWER = "panolog.orchestrator.watch.follower"
-# A command of a run that is killed: it starts the follower and waits.
-KILLED = """
-import sys, time
-from pathlib import Path
-from panolog.orchestrator.cli.session.companion import companion_follower
-from panolog.orchestrator.watch.follower.plan import read_plan
-
-plan, _ = read_plan(["webhook:env:HOOK"], (), {"HOOK": sys.argv[2], "HOME": "/nowhere"})
-with companion_follower(Path(sys.argv[1]), plan, print):
-    print("ready", flush=True)
-    time.sleep(600)
-"""
 # Its parent has closed the pipe, and has the lock of the run until it is killed.
 DYING = """
 import os, signal, subprocess, sys
@@ -137,20 +125,6 @@ def test_a_killed_command_that_closes_its_pipe_before_its_lock_has_failed(tmp_pa
         wait_until(lambda: list(folder.follower.glob("webhook-*")), "a look after the end of its stdin")
         run.kill()
         run.wait()
-        wait_until(lambda: gone(process), "the end of its follower")
-    assert server.texts == ["run.failed"]
-
-
-def test_a_command_that_is_killed_leaves_a_follower_that_says_so_and_ends(tmp_path: Path) -> None:
-    with receiver() as server:
-        command = [sys.executable, "-c", KILLED, str(tmp_path / "run"), f"{server.url}/x"]
-        run = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        assert run.stdout is not None
-        assert run.stdout.readline() == "ready\n"
-        process = follower_of(run.pid)
-        histories.write(tmp_path / "run", 0, 1)
-        run.kill()
-        run.communicate()
         wait_until(lambda: gone(process), "the end of its follower")
     assert server.texts == ["run.failed"]
     assert "killed" in server.received[0].json["text"]

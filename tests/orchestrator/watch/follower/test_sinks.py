@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Outcome
 from panolog.orchestrator.runs.state import ignore
 from panolog.orchestrator.watch.follower.board import Board
-from panolog.orchestrator.watch.follower.curves import Point, points
+from panolog.orchestrator.watch.follower.curves import Point
 from panolog.orchestrator.watch.follower.loggers import Logger
 from panolog.orchestrator.watch.follower.sinks.interface import Facts, Sink
 from panolog.orchestrator.watch.follower.watcher import Watcher
@@ -124,14 +123,6 @@ def test_a_follower_killed_or_refused_within_a_piece_adds_the_rest(
     folder = each_driver(tmp_path / "run", lambda: sink)
     assert not sink.fails
     assert {key: sorted(curve) for key, curve in sink.curves.items()} == expected(folder)
-
-
-def test_a_piece_follows_the_settled_part_whatever_came_in_between(tmp_path: Path) -> None:
-    folder = histories.write(tmp_path / "run")
-    path, whole = folder.database, points(folder.database, "coarse", 0, 100)
-    cuts = [0, 10, 20, 32, 44, 100]
-    pieces = [points(path, "coarse", after, until) for after, until in pairwise(cuts)]
-    assert [point for piece in pieces for point in piece] == whole
 
 
 def test_a_sink_that_never_answers_leaves_the_time_limit(tmp_path: Path) -> None:

@@ -1,14 +1,11 @@
 """Models, and runs that have them, for the tests of pages in 3D."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.scene.gaussians import Gaussians
@@ -40,14 +37,6 @@ def some(count: int, sky: int = 0, seed: int = 0) -> Gaussians:
         shN=torch.zeros(count, 15, 3),
         sky=sky,
     )
-
-
-def make_run(root: Path, scene: Path = Path("/gone")) -> RunFolder:
-    """The folder of a run that has not begun."""
-    folder = RunFolder(root)
-    folder.root.mkdir()
-    write_info(folder, make_info(SceneRef(path=str(scene), fingerprint="f"), RunConfig(width=64)))
-    return folder
 
 
 def save_model(folder: RunFolder, task: TaskId, count: int = 20, sky: int = 0) -> None:

@@ -1,15 +1,22 @@
+"""The map of a run and its picture, its curve of exposures, and the colours of blocks."""
+
 import base64
 import json
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import plotly.graph_objects as go  # type: ignore[import-untyped]
 import pytest
 from numpy.typing import NDArray
 
+from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.watch.views import figures, plan_map
-from panolog.orchestrator.watch.views.palette import SEAM_GRADES
+from panolog.orchestrator.watch.views.exposures import exposure_curve
+from panolog.orchestrator.watch.views.palette import BLOCK_COLORS, SEAM_GRADES, block_color
+from panolog.orchestrator.watch.views.plan_picture import plan_figure, write_plan_picture
 from panolog.partition.cells import Grid
 from panolog.partition.contraction import contract
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
@@ -98,3 +105,143 @@ def test_faces_have_the_colour_of_their_seam_the_worst_above(plan: Plan) -> None
     for side, block in ((-1e-3, 0), (1e-3, 1)):
         moved = contract(places + np.array([side, 0, 0]), plan.aabb)
         assert (plan.grid.block_of(moved) == block).all()
+
+
+def written(root: Path, content: Any) -> RunFolder:
+    (root / "exposure.json").write_text(content if isinstance(content, str) else json.dumps(content))
+    return RunFolder(root)
+
+
+def panorama(number: int, **changes: Any) -> dict[str, Any]:
+    return {
+        "name": f"{number}.jpg",
+        "stops": number / 100,
+        "gain": [1, 2, 0.5],
+        "black": [0, 0, 0],
+        **changes,
+    }
+
+
+def test_a_curve_has_both_ends_and_stops_of_each_channel(tmp_path: Path) -> None:
+    folder = written(tmp_path, {"panoramas": [panorama(number) for number in range(1_500)]})
+    curve = exposure_curve(folder, Path.read_bytes)
+    assert curve is not None
+    assert len(curve.name) == len(curve.stops) == len(curve.red) == 600
+    assert (curve.name[0], curve.name[-1], curve.stops[-1]) == ("0.jpg", "1499.jpg", 14.99)
+    assert (curve.red[0], curve.green[0], curve.blue[0]) == (0, 1, -1)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{",
+        {"panoramas": []},
+        {"panoramas": [panorama(0, gain=[0, 1, 1])]},
+        '{"panoramas": [{"name": "a", "stops": NaN, "gain": [1, 1, 1]}]}',
+        "[" * 100_000,
+    ],
+)
+def test_another_format_is_no_curve(content: Any, tmp_path: Path) -> None:
+    assert exposure_curve(written(tmp_path, content), Path.read_bytes) is None
+
+
+# Linear RGB as seen with no red and with no green cones: Machado, Oliveira and Fernandes 2009, severity 1.
+EYES = {
+    "all cones": np.eye(3),
+    "no red": np.array(
+        [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ]
+    ),
+    "no green": np.array(
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+    ),
+}
+XYZ = np.array([[0.41246, 0.35758, 0.18044], [0.21267, 0.71515, 0.07217], [0.01933, 0.11919, 0.95030]])
+
+
+def linear(color: str) -> NDArray[np.float64]:
+    parts = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    return np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+
+
+def lab(rgb: NDArray[np.float64]) -> NDArray[np.float64]:
+    """CIELAB, D65."""
+    x, y, z = np.cbrt(np.maximum(np.clip(rgb, 0, 1) @ XYZ.T / [0.95047, 1, 1.08883], 1e-6))
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+def luminance(color: str) -> float:
+    return float(linear(color) @ [0.2126, 0.7152, 0.0722])
+
+
+@pytest.mark.parametrize("across", range(1, 7))
+def test_neighbours_in_a_grid_have_different_colours(across: int) -> None:
+    colors = [block_color(block) for block in range(100)]
+    assert all(a != b for a, b in pairwise(colors))
+    assert all(a != b for a, b in zip(colors, colors[across:], strict=False))
+
+
+def test_block_colours_stand_out_from_light_and_dark() -> None:
+    for color in BLOCK_COLORS:
+        assert 1.05 / (luminance(color) + 0.05) > 3
+        assert (luminance(color) + 0.05) / (luminance("#151a21") + 0.05) > 3
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_blocks_can_be_told_apart(eyes: str) -> None:
+    seen = [lab(EYES[eyes] @ linear(color)) for color in BLOCK_COLORS]
+    assert min(np.linalg.norm(a - b) for a, b in combinations(seen, 2)) > 19
+
+
+# Blocks, and half the extent of the cameras.
+SHAPES = {
+    "a long street": ((4, 1, 1), (80, 4, 0.2)),
+    "a square": ((2, 2, 1), (20, 20, 0.2)),
+    "one block": ((1, 1, 1), (20, 14, 0.2)),
+    "many blocks": ((4, 1, 4), (40, 0.3, 40)),
+    "a tall scene": ((1, 4, 1), (4, 60, 0.2)),
+    "layers": ((3, 2, 3), (30, 20, 2)),
+}
+
+
+def plan_of(blocks: tuple[int, int, int], extent: tuple[float, float, float], points: int) -> Plan:
+    random, grid = np.random.default_rng(0), Grid(blocks)
+    centers = random.uniform(-1, 1, (40, 3)) * extent
+    cloud = random.uniform(-1.2, 1.2, (points, 3)) * extent
+    scores, names = random.random((40, grid.count)) ** 6, [f"{i}.jpg" for i in range(40)]
+    return make_plan(centers, cloud, scores, grid, PartitionConfig(), rows=range(40), names=names)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_picture_is_full_and_nothing_lies_over_anything_else(tmp_path: Path, shape: str) -> None:
+    blocks, extent = SHAPES[shape]
+    plan = plan_of(blocks, extent, 500)
+    cloud = np.random.default_rng(1).uniform(-1.2, 1.2, (0 if shape == "a square" else 500, 3)) * extent
+    write_plan_picture(tmp_path / "plan.png", plan, cloud)
+    picture = cv2.imread(str(tmp_path / "plan.png"))
+    assert picture is not None
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.png"]
+    used = (picture < 250).any(axis=2)
+    assert (used.mean(axis=1) > 0.5).mean() > 0.65  # rows with the map across them
+    assert (used.mean(axis=0) > 0.5).mean() > 0.85  # columns
+    figure = plan_figure(plan, cloud)
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    whole = axes.get_tightbbox()
+    assert whole is not None
+    assert figure.get_suptitle().endswith("), 40 cameras")
+    (legend,) = figure.legends
+    assert not legend.get_window_extent().overlaps(whole)
+    assert legend.get_window_extent().x0 >= 0
+    assert legend.get_window_extent().x1 <= figure.bbox.width
+    assert whole.y1 < figure.texts[0].get_window_extent().y0  # the title
+    boxes = [patch.get_window_extent() for label in axes.texts if (patch := label.get_bbox_patch())]
+    assert len(boxes) >= min(4, plan.grid.count)
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+    pair = [k for k in range(3) if k != int(np.argmin(np.ptp(plan.centers, axis=0)))]
+    cameras = axes.transData.transform(plan.centers[:, pair])
+    assert not any(box.contains(*camera) for box in boxes for camera in cameras)

@@ -1,11 +1,16 @@
-"""Pages of runs in 3D: which model they show, from where, and with which photographs."""
+"""Pages of runs in 3D: what they show and from where; in a browser: measuring, streaming, what goes wrong."""
 
 import json
+import shutil
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from playwright.sync_api import Browser, expect
 from scipy.spatial.transform import Rotation
 
 from panolog.orchestrator.runs.folder import RunFolder, model_of, write_json
@@ -17,14 +22,29 @@ from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import write_ply, write_ply_parts
 from panolog.scene.read import read_scene
 from panolog.workers.tasks import COARSE, TaskId
-from tests.orchestrator.watch.views.models import make_run, save_checkpoint, save_model, save_plan, some
+from tests.orchestrator.history import begun
+from tests.orchestrator.watch.dashboard.browser import opened
+from tests.orchestrator.watch.views.models import save_checkpoint, save_model, save_plan, some
+from tests.orchestrator.watch.views.sites import (
+    SIZE,
+    balls,
+    cloud,
+    psnr,
+    ready,
+    rendered,
+    run_with,
+    serving,
+    shown,
+    until,
+    viewpoints_of,
+)
 from tests.scenes import write_scene
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
     """A run that has not begun."""
-    return make_run(tmp_path / "a <run>")
+    return begun(tmp_path / "a <run>")
 
 
 def written(folder: Path) -> dict[str, Any]:
@@ -53,7 +73,7 @@ def test_a_page_begins_at_the_panorama_that_is_named(folder: RunFolder) -> None:
 
 def test_without_a_plan_the_cameras_are_those_of_the_scene(tmp_path: Path) -> None:
     """A run with refine=false has no plan, and had no cameras."""
-    folder = make_run(tmp_path / "run", tmp_path / "scene")
+    folder = begun(tmp_path / "run", scene=tmp_path / "scene")
     assert read_viewpoints(folder, None) is None  # its scene is not here
     scene = read_scene(write_scene(tmp_path / "scene"))
     found = read_viewpoints(folder, None)
@@ -69,7 +89,7 @@ def test_without_a_plan_the_cameras_are_those_of_the_scene(tmp_path: Path) -> No
 
 
 def test_a_panorama_that_is_held_out_comes_from_the_scene(tmp_path: Path) -> None:
-    folder = make_run(tmp_path / "run", tmp_path / "scene")
+    folder = begun(tmp_path / "run", scene=tmp_path / "scene")
     save_plan(folder)
     with pytest.raises(InputError, match=r"^camera 1\.png: is not in the run's plan, and its scene: "):
         read_viewpoints(folder, None, "1.png")
@@ -140,7 +160,7 @@ def test_the_world_is_turned_so_that_y_is_up(folder: RunFolder) -> None:
 def test_photographs_are_small_and_turned_like_their_panoramas(tmp_path: Path) -> None:
     names = [f"pano_{i}.jpg" for i in range(6)]
     write_scene(tmp_path / "scene", names=names)
-    folder = make_run(tmp_path / "run", tmp_path / "scene")
+    folder = begun(tmp_path / "run", scene=tmp_path / "scene")
     save_model(folder, COARSE)
     save_plan(folder, names)
     shown = site_of_run(folder, Wanted())
@@ -195,3 +215,88 @@ def test_a_model_of_sky_alone_is_shown(tmp_path: Path) -> None:
     write_ply(tmp_path / "sky.ply", some(9, sky=9))
     page = site_of_file(tmp_path / "sky.ply", Wanted()).page
     assert (page.total, page.sky) == (9, None)
+
+
+WIDTH, HEIGHT = 800, 500  # pixels of a window
+
+
+def measuring_run(root: Path, metres: float | None) -> Path:
+    """The page of two balls, two units apart, five units ahead of the first panorama."""
+    folder = begun(root / "run")
+    save_plan(folder)
+    viewpoints = viewpoints_of(folder, "0.jpg")
+    places = torch.tensor([[-1.0, 0.0, 5.0], [1.0, 0.0, 5.0], [0, 3.0, 30.0]])
+    folder.of(COARSE).mkdir()
+    write_ply(folder.model(COARSE), balls(viewpoints, places, torch.tensor([0.15, 0.15, 0.5])))
+    shown = site_of_run(folder, Wanted(camera="0.jpg"))
+    write_folder(replace(shown, page=replace(shown.page, metres_per_unit=metres)), root / "web")
+    return root / "web"
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("metres", [None, 10.0])
+def test_a_known_distance_is_measured(browser: Browser, tmp_path: Path, metres: float | None) -> None:
+    with (
+        serving(measuring_run(tmp_path, metres)) as url,
+        opened(browser, url, width=WIDTH, height=HEIGHT) as page,
+    ):
+        ready(page)
+        page.click("#measure")
+        focal = WIDTH / 2 / np.tan(np.radians(85 / 2))
+        for x in (-1.0, 1.0):
+            page.mouse.click(WIDTH / 2 + focal * x / 5, HEIGHT / 2)
+            until(page, f"panolog.measure.points.length === {1 if x < 0 else 2}")
+        assert page.evaluate("panolog.measure.length") == pytest.approx(2, rel=0.02)
+        unit = "units" if metres is None else "m"
+        assert unit in page.inner_text("#labels p").split()
+        written = float(page.inner_text("#measured strong").split()[0])
+        assert written == pytest.approx(2 * (metres or 1), rel=0.02)
+        until(page, "document.querySelector('#lines line').getBoundingClientRect().width > 0")  # is drawn
+        box = page.locator("#lines line").evaluate("line => line.getBoundingClientRect().toJSON()")
+        assert box["width"] == pytest.approx(2 * focal / 5, rel=0.03)
+        page.mouse.click(WIDTH / 2, HEIGHT / 2 + 70)  # nothing is there
+        expect(page.locator("#measured")).to_contain_text("nothing to measure")
+        page.keyboard.press("Escape")
+        expect(page.locator("#lines line")).to_have_count(0)
+
+
+@pytest.mark.system
+def test_a_damaged_model_or_a_browser_without_webgl_is_one_line(browser: Browser, tmp_path: Path) -> None:
+    write_ply(tmp_path / "model.ply", some(30))
+    write_folder(site_of_file(tmp_path / "model.ply", Wanted()), tmp_path / "web")
+    (tmp_path / "web" / "model.sog").write_bytes(b"no model")
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    bare = browser.browser_type.launch(executable_path=path, args=["--no-sandbox", "--disable-3d-apis"])
+    lines = {browser: "The model cannot be read", bare: "This browser cannot draw in 3D"}
+    with closing(bare), serving(tmp_path / "web") as url:
+        for one, line in lines.items():
+            with opened(one, url, tolerate=lambda text: "WebGL" in text) as page:
+                assert until(page, "document.documentElement.dataset.state") == "failed"
+                expect(page.locator("#message")).to_contain_text(line)
+
+
+@pytest.mark.system
+def test_a_streamed_model_is_coarse_first_then_fine_and_bounded(browser: Browser, tmp_path: Path) -> None:
+    folder = run_with(tmp_path)
+    viewpoints = viewpoints_of(folder)
+    model = cloud(viewpoints).select(torch.arange(3000) < 2000)
+    write_ply(folder.model(COARSE), model)
+    write_folder(site_of_run(folder, Wanted(streams=True, levels=2)), tmp_path / "web")
+    levels = json.loads((tmp_path / "web" / "model" / "lod-meta.json").read_text())["counts"]
+    assert len(levels) > 1
+    with serving(tmp_path / "web") as url:
+        page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
+        seen: list[str] = []
+        page.on("request", lambda request: seen.append(request.url.removeprefix(url)))
+        page.goto(url)
+        ready(page)
+        first = [name.split("/")[1] for name in seen if name.endswith("/meta.json")]
+        assert first
+        assert first[0].startswith(f"{len(levels) - 1}_")  # all of the place in its coarsest level
+        until(page, "panolog.stage.model.lodRangeMin === 0 && !panolog.stage.loading")
+        picture = shown(page)
+        drawn = page.evaluate("panolog.stage.app.stats.frame.gsplats")
+        page.close()
+    assert drawn <= 2000
+    quality = psnr(picture, rendered(model, viewpoints, SIZE, background=picture[0, 0]))
+    assert quality >= 25, f"{quality:.1f} dB"

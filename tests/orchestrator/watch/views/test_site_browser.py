@@ -12,10 +12,23 @@ from playwright.sync_api import Browser, Page, expect
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_file, write_folder
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
+from tests.orchestrator.history import begun
 from tests.orchestrator.watch.dashboard.browser import DESK, KEYBOARD, PHONE, SMALL, opened
-from tests.orchestrator.watch.views.models import make_run, save_plan
-from tests.orchestrator.watch.views.pictures import layers, psnr, ready, rendered, shown, until
-from tests.orchestrator.watch.views.sites import COUNT, SIZE, cloud, run_with, serving, viewpoints_of
+from tests.orchestrator.watch.views.models import save_plan
+from tests.orchestrator.watch.views.sites import (
+    COUNT,
+    SIZE,
+    cloud,
+    layers,
+    psnr,
+    ready,
+    rendered,
+    run_with,
+    serving,
+    shown,
+    until,
+    viewpoints_of,
+)
 from tests.visual import legible
 from tests.visual.browser import wait_until_quiet
 
@@ -67,7 +80,7 @@ def pass_by(page: Page, seconds: float) -> None:
 
 
 def test_the_picture_of_one_file_is_that_of_our_renderer(browser: Browser, tmp_path: Path) -> None:
-    folder = make_run(tmp_path / "run")
+    folder = begun(tmp_path / "run")
     save_plan(folder)
     viewpoints = viewpoints_of(folder, "1.jpg")
     model = layers(viewpoints)

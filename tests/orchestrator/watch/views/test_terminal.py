@@ -2,6 +2,7 @@
 
 import re
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -25,8 +26,10 @@ from panolog.orchestrator.runs.records import (
     TaskYielded,
 )
 from panolog.orchestrator.runs.state import RunState
+from panolog.orchestrator.watch.views.summary import task_label
 from panolog.orchestrator.watch.views.terminal import WIDE, page, progress
-from panolog.workers.tasks import EVAL
+from panolog.workers.tasks import EVAL, Stage
+from tests.orchestrator.history import started
 from tests.orchestrator.watch.views.test_timing import (
     MEASURED,
     MERGED,
@@ -37,10 +40,10 @@ from tests.orchestrator.watch.views.test_timing import (
     TRAINED,
     ZERO,
     Timed,
-    started,
     state,
 )
 
+FORMAT = Path(__file__).parents[4] / "orchestrator/watch/dashboard/static/shared/format.js"
 LARGE: list[Timed] = [
     *STAGE_TWO,
     (20_000, Progressed(ZERO, 12_345, 30_000, 12.3, 0.0812, 27.31, 1_739_000, 6 * 2**30)),
@@ -52,12 +55,10 @@ def shown(records: list[Timed], width: int, *, running: bool) -> str:
     """What a terminal shows a second after the last record."""
     began = time.time() - records[-1][0] - 1
     records = [(began + at, record) for at, record in records]
-    console = Console(file=StringIO(), width=width)
-    root = Path("runs/my street")
+    output, root = StringIO(), Path("runs/my street")
     content = page(state(records), root=root, running=running, wide=width >= WIDE)
-    console.print(content, crop=False)
-    assert isinstance(console.file, StringIO)
-    return console.file.getvalue()
+    Console(file=output, width=width).print(content, crop=False)
+    return output.getvalue()
 
 
 @pytest.mark.parametrize("width", [80, 160])
@@ -78,6 +79,13 @@ def test_a_run_fits_the_terminal_and_says_how_far_it_is(width: int) -> None:
     ]
     assert all(len(line.rstrip()) <= width for line in text.splitlines())
     assert "1,739,000" in rows[4]
+
+
+def test_the_dashboard_has_the_same_names_of_tasks() -> None:
+    match = re.search(r"const TASKS = \{(.*?)\};", FORMAT.read_text(), re.DOTALL)
+    assert match is not None
+    names = dict(re.findall(r'(\w+): "([^"]+)"', match[1]))
+    assert names == {stage.value: task_label(stage.value) for stage in Stage}
 
 
 def test_shards_of_the_evaluation_are_one_row() -> None:
@@ -125,18 +133,17 @@ def test_machines_that_leave_are_shown_with_the_time_left_until_they_have_left(w
     assert "gpu-07" not in shown(recent, width, running=False).splitlines()[1]
 
 
+def lines(*changes: tuple[RunState, Sequence[Record]]) -> list[str]:
+    """What is printed of changes of a run where there is no terminal."""
+    with progress(Console(file=(output := StringIO()), width=80), Path("run")) as show:
+        for state, records in changes:
+            show(state, [Stored(number, 0.0, record) for number, record in enumerate(records, 1)])
+    return output.getvalue().splitlines()
+
+
 def test_plain_lines_say_what_leaves_and_what_moves() -> None:
-    console = Console(file=StringIO(), width=80)
-    records: list[Record] = [
-        LEAVES,
-        TaskYielded(ONE, "gpu-07"),
-        NodeLeft("3f2a81c4d5e6", "gpu-07"),
-        NodeStaying("7f2a81c4d5e6", "gpu-08"),
-    ]
-    with progress(console, Path("run")) as show:
-        show(RunState(), [Stored(number, 0.0, record) for number, record in enumerate(records, 1)])
-    assert isinstance(console.file, StringIO)
-    assert console.file.getvalue().splitlines() == [
+    gone = NodeLeft("3f2a81c4d5e6", "gpu-07"), NodeStaying("7f2a81c4d5e6", "gpu-08")
+    assert lines((RunState(), [LEAVES, TaskYielded(ONE, "gpu-07"), *gone])) == [
         f"gpu-07 (3f2a81c4) leaves in 2:00: {why_leaving(Leaving.PREEMPTION)}",
         "block 1: has stopped with a checkpoint, and moves: gpu-07 leaves",
         "gpu-07 (3f2a81c4): has left",
@@ -145,17 +152,8 @@ def test_plain_lines_say_what_leaves_and_what_moves() -> None:
 
 
 def test_lines_say_views_where_nothing_is_trained_and_no_stop_of_nothing() -> None:
-    console = Console(file=StringIO(), width=80)
-    records: list[Record] = [
-        StopRequested(0),
-        StopRequested(1),
-        StopRequested(3),
-        Progressed(EVAL, 7, 216, 9.0),
-    ]
-    with progress(console, Path("run")) as show:
-        show(RunState(), [Stored(number, 0.0, record) for number, record in enumerate(records, 1)])
-    assert isinstance(console.file, StringIO)
-    assert console.file.getvalue().splitlines() == [
+    stops = [StopRequested(tasks) for tasks in (0, 1, 3)]
+    assert lines((RunState(), [*stops, Progressed(EVAL, 7, 216, 9.0)])) == [
         "stopping: a task saves a checkpoint first; repeat to stop at once",
         "stopping: 3 tasks save a checkpoint first; repeat to stop at once",
         "evaluation: 7/216 views, 9.0 it/s, 0:23 left",
@@ -165,13 +163,8 @@ def test_lines_say_views_where_nothing_is_trained_and_no_stop_of_nothing() -> No
 
 
 def test_plain_lines_say_it_also_where_no_record_can_be_stored() -> None:
-    console = Console(file=StringIO(), width=80)
-    with progress(console, Path("run")) as show:
-        for text in ("", "disk full", "disk full", ""):
-            show(replace(RunState(), waiting=text), ())
-    assert isinstance(console.file, StringIO)
-    lines = console.file.getvalue().splitlines()
-    assert lines == ["disk full", "the run continues"]
+    states = (replace(RunState(), waiting=text) for text in ("", "disk full", "disk full", ""))
+    assert lines(*((state, ()) for state in states)) == ["disk full", "the run continues"]
 
 
 def test_commands_have_the_path_of_the_run() -> None:

@@ -25,15 +25,14 @@ from panolog.orchestrator.runs.records import (
     ScoresSaved,
     Stored,
     TaskFailed,
-    TaskStarted,
     TaskYielded,
 )
 from panolog.orchestrator.runs.state import RunState, replay
 from panolog.orchestrator.watch.views.history import History
 from panolog.orchestrator.watch.views.run_view import RunView, StageView, view_run
 from panolog.orchestrator.watch.views.summary import summarize
-from panolog.orchestrator.watch.views.timing import run_eta
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.history import started
 
 INFO = {"config": {"blocks": "2x1x1", "refine": True}}
 ZERO, ONE, SHARD = TaskId.block(0), TaskId.block(1), TaskId.shard(0)
@@ -46,10 +45,6 @@ Timed = tuple[float, Record]
 
 def began(previous: float | None = None) -> RunBegan:
     return RunBegan("host", 7, resumed=previous is not None, previous=previous)
-
-
-def started(task: TaskId, iteration: int = 0) -> TaskStarted:
-    return TaskStarted(task, 1, iteration, "host", 8, "cpu", 1)
 
 
 def model(task: TaskId, seconds: float) -> ModelSaved:
@@ -111,75 +106,79 @@ MEASURED: list[Timed] = [
 ]
 
 
-def test_the_stages_of_a_killed_run_have_ended_with_its_last_record() -> None:
+CUT: list[Timed] = [
+    *STAGE_TWO,
+    (152, model(ONE, 27.0)),
+    (155, TaskYielded(ZERO)),
+    (156, BudgetReached("max_cost")),
+]
+AFTER: list[Timed] = [*CUT, (160, MERGED), (161, started(EVAL)), (170, EvaluationSaved("metrics.json", {}))]
+EARLY: list[Timed] = [
+    *STAGE_ONE[:-1],
+    (80, TaskYielded(COARSE)),
+    (80, BudgetReached("deadline")),
+    (84, MERGED),
+]
+AGAIN: list[Timed] = [
+    *AFTER[:-1],
+    (162, RunEnded(Outcome.LIMITED, "max_cost")),
+    (300, began(162)),
+    (300, BudgetSet()),
+    (305, started(ZERO, 20)),
+]
+DONE_THEN: list[Timed] = [*AGAIN, (350, model(ZERO, 80)), (356, MERGED)]
+NO_MEMORY: list[Timed] = [(160, TaskFailed(ZERO, 3, "no memory", final=True)), (170, model(ONE, 40.0))]
+NAN: list[Timed] = [*STAGE_ONE[:-1], (70, TaskFailed(COARSE, 3, "NaN", final=True))]
+# Records, whether a driver is at work, a stage, and its status, begin, end, seconds, and tasks that are done.
+STAGES: dict[str, tuple[list[Timed], bool, str, tuple[object, ...]]] = {
+    "a killed run ends with its last record": (STAGE_TWO, False, "block", ("stopped", 125, 150, 25, 0)),
+    "what was done stays": (STAGE_TWO, False, "calibrate", ("done", 1, 10, 9, 0)),
+    "what is to come waits": (STAGE_TWO, False, "merge", ("waiting", None, None, None, 0)),
+    "an interrupted preflight": (STAGE_ONE[:3], False, "calibrate", ("stopped", 1, 5, 4, 0)),
+    "a live preflight": (STAGE_ONE[:3], True, "calibrate", ("running", 1, None, None, 0)),
+    "a failed block": (
+        [*STAGE_TWO, *NO_MEMORY, (171, RunEnded(Outcome.FAILED, "block 0"))],
+        *(False, "block", ("failed", 125, 170, 45, 1)),
+    ),
+    "a failed Stage I": (
+        [*NAN, (71, RunEnded(Outcome.FAILED, "NaN"))],
+        *(False, "coarse", ("failed", 12, 70, 58, 0)),
+    ),
+    "a limit ends the training": (CUT, True, "block", ("stopped", 125, 156, 31, 1)),
+    "what follows changes it no more": (AFTER, False, "block", ("stopped", 125, 156, 31, 1)),
+    "no time is in two stages: merge": (AFTER, False, "merge", ("done", 156, 160, 4, 1)),
+    "no time is in two stages: evaluation": (AFTER, False, "eval", ("done", 161, 170, 9, 1)),
+    "a limit ends Stage I": (EARLY, True, "coarse", ("stopped", 12, 80, 68, 0)),
+    "a merge after that": (EARLY, True, "merge", ("done", 80, 84, 4, 1)),
+    "a higher limit continues it": (AGAIN, True, "block", ("running", 125, None, None, 1)),
+    "and makes the merge anew": (AGAIN, True, "merge", ("waiting", None, None, None, 0)),
+    "with an end of its own": (DONE_THEN, True, "block", ("done", 125, 350, 87, 2)),
+    "and a merge of its own": (DONE_THEN, True, "merge", ("done", 350, 356, 6, 1)),
+    "no time counts without a driver": (
+        [*STAGE_TWO, (1000, began(previous=150)), (1010, started(ZERO, 20)), (1030, at(ZERO, 30))],
+        *(False, "block", ("stopped", 125, 1030, 55, 0)),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", STAGES)
+def test_a_stage_has_a_status_and_times(case: str) -> None:
+    records, running, name, expected = STAGES[case]
+    found = stage(view(records, running=running), name)
+    seconds = None if found.status == "running" else found.seconds  # until now
+    assert (found.status, found.began, found.ended, seconds, found.done) == expected
+
+
+def test_a_killed_run_says_what_is_known() -> None:
     shown = view(STAGE_TWO, running=False)
-    block = stage(shown, "block")
-    assert (block.status, block.began, block.ended, block.seconds) == ("stopped", 125, 150, 25)
     assert [stage.status for stage in shown.stages] == ["done"] * 4 + ["stopped"] + ["waiting"] * 2
-    preflight = stage(shown, "calibrate")
-    assert (preflight.label, preflight.began, preflight.ended) == ("preflight", 1, 10)
     summary = shown.summary
-    assert (summary.status, summary.label, summary.seconds, summary.eta) == (
-        "stopped",
-        "driver lost",
-        150,
-        None,
-    )
+    said = (summary.status, summary.label, summary.seconds, summary.eta)
+    assert said == ("stopped", "driver lost", 150, None)
     assert summary.reason == "the driver, process 7 on host, was killed or has crashed"
-    task = summary.task("block/000")
-    assert task is not None
+    (task,) = (task for task in summary.tasks if task.name == "block/000")
     assert (task.status, task.seconds) == ("waiting", 25)
-
-
-def test_a_run_that_failed_is_at_rest() -> None:
-    failed = TaskFailed(ZERO, 3, "no memory", final=True)
-    records = [*STAGE_TWO, (160, failed), (170, model(ONE, 40.0)), (171, RunEnded(Outcome.FAILED, "block 0"))]
-    block = stage(view(records, running=False), "block")
-    assert (block.status, block.ended, block.seconds, block.done) == ("failed", 170, 45, 1)
-    coarse_failed = [*STAGE_ONE[:-1], (70, TaskFailed(COARSE, 3, "NaN", final=True))]
-    coarse = stage(view([*coarse_failed, (71, RunEnded(Outcome.FAILED, "NaN"))], running=False), "coarse")
-    assert (coarse.status, coarse.ended, coarse.seconds) == ("failed", 70, 58)
-
-
-def test_a_stage_that_a_limit_ended_has_ended_at_that_moment() -> None:
-    """The times of all stages add up: none is in two of them."""
-    cut = [*STAGE_TWO, (152, model(ONE, 27.0)), (155, TaskYielded(ZERO)), (156, BudgetReached("max_cost"))]
-    block = stage(view(cut, running=True), "block")
-    assert (block.status, block.ended, block.seconds, block.done) == ("stopped", 156, 31, 1)
-    rest: list[Timed] = [(160, MERGED), (161, started(EVAL)), (170, EvaluationSaved("eval/metrics.json", {}))]
-    over = [*cut, *rest, (171, RunEnded(Outcome.LIMITED, "max_cost"))]
-    shown = view(over, running=False)
-    assert stage(shown, "block") == block
-    spans = [(stage.began, stage.ended) for stage in shown.stages[-3:]]
-    assert spans == [(125, 156), (156, 160), (161, 170)]
-    reached: list[Timed] = [(80, TaskYielded(COARSE)), (80, BudgetReached("deadline")), (84, MERGED)]
-    early = view([*STAGE_ONE[:-1], *reached], running=True)
-    assert [(stage(early, name).began, stage(early, name).ended) for name in ("coarse", "merge")] == [
-        (12, 80),
-        (80, 84),
-    ]
-
-
-def test_after_a_higher_limit_what_follows_begins_anew() -> None:
-    cut = [*STAGE_TWO, (156, BudgetReached("max_cost")), (160, MERGED), (161, started(EVAL))]
-    again = [*cut, (162, RunEnded(Outcome.LIMITED, "max_cost")), (300, began(162)), (300, BudgetSet())]
-    resumed = [*again, (305, started(ZERO, 20)), (306, started(ONE, 25))]
-    block, merge = (stage(view(resumed, running=True), name) for name in ("block", "merge"))
-    assert (block.status, block.began, block.ended) == ("running", 125, None)
-    assert (merge.began, merge.ended) == (None, None)
-    done = [*resumed, (350, model(ZERO, 80)), (352, model(ONE, 75)), (356, MERGED)]
-    block, merge = (stage(view(done, running=True), name) for name in ("block", "merge"))
-    assert (block.began, block.ended, merge.began, merge.ended) == (125, 352, 352, 356)
-
-
-def test_an_interrupted_preflight_is_stopped() -> None:
-    shown = view(STAGE_ONE[:3], running=False)
-    assert [(s.name, s.status, s.ended) for s in shown.stages][:2] == [
-        ("calibrate", "stopped", 5),
-        ("coarse", "waiting", None),
-    ]
-    live = view(STAGE_ONE[:3], running=True)
-    assert (live.stages[0].status, live.summary.step) == ("running", "calibrating")
+    assert view(STAGE_ONE[:3], running=True).summary.step == "calibrating"
 
 
 def test_elapsed_leaves_out_the_time_without_a_driver() -> None:
@@ -187,10 +186,8 @@ def test_elapsed_leaves_out_the_time_without_a_driver() -> None:
     shown = summarize(state(killed), running=True, now=1020.0)
     assert shown.seconds == 150 + 20
     stopped = [*STAGE_TWO, (155, RunEnded(Outcome.INTERRUPTED)), (1000, RunBegan("host", 9, resumed=True))]
-    assert (
-        summarize(state(stopped), running=True, now=1020.0).seconds == 155 + 20
-    )  # an older version's record
-    assert stage(view([*killed, (1030, at(ZERO, 30))], running=False), "block").seconds == 25 + 30
+    of_an_older_version = summarize(state(stopped), running=True, now=1020.0)
+    assert of_an_older_version.seconds == 155 + 20
 
 
 def test_the_seconds_of_a_task_are_of_all_its_attempts() -> None:
@@ -205,14 +202,7 @@ def test_the_seconds_of_a_task_are_of_all_its_attempts() -> None:
     ]
     ended = [*records, (1050, model(ZERO, 40.0))]
     shown = summarize(state(ended), running=True, now=1060.0)
-    seconds = {task.name: task.seconds for task in shown.tasks}
-    assert seconds == {
-        "coarse": 100,
-        "score/000": 7,
-        "plan": None,
-        "block/000": 35 + 40,
-        "block/001": 30 + 20 + 30,
-    }
+    assert [task.seconds for task in shown.tasks] == [100, 7, None, 35 + 40, 30 + 20 + 30]
 
 
 @pytest.mark.parametrize(
@@ -230,9 +220,11 @@ def test_the_seconds_of_a_task_are_of_all_its_attempts() -> None:
         ([*TRAINED, *SHARDED, (206, MERGED)], 206, 12 + 6),
         ([*TRAINED, *SHARDED, (206, MERGED), *MEASURED[:2]], 209, 12 - 3 + 6),
         ([*TRAINED, *SHARDED, (206, MERGED), *MEASURED], 212, 12 * 2 / 3 + 6),
+        ([(0, began()), (1, started(COARSE)), (2, at(COARSE, 50))], 2, None),  # Stage II has no estimate
+        ([*STAGE_TWO, (210, MERGED), (212, RunEnded(Outcome.DONE))], 213, None),
     ],
 )
-def test_the_time_left_is_that_of_the_whole_run(records: list[Timed], now: float, eta: float) -> None:
+def test_the_time_left_is_that_of_the_whole_run(records: list[Timed], now: float, eta: float | None) -> None:
     assert summarize(state(records), running=True, now=now).eta == pytest.approx(eta)
 
 
@@ -289,25 +281,10 @@ def test_the_shards_of_an_evaluation_are_a_stage() -> None:
     parts = [*TRAINED, *SHARDED, (206, MERGED)]
     begun = view([*parts, *MEASURED[:2]], running=True)
     measuring = stage(begun, "measure")
-    assert (measuring.label, measuring.status, measuring.tasks, measuring.done) == (
-        "measurement",
-        "running",
-        3,
-        0,
-    )
+    found = (measuring.label, measuring.status, measuring.tasks, measuring.done)
+    assert found == ("measurement", "running", 3, 0)
     assert measuring.progress == pytest.approx(0.5 / 3)
     assert not [each for each in view(TRAINED, running=True).stages if each.name == "measure"]
     every = [(211, MeasuresSaved(TaskId.measure(part), "", 3, 0)) for part in (1, 2)]
     ended = view([*parts, *MEASURED, *every], running=True)
     assert stage(ended, "measure").status == "done" and ended.summary.stage == "measure"
-
-
-def test_there_is_no_time_left_where_it_is_not_known() -> None:
-    unknown: list[Timed] = [(0, began()), (1, started(COARSE)), (2, at(COARSE, 50))]
-    assert run_eta(state(unknown), 2) is None  # an older run: Stage II has no estimate
-    end: list[Timed] = [
-        (210, MERGED),
-        (211, EvaluationSaved("eval/metrics.json", {})),
-        (212, RunEnded(Outcome.DONE)),
-    ]
-    assert run_eta(state([*STAGE_TWO, *end]), 213) is None

@@ -51,9 +51,3 @@ def test_a_motion_back_finds_little(
     words, rays, motion = place
     back = Motion(motion.rotation, -motion.direction)
     assert len(match_along(words, rays, back, ERROR)) < 0.2 * COUNT
-
-
-def test_nothing_matches_a_panorama_without_features() -> None:
-    words = [np.ones((3, 128), np.float32), np.empty((0, 128), np.float32)]
-    rays = np.eye(3), np.empty((0, 3))
-    assert match_along(words, rays, Motion(np.eye(3), np.array([0.0, 0, 1])), ERROR).shape == (0, 2)

@@ -14,7 +14,7 @@ from panolog.prepare.sfm.consistency.contradictions import (
     is_trusted,
 )
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, with_coverage
-from panolog.prepare.sfm.consistency.skeleton import Skeleton, find_skeleton, hops, tree_path
+from panolog.prepare.sfm.consistency.skeleton import Skeleton, find_skeleton, hops
 
 NOTHING = np.empty((0, 2), np.int64)
 
@@ -77,12 +77,6 @@ def test_coverage_counts_directions_and_not_features() -> None:
     for matches, share in ((every, 1.0), (every[:30], 0.5), (every[::2], 1.0), (every[:0], 0.0)):
         pairs = [Pair((0, 1), every), Pair((0, 2), matches), Pair((2, 3), every)]
         assert with_coverage([rays] * 4, pairs)[1].coverage == share
-
-
-def test_ways_along_a_tree() -> None:
-    tree = {(0, 1), (1, 4), (2, 4)}
-    assert tree_path(tree, (0, 2)) == [(2, 4), (1, 4), (0, 1)]
-    assert tree_path(tree, (0, 3)) == []
 
 
 def test_edges_between_pairs_in_little_memory() -> None:

@@ -4,26 +4,18 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.records import Record, RunBegan, ViewEvaluated
+from panolog.orchestrator.runs.records import Record, ViewEvaluated
 from panolog.orchestrator.watch.views.comparison.page import write_comparison
 from panolog.workers.tasks import COARSE, EVAL
+from tests.orchestrator.history import BEGAN, append, started
 from tests.orchestrator.watch.dashboard.browser import PHONE, SMALL, opened, unreachable
-from tests.orchestrator.watch.dashboard.served import EVIL, Served, append, serving
-from tests.orchestrator.watch.views.comparison.runs import (
-    VALUES,
-    metrics,
-    progressed,
-    started,
-    write,
-    write_picture,
-)
-from tests.visual import legible
+from tests.orchestrator.watch.dashboard.served import EVIL, Served, serving
+from tests.orchestrator.watch.views.comparison.runs import VALUES, metrics, progressed, write, write_picture
+from tests.visual.compare import expand
 
 pytestmark = pytest.mark.system
 
@@ -63,9 +55,8 @@ def settled(page: Page, runs: int) -> None:
 
 def grey(box: Locator) -> tuple[int, int]:
     """The grey of the left and of the right part of a picture, below the knob and the names."""
-    picture = cv2.imdecode(np.frombuffer(box.screenshot(), np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert picture is not None
-    row = picture[len(picture) * 3 // 4]
+    picture = expand(box.screenshot())
+    row = picture[len(picture) * 3 // 4, :, 1]
     return int(row[len(row) // 4]), int(row[-len(row) // 4])
 
 
@@ -94,16 +85,12 @@ def test_runs_are_chosen_in_the_list_with_the_keyboard(browser: Browser, served:
         assert page.title() == "first | second · PanoLOG"
 
 
-def test_what_the_page_says(browser: Browser, served: Served) -> None:
+def test_differences_and_curves_of_chosen_runs(browser: Browser, served: Served) -> None:
     with opened(browser, url_of(served, "first", "second")) as page:
         settled(page, 2)
         row = page.locator("#metrics tbody tr").first
-        expect(row).to_contain_text("WS-PSNR")
         expect(row.locator("td").nth(1)).to_contain_text("25.00+1.00better in 3, worse in 0 of 3")
         expect(row.locator(".difference")).to_have_class("difference good")
-        expect(page.locator("#settings tbody tr")).to_have_count(1)
-        expect(page.locator("#settings tbody")).to_contain_text("seed")
-        expect(page.locator("#facts tbody")).to_contain_text("Stage I1 min 0 s1 min 0 s")
         expect(page.locator("#warnings")).to_be_hidden()
         traces = page.locator(".chart").first.locator(".scatterlayer .trace")
         expect(traces).to_have_count(2)
@@ -150,7 +137,7 @@ def test_any_two_runs_and_the_ground_truth_are_compared_and_runs_are_left_out(
 def test_the_page_follows_runs_that_train(browser: Browser, tmp_path: Path) -> None:
     write(tmp_path / "done", measured=metrics())
     begun: list[tuple[float, Record]] = [
-        (0.0, RunBegan("host", 1, resumed=False)),
+        (0.0, BEGAN),
         (0.0, started(COARSE)),
         (1.0, progressed(COARSE, 10, 90)),
     ]
@@ -184,7 +171,7 @@ def test_a_run_that_is_gone_or_damaged_is_said(browser: Browser, served: Served,
         expect(page.locator("#missing")).to_contain_text("Choose two to eight runs")
 
 
-def test_all_can_be_read_and_reached_and_names_stay_text(
+def test_all_can_be_reached_and_names_stay_text(
     browser: Browser, served: Served, root: Path, tmp_path: Path
 ) -> None:
     def frozen(_: object) -> None:
@@ -201,5 +188,4 @@ def test_all_can_be_read_and_reached_and_names_stay_text(
             expect(page.locator("#warning-list")).to_contain_text(NAMES[2])
             assert page.evaluate("document.querySelectorAll('#content script, img:not([alt])').length") == 0
             assert page.evaluate(SMALL) == []
-            assert legible.hard_to_read(page, PHONE) == []
-            assert unreachable(page) == []
+            assert url != report.as_uri() or unreachable(page) == []  # of both the same

@@ -1,4 +1,4 @@
-"""The 3D view of a run in a real browser: it draws, and what it runs can do nothing to the dashboard."""
+"""What is made of models: the 3D view, which can do nothing to the dashboard, and files to save."""
 
 import os
 import time
@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
+from panolog.export.reading import read_model
 from panolog.orchestrator.engine.stages.partitioning import write_plan
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.watch.dashboard.models import pages
+from panolog.orchestrator.watch.dashboard.models import downloads, pages
 from panolog.orchestrator.watch.dashboard.models.pages import page_policy
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import write_ply
+from panolog.scene.ply import ply_exported, read_ply, write_ply
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.watch.dashboard.browser import opened
 from tests.orchestrator.watch.dashboard.served import POST, SCORES, Served, plan, raw, serving, write_run
 from tests.orchestrator.watch.views.models import save_checkpoint, some
-from tests.orchestrator.watch.views.pictures import layers, psnr, ready, rendered, shown, until
-from tests.orchestrator.watch.views.sites import SIZE, viewpoints_of
+from tests.orchestrator.watch.views.sites import SIZE, layers, ready, shown, until, viewpoints_of
 from tests.scenes import write_scene
 
 TOKEN = "t" * 43
@@ -84,20 +84,16 @@ def served(folder: RunFolder) -> Iterator[Served]:
 
 
 @pytest.mark.system
-def test_the_picture_of_a_page_that_can_reach_nothing_is_that_of_our_renderer(
-    browser: Browser, served: Served, folder: RunFolder
-) -> None:
+def test_a_page_draws_and_can_reach_nothing(browser: Browser, served: Served) -> None:
     def policy(text: str) -> bool:
         return "Content Security Policy" in text
 
-    viewpoints, url = viewpoints_of(folder, "1.jpg"), f"{served.url}{url_of_both(served)}#camera=1.jpg"
+    url = f"{served.url}{url_of_both(served)}#camera=1.jpg"
     with opened(browser, url, width=SIZE[0], height=SIZE[1], tolerate=policy) as page:
-        picture = shown(page)
+        assert len(np.unique(shown(page).reshape(-1, 3), axis=0)) > 1_000  # it is drawn
         assert page.title() == "model of run"
         assert page.evaluate("self.origin") == "null"
         assert page.evaluate(FETCH) == "refused"
-    expected = rendered(layers(viewpoints), viewpoints, SIZE, background=picture[0, 0])
-    assert psnr(picture, expected) >= 25
 
 
 @pytest.mark.system
@@ -215,3 +211,90 @@ def test_what_a_run_has_written_is_shown_with_the_scenes_photographs(
         later = time.time() + 100
         os.utime(folder.model(COARSE), (later, later))  # a newer model needs another page
         assert refused(served) == "the 3D view could not be made"
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> RunFolder:
+    """A run with a model of thirty Gaussians."""
+    folder = write_run(tmp_path / "runs" / "run")
+    write_plan(folder, plan(), SCORES)
+    write_ply(folder.point_cloud, some(30))
+    return folder
+
+
+def request(served: Served, kind: str) -> httpx.Response:
+    path = f"/api/runs/{served.id('run')}/downloads"
+    return served.client.post(path, json={"kind": kind}, headers=POST)
+
+
+def saved(served: Served, kind: str, folder: Path) -> Path:
+    """The file that the answer to a request leads to, saved."""
+    answer = request(served, kind)
+    assert answer.status_code == 200, answer.text
+    file = served.client.get(answer.json()["url"])
+    path = folder / file.headers["content-disposition"].partition("filename=")[2].strip('"')
+    path.write_bytes(file.content)
+    return path
+
+
+@pytest.mark.system
+def test_each_format_opens(small: RunFolder, tmp_path: Path) -> None:
+    with serving(small.root.parent) as served:
+        assert served.errors(f"/api/runs/{served.id('run')}/downloads/sog", 404)  # nothing was requested
+        sog, spz, ply, page = (saved(served, kind, tmp_path) for kind in ("sog", "spz", "ply", "html"))
+    assert [path.name for path in (sog, spz, ply, page)] == [
+        "run.sog",
+        "run.spz",
+        "run-upright.ply",
+        "run.html",
+    ]
+    assert ply_exported(ply)
+    down = np.sort(read_ply(ply).means[:, 1].numpy())
+    assert len(down) == 30
+    np.testing.assert_allclose(np.sort(read_model(sog).means[:, 1]), down, atol=0.01)
+    np.testing.assert_allclose(np.sort(-read_model(spz).means[:, 1]), down, atol=0.01)
+    assert b"engine.js" in page.read_bytes()
+
+
+@pytest.mark.system
+def test_a_file_is_made_once_for_each_model(
+    small: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = list[str]()
+
+    async def counted(module: str, arguments: list[str], what: str) -> None:
+        made.append(arguments[2])
+        Path(arguments[3]).write_bytes(small.point_cloud.read_bytes())
+
+    monkeypatch.setattr(downloads, "run_program", counted)  # what it makes: the test above
+    with serving(small.root.parent) as served:
+        first = saved(served, "ply", tmp_path).read_bytes()
+        assert saved(served, "ply", tmp_path).read_bytes() == first
+        assert made == ["ply"]
+        write_ply(small.point_cloud, some(20))
+        assert served.errors(f"/api/runs/{served.id('run')}/downloads/ply", 404)  # that was the old model
+        assert len(read_ply(saved(served, "ply", tmp_path))) == 20
+        monkeypatch.setattr(downloads, "_CACHED", 1)
+        saved(served, "spz", tmp_path)
+        assert served.errors(f"/api/runs/{served.id('run')}/downloads/ply", 404)
+
+
+@pytest.mark.system
+def test_what_cannot_be_made_is_one_line(small: RunFolder, tmp_path: Path) -> None:
+    with serving(small.root.parent) as served:
+        assert request(served, "exe").status_code == 422
+        model = tmp_path / "outside.ply"
+        small.point_cloud.rename(model)
+        missing = request(served, "sog")
+        assert (missing.status_code, missing.json()["error"]) == (409, "run: has no model yet")
+        small.point_cloud.symlink_to(model)
+        outside = request(served, "sog")
+        assert (outside.status_code, outside.json()["error"]) == (
+            409,
+            "point_cloud.ply: is not a plain file of the run",
+        )
+        small.point_cloud.unlink()
+        small.point_cloud.write_bytes(b"ply\n")
+        damaged = request(served, "sog")
+        assert damaged.status_code == 409
+        assert damaged.json()["error"].startswith("point_cloud.ply: the PLY header is not terminated")

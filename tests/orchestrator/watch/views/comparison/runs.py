@@ -8,9 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.orchestrator.runs.records import (
     BlockPlan,
     EvaluationSaved,
@@ -20,12 +18,11 @@ from panolog.orchestrator.runs.records import (
     PlanSaved,
     Progressed,
     Record,
-    RunBegan,
     RunEnded,
-    TaskStarted,
 )
 from panolog.orchestrator.runs.store import Database
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.history import BEGAN, begun, started
 
 BLOCKS = (TaskId.block(0), TaskId.block(1))
 VALUES = {"a.jpg": 20.0, "b.jpg": 24.0, "c.jpg": 28.0}  # WS-PSNR by panorama
@@ -47,20 +44,13 @@ def write(
     **config: Any,
 ) -> RunFolder:
     """A run folder with records at so many seconds after its start; by default those of a finished run."""
-    folder = RunFolder(root)
-    root.mkdir(parents=True)
-    settings = RunConfig(**{"width": 64, "iterations": 100, "device": "cpu", **config})
-    write_info(folder, make_info(SceneRef(path="/scenes/town", fingerprint=fingerprint), settings))
+    settings = {"iterations": 100, "device": "cpu"} | config
+    folder = begun(root, scene="/scenes/town", fingerprint=fingerprint, **settings)
     with closing(Database(folder.database)) as database:
         database.store([(_START + at, record) for at, record in (finished() if records is None else records)])
     if measured is not None:
         write_json(folder.metrics, measured)
     return folder
-
-
-def started(task: TaskId, node: str = "host") -> TaskStarted:
-    """A task's beginning."""
-    return TaskStarted(task, 1, 0, node, 7, "cpu", 2, "cpu")
 
 
 def progressed(task: TaskId, iteration: int, gaussians: int, loss: float = 0.1) -> Progressed:
@@ -73,22 +63,22 @@ def finished(node: str = "host") -> list[tuple[float, Record]]:
     first, second = BLOCKS
     plan = tuple(BlockPlan(number, 2, 250, train=True) for number in (0, 1))
     return [
-        (0, RunBegan("host", 1, resumed=False)),
-        (0, started(COARSE, node)),
+        (0, BEGAN),
+        (0, started(COARSE, node=node)),
         (30, progressed(COARSE, 50, 400, 0.3)),
         (60, progressed(COARSE, 100, 500, 0.2)),
         (60, ModelSaved(COARSE, "coarse/model.ply", 500, 9_000, 100, 60.0)),
         (60, PlanSaved("partition/plan.json", plan)),
-        (60, started(first, node)),
+        (60, started(first, node=node)),
         (90, progressed(first, 50, 300, 0.2)),
         (120, progressed(first, 100, 340, 0.1)),
         (120, ModelSaved(first, "blocks/000/model.ply", 340, 9_000, 100, 60.0)),
-        (120, started(second, node)),
+        (120, started(second, node=node)),
         (150, progressed(second, 50, 320, 0.4)),
         (180, progressed(second, 100, 360, 0.3)),
         (180, ModelSaved(second, "blocks/001/model.ply", 360, 9_000, 100, 60.0)),
         (181, Merged("point_cloud.ply", 700, 10, 12_345, 1.0)),
-        (181, started(EVAL, node)),
+        (181, started(EVAL, node=node)),
         (190, EvaluationSaved("eval/metrics.json", {"ws_psnr": 24.0})),
         (190, RunEnded(Outcome.DONE)),
     ]

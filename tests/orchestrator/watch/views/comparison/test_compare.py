@@ -1,19 +1,23 @@
-"""What a comparison of runs says: differences, counts, settings, and whether it is fair."""
+"""What a comparison of runs says: differences, settings, whether it is fair; and its page as one file."""
 
+import base64
 import json
 import os
 import sqlite3
+import struct
 from collections.abc import Callable
 from contextlib import closing
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from rich.console import Console
 
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.records import Outcome, Record, RunBegan, RunEnded
+from panolog.orchestrator.runs.records import Outcome, Record, RunEnded
 from panolog.orchestrator.watch.views.comparison.compare import compare
 from panolog.orchestrator.watch.views.comparison.curves import curves_of
 from panolog.orchestrator.watch.views.comparison.page import write_comparison
@@ -22,14 +26,9 @@ from panolog.orchestrator.watch.views.comparison.schema import Comparison
 from panolog.orchestrator.watch.views.comparison.terminal import table
 from panolog.scene.errors import InputError
 from panolog.workers.tasks import COARSE, TaskId
-from tests.orchestrator.watch.views.comparison.runs import (
-    finished,
-    metrics,
-    progressed,
-    started,
-    write,
-)
-from tests.orchestrator.watch.views.pages.snapshots import snapshot_of
+from tests.orchestrator.history import BEGAN, started
+from tests.orchestrator.watch.views.comparison.runs import finished, metrics, progressed, write, write_picture
+from tests.orchestrator.watch.views.pages.snapshots import self_contained, snapshot_of
 
 HIGHER = {"a.jpg": 21.0, "b.jpg": 23.0, "c.jpg": 31.0}
 
@@ -79,7 +78,7 @@ def test_settings_that_differ_also_from_an_older_version(tmp_path: Path) -> None
 
 
 BEGUN: list[tuple[float, Record]] = [
-    (0.0, RunBegan("host", 1, resumed=False)),
+    (0.0, BEGAN),
     (0.0, started(COARSE)),
     (9.0, progressed(COARSE, 50, 9)),
 ]
@@ -158,7 +157,7 @@ def test_of_many_tasks_some_are_read_and_sums_are_of_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("panolog.orchestrator.watch.views.comparison.curves._TASKS", 2)
-    many: list[tuple[float, Record]] = [(0.0, RunBegan("host", 1, resumed=False))]
+    many: list[tuple[float, Record]] = [(0.0, BEGAN)]
     for number in range(5):
         task = TaskId.block(number)
         many += [(0.0, started(task)), (30.0, progressed(task, 50, 100)), (60.0, progressed(task, 100, 200))]
@@ -181,17 +180,14 @@ def break_info(folder: RunFolder, **changes: Any) -> None:
     "damage",
     [
         lambda folder: folder.info.write_text("[" * 100_000),
-        lambda folder: folder.info.write_text("[]"),
         lambda folder: folder.info.write_text('{"x": "' + "x" * 2_000_000 + '"}'),
         lambda folder: break_info(folder, scene=None),
         lambda folder: break_info(folder, config={"width": 64, "recipe": ["x"]}),
         lambda folder: folder.database.write_bytes(b"no database" * 1_000),
         lambda folder: folder.metrics.write_text("{"),
-        lambda folder: folder.metrics.write_text("[" * 100_000),
         lambda folder: folder.metrics.write_text("[]"),
         lambda folder: replace_by_pipe(folder.info),
         lambda folder: (folder.database.unlink(), folder.database.mkdir()),
-        lambda folder: replace_by_pipe(folder.metrics),
         lambda folder: replace_by_pipe(folder.lock),
         lambda folder: os.truncate(folder.metrics, 100_000_000),
     ],
@@ -250,3 +246,74 @@ def test_numbers_that_json_does_not_have(tmp_path: Path) -> None:
     output = tmp_path / "page.html"
     write_comparison([first.root, second.root], output)
     snapshot_of(output.read_text())  # is JSON
+
+
+JPEG = "data:image/jpeg;base64,"
+
+
+def page_of(tmp_path: Path, *folders: RunFolder) -> str:
+    output = tmp_path / "page.html"
+    write_comparison([folder.root for folder in folders], output)
+    return output.read_text()
+
+
+def grey(url: str) -> tuple[int, int, int]:
+    """The size of a picture in a data URL, and its mean grey."""
+    raw = np.frombuffer(base64.b64decode(url.removeprefix(JPEG)), np.uint8)
+    picture = cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    return picture.shape[1], picture.shape[0], round(float(picture.mean()))
+
+
+def test_it_is_one_page_with_all_of_it(tmp_path: Path) -> None:
+    first, second = write(tmp_path / "a", measured=metrics()), write(tmp_path / "b", measured=metrics())
+    write_picture(first, "b.jpg", 20, 200)
+    write_picture(second, "b.jpg", 100, 200, width=2048)
+    page = page_of(tmp_path, first, second)
+    assert self_contained(page)
+    assert "default-src 'none'" in page
+    found = snapshot_of(page)["answers"]
+    assert [run["name"] for run in found["compare?"]["runs"]] == ["a", "b"]
+    assert [len(run["stages"]) for run in found["compare/curves?"]["runs"]] == [2, 2]
+    (view,) = (view for view in found["compare?"]["views"] if view["truth"])
+    assert view["name"] == "b.jpg"
+    assert grey(view["pictures"][0]) == (64, 32, 20)
+    assert grey(view["pictures"][1]) == (1024, 512, 100)
+    assert grey(view["truth"]) == (64, 32, 200)
+
+
+@pytest.mark.parametrize(("count", "most"), [(2, 12), (8, 6)])
+def test_pictures_are_few_and_small(tmp_path: Path, count: int, most: int) -> None:
+    values = {f"{number:02d}.jpg": float(number) for number in range(20)}
+    folders = [write(tmp_path / str(number), measured=metrics(values)) for number in range(count)]
+    for folder in folders:
+        for name in values:
+            write_picture(folder, name, 20, 200, width=1024)
+    page = page_of(tmp_path, *folders)
+    shown = [view["name"] for view in snapshot_of(page)["answers"]["compare?"]["views"] if view["truth"]]
+    assert (len(shown), shown[0], shown[-1]) == (most, "00.jpg", "19.jpg")
+    assert len(page) < 8_000_000
+
+
+def huge_jpeg(width: int, height: int) -> bytes:
+    """A small JPEG whose header states another size."""
+    raw = bytes(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1])
+    at = raw.index(b"\xff\xc0") + 5
+    return raw[:at] + struct.pack(">HH", height, width) + raw[at + 4 :]
+
+
+def test_pictures_that_are_none_are_left_out(tmp_path: Path) -> None:
+    views = dict.fromkeys(("cut", "bomb", "png", "wide", "empty", "link", "good"), 20.0)
+    first = write(tmp_path / "a", measured=metrics({f"{name}.jpg": value for name, value in views.items()}))
+    write_picture(first, "good.jpg", 20, 200)
+    good = first.picture("good.jpg").read_bytes()
+    (tmp_path / "outside.jpg").write_bytes(good)
+    first.picture("cut.jpg").write_bytes(good[: len(good) // 3])
+    first.picture("bomb.jpg").write_bytes(huge_jpeg(65_000, 65_000))
+    first.picture("png.jpg").write_bytes(bytes(cv2.imencode(".png", np.zeros((64, 64, 3), np.uint8))[1]))
+    first.picture("wide.jpg").write_bytes(bytes(cv2.imencode(".jpg", np.zeros((8, 64, 3), np.uint8))[1]))
+    first.picture("empty.jpg").touch()
+    first.picture("link.jpg").symlink_to(tmp_path / "outside.jpg")
+    found = snapshot_of(page_of(tmp_path, first, write(tmp_path / "b")))["answers"]["compare?"]["views"]
+    assert {view["name"] for view in found if any(view["pictures"]) or view["truth"]} == {"good.jpg"}
+    assert len(found) == len(views)

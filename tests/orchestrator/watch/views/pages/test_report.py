@@ -19,10 +19,9 @@ from panolog.orchestrator.cli.session import session  # cli_results has commands
 from panolog.orchestrator.engine.driver.journal import Journal
 from panolog.orchestrator.engine.scheduling.pool import Failed
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.runs.info import SceneRef, make_info, read_info, write_info
-from panolog.orchestrator.runs.records import Noticed, RunBegan, Stored, TaskFailed
+from panolog.orchestrator.runs.info import read_info
+from panolog.orchestrator.runs.records import Noticed, Stored, TaskFailed
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.dashboard.messages import (
     BlockCameras,
@@ -35,20 +34,19 @@ from panolog.orchestrator.watch.dashboard.messages import (
 )
 from panolog.orchestrator.watch.views.pages.report import report_or_notice, write_report
 from panolog.scene.errors import InputError, RunError
-from panolog.scene.ply import write_ply
 from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.fakes import Harness, fails
-from tests.orchestrator.watch.dashboard.served import write_whole_run
+from tests.orchestrator.history import BEGAN, append, begun
 from tests.orchestrator.watch.views.pages.snapshots import self_contained, snapshot_of
-from tests.scene.test_ply import gaussians
+from tests.visual.compare import expand
 from tests.workers.seams.test_schema import seam
 
 SCRIPT = "</script><script>alert(1)</script>"
 
 
 def begin(folder: RunFolder, scene: str = "/scenes/street") -> None:
-    write_info(folder, make_info(SceneRef(path=scene, fingerprint="f"), RunConfig(width=64, seed=7)))
+    begun(folder.root, scene=scene, seed=7)
 
 
 @pytest.fixture(scope="module")
@@ -132,24 +130,12 @@ def test_a_failed_run_has_a_report_with_its_reason(tmp_path: Path) -> None:
     assert "CUDA error: <misaligned>" in str(report.run.summary.reason)
 
 
-def test_a_report_of_a_live_run_and_of_one_that_was_killed(tmp_path: Path) -> None:
-    folder = write_whole_run(tmp_path / "run")
-    write_ply(folder.model(COARSE), gaussians(50))
-    with lock.hold(folder.lock):
-        live = Report(write_report(folder)).run
-    assert (live.summary.status, live.summary.training_gaussians) == ("running", 500)
-    assert live.eta is not None
-    assert Report(write_report(folder)).run.summary.label == "driver lost"
-
-
 def test_other_peoples_words_stay_words(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "<img src=x onerror=alert(1)>")
     folder.root.mkdir()
     begin(folder, SCRIPT)
-    database = Database(folder.database)
-    database.append([RunBegan("host", 1, resumed=False), Noticed(COARSE, SCRIPT)])
-    database.append([TaskFailed(COARSE, 1, SCRIPT, final=True)])
-    database.close()
+    failed = TaskFailed(COARSE, 1, SCRIPT, final=True)
+    append(folder, BEGAN, Noticed(COARSE, SCRIPT), failed)
     write_json(folder.metrics, {"views": {SCRIPT: {"psnr": 1.0}}, "lpips_reason": SCRIPT})
     report = Report(write_report(folder))
     assert "alert(1)</script>" not in report.text
@@ -162,8 +148,7 @@ def test_a_run_that_has_hardly_begun_has_a_report_too(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     begin(folder)
     assert "runs/report/events" not in Report(write_report(folder)).answers
-    with closing(Database(folder.database)) as database:
-        database.append([RunBegan("host", 1, resumed=False)])
+    append(folder, BEGAN)
     report = Report(write_report(folder))
     assert report.run.summary.label == "driver lost"
     assert [event["type"] for event in report["events"]["events"]] == ["RunBegan"]
@@ -187,8 +172,7 @@ def test_pictures_are_few_and_small_and_only_the_runs_own(tmp_path: Path) -> Non
     assert not {"../../../secret.png", "gone.png", "20.png"} & set(shown)
     for number in range(len(shown)):
         raw = base64.b64decode(report[f"views/{number}"].partition(",")[2])
-        decoded = cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_COLOR)
-        assert decoded is not None and decoded.shape[1] <= 2048
+        assert expand(raw).shape[1] <= 2048
     assert len(report.text) < 8_000_000
 
 
@@ -265,15 +249,10 @@ def test_the_report_has_movers_and_only_the_runs_own_pictures(done: RunFolder, t
         cv2.imwrite(str(path), np.zeros((32, 64, 3), np.uint8))
     report = Report(write_report(done, tmp_path / "page.html"))
     found = report["findings"]
-    assert [mover["name"] for mover in found["movers"]] == [
-        "../../secret.jpg",
-        "walk/a.jpg",
-        "c.jpg",
-        "b.jpg",
-    ]
-    assert found["pictures"] == ["mover-1.jpg"] and report["findings/mover-1.jpg"].startswith(
-        "data:image/jpeg"
-    )
+    order = ["../../secret.jpg", "walk/a.jpg", "c.jpg", "b.jpg"]
+    assert [mover["name"] for mover in found["movers"]] == order
+    assert found["pictures"] == ["mover-1.jpg"]
+    assert report["findings/mover-1.jpg"].startswith("data:image/jpeg")
     done.mover_shares.write_bytes(b'{"panoramas": [1]}')
     with pytest.raises(InputError, match=r"movers\.json: is damaged"):
         write_report(done, tmp_path / "page.html")
@@ -284,10 +263,8 @@ def test_the_report_has_movers_and_only_the_runs_own_pictures(done: RunFolder, t
 
 
 def test_refined_poses_are_there_the_farthest_first(done: RunFolder, tmp_path: Path) -> None:
-    moves = [
-        {"name": name, "moved": 0.01, "turned": 0.1, "pixels": pixels, "at_bound": False}
-        for name, pixels in (("a.jpg", 1.5), ("b.jpg", 2.5))
-    ]
+    one = {"name": "a.jpg", "moved": 0.01, "turned": 0.1, "pixels": 1.5, "at_bound": False}
+    moves = [one, one | {"name": "b.jpg", "pixels": 2.5}]
     write_json(done.poses, {"panoramas": moves})
     metrics = json.loads(done.metrics.read_bytes())
     there = {"psnr": 27.25, "ws_psnr": 26.5, "lpips": None, "cc_psnr": 28.0, "pixels": 0.75}

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,7 +32,7 @@ from panolog.workers.events import Calibration, Event, Progress
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from tests.orchestrator.fakes import CrashError, FakePool, Harness, Script, SetClock, well
-from tests.orchestrator.history import AGAIN, after, model, started
+from tests.orchestrator.history import AGAIN, after, started
 
 A, B = Node("aaaa", "gpu-a", 2, 2**40), Node("bbbb", "gpu-b", 2, 2**40)
 CARDS = tuple(Gpu("NVIDIA L4", 22 * 2**30, f"GPU-{number}") for number in range(4))
@@ -59,123 +60,99 @@ def run(*records: Record, nodes: tuple[Node, ...] = (A, B)) -> RunState:
 
 
 def review(state: RunState, now: float, nodes: tuple[Node, ...] = (A, B)) -> RunState:
-    """The state after it was decided which nodes are in quarantine."""
     for change in quarantine.changes(state, nodes, CONFIG, now):
         state = apply(state, [Stored(0, now, change)])
     return state
+
+
+def fails(*tasks: int, node: Node = A, **rest: Any) -> list[Record]:
+    return [failed(BLOCKS[task], node, **rest) for task in tasks]
+
+
+def saves(node: Node, card: str = "") -> list[Record]:
+    return [replace(started(BLOCKS[8], node=node.id), card=card), CheckpointSaved(BLOCKS[8], 5, "c", 1)]
 
 
 def bad(state: RunState) -> list[str]:
     return [node.host for node in state.quarantined()]
 
 
-def test_failures_of_different_tasks_put_a_node_into_quarantine() -> None:
-    assert bad(run(failed(BLOCKS[0], A), failed(BLOCKS[1], A))) == []
-    assert bad(run(*[failed(BLOCKS[0], A)] * 5)) == []  # one task may be the cause
-    assert bad(run(*(failed(task, A, kind=Failure.MEMORY) for task in BLOCKS))) == []
-    state = run(*(failed(task, A) for task in BLOCKS[:3]))
+THREE, ON_ONE = fails(0, 1, 2), fails(0, 1, 2, node=FOUR, gpu=3)
+ALIKE = [failed(task, A, f"no card {task.number}") for task in BLOCKS[:3]]
+UNLIKE = [failed(task, A, why) for task, why in zip(BLOCKS, ("file", "memory", "card"), strict=False)]
+EACH = [failed(task, FOUR, "no driver", gpu=task.number) for task in BLOCKS[:3]]
+ENDED = RunEnded(Outcome.FAILED, "no")
+REPEATED = [*fails(0), *fails(0, node=B), *fails(1, 2)]
+
+
+@pytest.mark.parametrize(
+    ("nodes", "records", "places"),
+    [
+        pytest.param((A, B), THREE[:2], [], id="two tasks are too few"),
+        pytest.param((A, B), fails(0, 0, 0, 0, 0), [], id="one task may be the cause"),
+        pytest.param((A, B), fails(*range(9), kind=Failure.MEMORY), [], id="a shortage is of no node"),
+        pytest.param((A, B), [*THREE[:2], *saves(A), THREE[2]], [], id="a success clears a node"),
+        pytest.param((A, B), [*THREE[:2], *saves(B), THREE[2]], ["gpu-a"], id="but not one elsewhere"),
+        pytest.param((A,), UNLIKE, [], id="the only node may be used while tasks fail differently"),
+        pytest.param((A,), ALIKE[:2], [], id="or two alike"),
+        pytest.param((A,), ALIKE, ["gpu-a"], id="not where all do"),
+        pytest.param((A, FOUR), EACH, ["gpu-f"], id="failures on several GPUs are of their node"),
+        pytest.param((FOUR,), EACH, ["gpu-f"], id="also of the only one where they are alike"),
+        pytest.param(
+            (FOUR,),
+            [*ON_ONE[:2], *saves(FOUR, "GPU-0"), ON_ONE[2]],
+            ["gpu-f, GPU 3"],
+            id="a success on another GPU does not clear a bad one",
+        ),
+        pytest.param((FOUR,), [*ON_ONE, *EACH[:1]], ["gpu-f, GPU 3"], id="its failures are not the node's"),
+        pytest.param((A, FOUR), [*ON_ONE, *EACH[:1]], ["gpu-f, GPU 3"], id="also next to another node"),
+        pytest.param((A, B), [*saves(B), *REPEATED], [], id="a task that fails alike on a sound node"),
+        pytest.param((A, B), REPEATED, ["gpu-a"], id="of the other nothing good is known"),
+        pytest.param((A, B), [*THREE, *saves(B), *fails(2, node=B)], [], id="found out after the quarantine"),
+        pytest.param((A, B), [*THREE, AGAIN], ["gpu-a"], id="a new driver knows of it"),
+        pytest.param((A, B), [*THREE, ENDED, AGAIN], [], id="unless the run had failed"),
+        pytest.param((A, B), [*THREE[:2], AGAIN, THREE[2]], [], id="but not of single failures"),
+    ],
+)
+def test_failures_of_different_tasks_put_a_place_into_quarantine(
+    nodes: tuple[Node, ...], records: list[Record], places: list[str]
+) -> None:
+    assert bad(run(*records, nodes=nodes)) == places
+
+
+def test_a_quarantine_has_its_reason_and_ends_after_its_time() -> None:
+    state = run(*THREE)
     (node,) = state.quarantined()
     assert (node.host, node.until) == ("gpu-a", 62.0)
     assert node.reason == "3 tasks have failed there in a row, the last one, block/002: block/002: no"
     assert [node.host for node in quarantine.usable(state, (A, B))] == ["gpu-b"]
     assert [notice.message for notice in state.notices] == [f"gpu-a (aaaa) is in quarantine: {node.reason}"]
-
-
-def test_the_only_node_is_not_used_for_a_while_where_tasks_fail_alike() -> None:
-    ways = ["no file", "no memory", "no card"]
-    different = [failed(task, A, why) for task, why in zip(BLOCKS, ways, strict=False)]
-    assert bad(run(*different, nodes=(A,))) == []
-    alike = [failed(task, A, f"no card {task.number}") for task in BLOCKS[:3]]
-    assert bad(run(*alike[:2], nodes=(A,))) == []
-    state = run(*alike, nodes=(A,))
-    assert bad(state) == ["gpu-a"]
-    assert {state.task(task).errors for task in BLOCKS[:3]} == {0}
-
-
-def test_a_gpu_is_put_into_quarantine_alone() -> None:
-    on_one = [failed(task, FOUR, gpu=3) for task in BLOCKS[:3]]
-    for nodes in ((FOUR,), (A, FOUR)):
-        state = run(*on_one, nodes=nodes)
-        (card,) = state.quarantined()
-        assert (card.id, card.host) == ("GPU-3", "gpu-f, GPU 3")
-        assert quarantine.usable(state, [FOUR])[0].closed == (3,)
-        assert quarantine.excuses(state, (FOUR.id, "GPU-3"), Failure.ERROR)
-        assert not quarantine.excuses(state, (FOUR.id, "GPU-2"), Failure.ERROR)
-        assert {state.task(task).errors for task in BLOCKS[:3]} == {0}
-        more = run(*on_one, failed(BLOCKS[3], FOUR, gpu=0), nodes=nodes)
-        assert bad(more) == ["gpu-f, GPU 3"]  # what has failed on it counts no more against the node
-
-
-def test_failures_on_several_gpus_are_those_of_their_node() -> None:
-    spread = [failed(task, FOUR, gpu=gpu) for gpu, task in enumerate(BLOCKS[:3])]
-    assert bad(run(*spread, nodes=(A, FOUR))) == ["gpu-f"]
-    one_each = [failed(task, FOUR, "no driver", gpu=task.number % 4) for task in BLOCKS]
-    assert bad(run(*one_each[:3], nodes=(FOUR,))) == ["gpu-f"]
-
-
-def test_a_success_on_another_gpu_does_not_clear_a_bad_one() -> None:
-    saved: list[Record] = [
-        replace(started(BLOCKS[8], node=FOUR.id), card="GPU-0"),
-        CheckpointSaved(BLOCKS[8], 5, "c", 1),
-    ]
-    two: list[Record] = [failed(task, FOUR, gpu=3) for task in BLOCKS[:2]]
-    assert bad(run(*two, *saved, failed(BLOCKS[2], FOUR, gpu=3), nodes=(FOUR,))) == ["gpu-f, GPU 3"]
-
-
-def test_a_success_in_between_clears_a_node() -> None:
-    saved: list[Record] = [started(BLOCKS[8], node=A.id), CheckpointSaved(BLOCKS[8], 5, "c", 1)]
-    elsewhere: list[Record] = [started(BLOCKS[8], node=B.id), model(BLOCKS[8])]
-    two: list[Record] = [failed(task, A) for task in BLOCKS[:2]]
-    third = failed(BLOCKS[2], A)
-    assert bad(run(*two, *saved, third)) == []
-    assert bad(run(*two, *elsewhere, third)) == ["gpu-a"]
-
-
-def test_failures_on_a_bad_node_do_not_count_against_its_tasks() -> None:
-    lost = failed(BLOCKS[1], A, kind=Failure.LOST)
-    good = [failed(BLOCKS[0], B), failed(BLOCKS[0], A), lost]
-    before = after(PLAN, *good, TaskFailed(BLOCKS[2], 3, "block/002: no", final=True, node=A.id))
-    counts = [(before.task(task).errors, before.task(task).losses) for task in BLOCKS[:3]]
-    assert counts == [(2, 0), (0, 1), (1, 0)]
-    assert before.status(BLOCKS[2]) == Status.FAILED
-    state = review(before, 1.0)
-    counts = [(state.task(task).errors, state.task(task).losses) for task in BLOCKS[:3]]
-    assert counts == [(1, 0), (0, 0), (0, 0)]
-    assert state.status(BLOCKS[2]) == Status.WAITING
-    assert quarantine.excuses(state, (A.id, ""), Failure.LOST)
-    assert not quarantine.excuses(state, (A.id, ""), Failure.MEMORY)
-    assert not quarantine.excuses(state, (B.id, ""), Failure.LOST)
-
-
-def test_tasks_that_fail_alike_on_a_sound_node_are_the_cause_themselves() -> None:
-    sound: list[Record] = [started(BLOCKS[8], node=B.id), CheckpointSaved(BLOCKS[8], 5, "c", 1)]
-    two: list[Record] = [
-        failed(BLOCKS[0], A),
-        failed(BLOCKS[0], B),
-        failed(BLOCKS[1], A),
-        failed(BLOCKS[2], A),
-    ]
-    assert bad(run(*sound, *two)) == []
-    assert bad(run(*two)) == ["gpu-a"]  # of B nothing good is known
-    state = run(*(failed(task, A) for task in BLOCKS[:3]), *sound, failed(BLOCKS[2], B))
-    assert bad(state) == []  # found out after the quarantine
-
-
-def test_a_node_is_released_after_its_time() -> None:
-    state = run(*(failed(task, A) for task in BLOCKS[:3]))
     assert bad(review(state, 61.0)) == ["gpu-a"]
     assert bad(review(state, 62.0)) == []
     assert bad(review(state, -1000.0)) == []  # the clock was set back
-    again = review(review(state, 62.0), 63.0)
-    assert bad(again) == []  # its old failures are forgotten
+    assert bad(review(review(state, 62.0), 63.0)) == []  # its old failures are forgotten
 
 
-def test_a_new_driver_knows_of_a_quarantine_unless_the_run_had_failed() -> None:
-    three: list[Record] = [failed(task, A) for task in BLOCKS[:3]]
-    assert bad(run(*three, AGAIN)) == ["gpu-a"]
-    ended = RunEnded(Outcome.FAILED, "no")
-    assert bad(run(*three, ended, AGAIN)) == []
-    assert bad(run(*three[:2], AGAIN, three[2])) == []
+@pytest.mark.parametrize("nodes", [(FOUR,), (A, FOUR)], ids=["the only node", "one of two"])
+def test_a_gpu_is_put_into_quarantine_alone(nodes: tuple[Node, ...]) -> None:
+    state = run(*ON_ONE, nodes=nodes)
+    assert [(card.id, card.host) for card in state.quarantined()] == [("GPU-3", "gpu-f, GPU 3")]
+    assert quarantine.usable(state, [FOUR])[0].closed == (3,)
+    assert quarantine.excuses(state, (FOUR.id, "GPU-3"), Failure.ERROR)
+    assert not quarantine.excuses(state, (FOUR.id, "GPU-2"), Failure.ERROR)
+
+
+def test_failures_on_a_bad_node_do_not_count_against_its_tasks() -> None:
+    lost = fails(1, kind=Failure.LOST)
+    final = TaskFailed(BLOCKS[2], 3, "block/002: no", final=True, node=A.id)
+    before = after(PLAN, *fails(0, node=B), *fails(0), *lost, final)
+    state = review(before, 1.0)
+    for found, counts in ((before, [(2, 0), (0, 1), (1, 0)]), (state, [(1, 0), (0, 0), (0, 0)])):
+        assert [(found.task(task).errors, found.task(task).losses) for task in BLOCKS[:3]] == counts
+    assert (before.status(BLOCKS[2]), state.status(BLOCKS[2])) == (Status.FAILED, Status.WAITING)
+    assert quarantine.excuses(state, (A.id, ""), Failure.LOST)
+    assert not quarantine.excuses(state, (A.id, ""), Failure.MEMORY)
+    assert not quarantine.excuses(state, (B.id, ""), Failure.LOST)
 
 
 # With the driver
@@ -276,21 +253,6 @@ def test_a_worker_that_is_killed_on_the_sound_node_leaves_no_only_choice(tmp_pat
 
     assert harness.drive(script).outcome == "done"
     assert [where.node for where, _ in harness.attempts(COARSE)] == [A.id, B.id, B.id]
-
-
-def test_a_read_error_of_one_node_does_not_end_the_run(tmp_path: Path) -> None:
-    """Also one that the worker takes for wrong input."""
-    harness = Harness(tmp_path, (A, B))
-
-    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
-        if harness.pool.placement(spec.task).node == A.id:
-            raise CrashError(Failed("a.jpg is truncated", Failure.INPUT))
-        yield from well(spec)
-
-    assert harness.drive(script).outcome == "done"
-    assert {failed.then for failed in harness.records(TaskFailed)} == {
-        "tried again before the input counts as wrong"
-    }
 
 
 def test_where_all_nodes_fail_the_run_waits_and_then_says_why(many: Harness) -> None:
