@@ -14,6 +14,7 @@ from panolog.orchestrator.cli.session.preparing import settings_of
 from panolog.orchestrator.runs.preparation.settings import Options
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
 from panolog.prepare.stitching.circles import halves
+from panolog.prepare.stitching.lenses import APPROXIMATE
 from panolog.prepare.video.decode import open_video
 from panolog.prepare.video.frames import extract_frames
 from panolog.scene.errors import InputError
@@ -82,7 +83,7 @@ def test_frames_are_those_of_the_panorama(
             assert np.abs(picture.astype(float) - truth).mean() < 12
             grey = video.grey(400)
             assert grey is not None and grey.shape == (200, 400)
-        assert video.decoded == COUNT and not video.notes()
+        assert video.decoded == COUNT and video.notes() == [f"{path}: {APPROXIMATE}"]
 
 
 def test_frames_are_chosen_as_of_any_video(walked: list[tuple[Image, Image]], tmp_path: Path) -> None:
