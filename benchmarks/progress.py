@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         runs: dict[str, list[Moment]] = {}
         for root in options.runs:
             try:
-                runs[root.name] = moments(list(history(root)))
+                runs[str(root)] = moments(list(history(root)))
             except InputError as error:
                 raise InputError(f"{root}: {error}") from error
         if options.svg:
