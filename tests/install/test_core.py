@@ -35,7 +35,8 @@ def core(script: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 COMMANDS = {
     "scene sfm raw -o scene": "this needs pycolmap: pip install 'panolog[prepare]'",
-    "run raw -o run": "this needs pycolmap: pip install 'panolog[prepare]'",
+    "scene stitch raw -o scene": "this needs PyAV: pip install 'panolog[prepare]'",
+    "run raw -o run": "this needs PyAV: pip install 'panolog[prepare]'",
     "dashboard .": "this needs Starlette: pip install 'panolog[dashboard]'",
     "run scene -o run --address auto": "this needs Ray: pip install 'panolog[cluster]'",
     "export model.ply -o out --3dtiles --epsg 25832": "this needs pyproj: pip install 'panolog[export]'",
