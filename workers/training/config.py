@@ -176,7 +176,7 @@ class DensifyConfig(Group):
         ge=0,
         le=1,
         description="exponent p: in a Stage I of more than 1,500 iterations `growth` is multiplied by"
-        " (iterations / 1,500)^p: what trains longer can teach more of them; 0 = as it is",
+        " (iterations / 1,500)^p, of 30,000 at most: what trains longer can teach more of them; 0 = never",
     )
     filled: float = Field(
         default=0.5, gt=0, le=1, description="part of the densifications after which the budget is reached"

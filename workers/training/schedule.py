@@ -125,9 +125,9 @@ class Schedule:
         Args: start, how many there were before the first iteration; pixels of one panorama.
         """
         densify = self.densify
-        longer = 1.0 if self.refine else max(1.0, self.iterations / SHORT_RUN) ** densify.long_runs
+        length = 1.0 if self.refine else min(max(self.iterations, SHORT_RUN), FULL_RUN) / SHORT_RUN
         factor = GROWTH_OFFSET + GROWTH_SLOPE * math.log(max(1.0, pixels / max(start, 1)))
-        factor *= densify.growth * longer
+        factor *= densify.growth * length**densify.long_runs
         first, last = self.point(densify.start), min(self.point(densify.until), self.iterations)
         ends = first + densify.filled * (last - first)
         share = min(max((iteration - first) / max(ends - first, 1.0), 0.0), 1.0)

@@ -195,7 +195,7 @@ def test_the_budget_rises_evenly_and_ends_where_preflight_says() -> None:
 
 @pytest.mark.parametrize(
     ("iterations", "refine", "factor"),
-    [(500, False, 1), (1_500, False, 1), (6_000, False, 2), (30_000, False, 20**0.5), (30_000, True, 1)],
+    [(500, False, 1), (1_500, False, 1), (6_000, False, 2), (90_000, False, 20**0.5), (30_000, True, 1)],
 )
 def test_the_budget_follows_the_length_of_a_long_stage_one(
     iterations: int, refine: bool, factor: float
