@@ -56,6 +56,11 @@ def find_image_files(folder: Path) -> list[Path]:
     return look_into(folder).images
 
 
+def pictures_below(source: Path) -> Path:
+    """Where the pictures of a folder are: in its folder images or imgs, or in itself."""
+    return next((source / name for name in ("images", "imgs") if (source / name).is_dir()), source)
+
+
 def look_into(folder: Path) -> FolderContent:
     """The image files below a folder, also behind links to folders, and what is left out.
 

@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from panolog.prepare.panorama_files import SUFFIXES
+from panolog.prepare.panorama_files import SUFFIXES, pictures_below
 from panolog.prepare.stitching.lenses import Pair, Up, pairs_as_json, read_pairs
 from panolog.prepare.stitching.pictures import (
     INSP,
@@ -112,7 +112,7 @@ def look_at_raw(source: Path) -> tuple[int, int] | None:
 
     Raises as `stitch_pictures` does.
     """
-    inner = next((source / name for name in ("images", "imgs") if (source / name).is_dir()), source)
+    inner = pictures_below(source)
     files = raw_pictures(inner) if inner.is_dir() else []
     return (len(files), common_width(find_pairs(files).values())) if files else None
 

@@ -163,7 +163,7 @@ def by_colmap(
 
 
 def cpu_seconds() -> float:
-    """Of all cores, on this process and on the ended ones that it started."""
+    """CPU seconds, on all cores, of this process and of those that it has started and that have ended."""
     own, ended = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return own.ru_utime + own.ru_stime + ended.ru_utime + ended.ru_stime
 

@@ -100,19 +100,11 @@ def import_(
 @app.command(cls=Command)
 def stitch(
     source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="IMAGES|VIDEO", help="Folder of pictures of two fisheye circles, or a video of them."
-        ),
+        Path, argument("IMAGES|VIDEO", "Folder of pictures of two fisheye circles, or a video of them.")
     ],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder of the panoramas.")
-    ],
+    output: Annotated[Path, option("FOLDER", "Folder of the panoramas.", "--output", "-o")],
     width: Annotated[
-        int | None,
-        typer.Option(
-            metavar="PIXELS", min=64, max=16384, help="Of the panoramas. Default: as of the lenses."
-        ),
+        int | None, option("PIXELS", "Of the panoramas. Default: as of the lenses.", min=64, max=16384)
     ] = None,
     up: UpOption = None,
     parallax: ParallaxOption = None,

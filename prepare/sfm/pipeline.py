@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.panorama_files import SUFFIXES, PanoramaFile, look_into, masks_among
+from panolog.prepare.panorama_files import SUFFIXES, PanoramaFile, look_into, masks_among, pictures_below
 from panolog.prepare.sfm.features import MEMORY
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
@@ -73,7 +73,7 @@ def make_scene(
     require_new(output)
     known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
     folder, notes = workspace_folder(output.resolve()), list[str]()
-    if _image_folder(source).resolve() in output.resolve().parents:
+    if pictures_below(source).resolve() in output.resolve().parents:
         raise SceneError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
     source = _stitched(source, folder, settings, notes.append, progress)
     panoramas, layers, copies = _panoramas_of(source, folder, settings, notes.append, progress)
@@ -90,7 +90,7 @@ def make_scene(
         memory=memory,
         places=places,
     )
-    left_out = (*copies, *look_into(_image_folder(source)).left_out)  # a file has nothing below it
+    left_out = (*copies, *look_into(pictures_below(source)).left_out)  # a file has nothing below it
     reports = [
         _report(part, number, settings, places, notes, left_out)
         for number, part in enumerate(found if settings.parts else found[:1], start=1)
@@ -111,12 +111,12 @@ def _stitched(
     progress: StageProgress,
 ) -> Path:
     """The folder with the panoramas of pictures that are not stitched; any other source as it is."""
-    pictures = raw_pictures(_image_folder(source)) if source.is_dir() else []
+    pictures = raw_pictures(pictures_below(source)) if source.is_dir() else []
     if not pictures:
         return source
     stitch_pictures(
         pictures,
-        _image_folder(source),
+        pictures_below(source),
         folder / "stitched",
         up=settings.up,
         progress=lambda done, total: progress("stitching", done, total),
@@ -186,7 +186,7 @@ def panoramas_in_folder(source: Path) -> tuple[tuple[PanoramaFile, ...], LayerFi
     """
     if not source.is_dir():
         raise SceneError(f"{source}: there is no such folder or video")
-    inner = _image_folder(source)
+    inner = pictures_below(source)
     content = look_into(inner)
     images = [path for path in content.images if path.relative_to(inner).parts[0] not in _LAYERS]
     among = masks_among(images)
@@ -226,11 +226,6 @@ def without_copies(
         )
     chosen = {layer: [files[row] for row in kept] for layer, files in layers.items()}
     return tuple(panoramas[row] for row in kept), chosen, lines
-
-
-def _image_folder(source: Path) -> Path:
-    """Where the panoramas of a folder are."""
-    return next((source / name for name in ("images", "imgs") if (source / name).is_dir()), source)
 
 
 def _georeference(found: Reconstruction, settings: SfmSettings, first: bool) -> Georeference:

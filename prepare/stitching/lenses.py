@@ -75,7 +75,7 @@ class Lens:
         return np.asarray(self.focal * angle * (1 + square * (self.bend + self.edge * square * square)))
 
     def scaled(self, factor: float) -> "Lens":
-        """Its picture resized by a factor."""
+        """The lens for its picture resized by a factor."""
         return replace(self, x=self.x * factor, y=self.y * factor, focal=self.focal * factor)
 
 
@@ -96,8 +96,12 @@ class Pair:
         quarter = max(float(lens.radius(np.array(np.pi / 2))) for lens in self.lenses)
         return min(round(quarter) * 4, WIDEST)
 
+    def resized(self, size: tuple[int, int]) -> "Pair":
+        """The pair for pictures resized to this width and height, by the factor of the widths."""
+        return replace(self.scaled(size[0] / self.size[0]), size=size)
+
     def scaled(self, factor: float) -> "Pair":
-        """Pictures resized by a factor."""
+        """The pair for pictures resized by a factor."""
         one, other = (lens.scaled(factor) for lens in self.lenses)
         size = (max(1, round(self.size[0] * factor)), max(1, round(self.size[1] * factor)))
         return replace(self, lenses=(one, other), size=size)

@@ -16,6 +16,7 @@ from panolog.prepare.stitching.circles import CircleError, Picture, halves
 from panolog.prepare.stitching.lenses import APPROXIMATE, Pair, Up, pairs_as_json, read_pairs
 from panolog.prepare.stitching.stitch import Stitcher
 from panolog.prepare.world.exif import camera_of, essential_exif
+from panolog.prepare.world.image_blocks import with_segments
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, natural_key, write_bytes
 from panolog.scene.image_files import decode, decode_colors, read_info
@@ -102,7 +103,7 @@ def lenses_in(source: Path, size: tuple[int, int], pictures: Sequence[Lenses]) -
         raise SceneError(
             f"{source}: its two fisheye circles cannot be stitched: {error}; or {STITCH_THERE}"
         ) from error
-    return replace(pair.scaled(size[0] / pair.size[0]), size=size)
+    return pair.resized(size)
 
 
 def stitch_pictures(
@@ -161,7 +162,8 @@ def check_folder(output: Path) -> None:
 def _stitch(file: Path, target: Path, stitcher: Stitcher, changed: int, note: Callable[[str], None]) -> None:
     """Writes a panorama, with the time of its picture."""
     picture = decode_colors(file)
-    off = disagreement(*_both_reduced(stitcher.pair, picture))
+    both = reduced(picture)
+    off = disagreement(stitcher.pair.resized((both[0].shape[1], both[0].shape[0])), both)
     if off is not None and off > np.rad2deg(AGREED):
         note(
             f"{file.name}: the two lenses differ by {off:.1f} degrees where both see; what is there is near, "
@@ -170,19 +172,11 @@ def _stitch(file: Path, target: Path, stitcher: Stitcher, changed: int, note: Ca
     whole = stitcher.panorama(halves(picture))
     jpeg = bytes(cv2.imencode(".jpg", whole, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
     if (block := essential_exif(file)) is not None:
-        behind = 4 + int.from_bytes(jpeg[4:6], "big")  # the JFIF segment, which has to be the first
-        content = _EXIF + block
-        jpeg = jpeg[:behind] + b"\xff\xe1" + (len(content) + 2).to_bytes(2, "big") + content + jpeg[behind:]
+        jpeg = with_segments(jpeg, _EXIF + block)
     target.parent.mkdir(parents=True, exist_ok=True)
     with atomic(target) as temporary:
         temporary.write_bytes(jpeg)
         os.utime(temporary, ns=(changed, changed))
-
-
-def _both_reduced(pair: Pair, picture: Picture) -> tuple[Pair, Lenses]:
-    both = reduced(picture)
-    height, width = both[0].shape[:2]
-    return replace(pair.scaled(width / pair.size[0]), size=(width, height)), both
 
 
 def reduced(picture: Picture) -> Lenses:

@@ -29,6 +29,7 @@ from panolog.prepare.video.spherical import read_spherical, spherical_of
 from panolog.prepare.video.streams import (
     WIDEST,
     Effort,
+    decoded,
     largest_streams,
     often,
     open_container,
@@ -190,26 +191,20 @@ class Video:
         return lines
 
     def _decode(self) -> Iterator[av.VideoFrame]:
-        """The frames that can be decoded."""
-        try:
-            for packet in self._container.demux(self._stream):
-                try:
-                    yield from self._joined(packet.decode())
-                except av.FFmpegError:
-                    self._damaged += 1
-                    self.is_plain = False
-        except av.FFmpegError:  # the rest of the file cannot be read
-            return
-
-    def _joined(self, frames: Sequence[av.VideoFrame]) -> Iterator[av.VideoFrame]:
-        """The frames, with those of the second lens next to them. Raises av.FFmpegError."""
-        for frame in frames:
-            both = frame if self._second is None else self._second.joined(frame)
-            if both is not None:
-                yield both
+        """The frames that can be decoded, with those of the second lens next to them if it has its own."""
+        for frame in decoded(self._container, self._stream, self._count_damage):
+            try:
+                both = frame if self._second is None else self._second.joined(frame)
+            except av.FFmpegError:
+                both = None
+            if both is None:
+                self._count_damage()
             else:
-                self._damaged += 1
-                self.is_plain = False
+                yield both
+
+    def _count_damage(self) -> None:
+        self._damaged += 1
+        self.is_plain = False
 
     def _converted(self, convert: Callable[[av.VideoFrame], NDArray[np.uint8]]) -> NDArray[np.uint8] | None:
         """The panorama of the last frame."""

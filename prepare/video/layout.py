@@ -62,7 +62,7 @@ class Layout:
         return self.place.shape == (self.width // 2, self.width)
 
     def scaled(self, width: int) -> "Layout":
-        """That of panoramas that are at most `width` pixels wide."""
+        """The layout of panoramas that are at most `width` pixels wide."""
         if width >= self.width:
             return self
         place = Span(*(round(edge * width / self.width) for edge in self.place))

@@ -26,7 +26,14 @@ from panolog.prepare.stitching.lenses import Pair, Up
 from panolog.prepare.stitching.pictures import circles_in, lenses_in, reduced
 from panolog.prepare.stitching.stitch import Stitcher
 from panolog.prepare.video.colour import ColourError, Converter, Picture, check_colours
-from panolog.prepare.video.streams import WIDEST, Effort, largest_streams, open_container, prepare_stream
+from panolog.prepare.video.streams import (
+    WIDEST,
+    Effort,
+    decoded,
+    largest_streams,
+    open_container,
+    prepare_stream,
+)
 
 _SAMPLED = 8  # frames in which the lenses are looked for
 _SAME = 0.004  # seconds between two frames that were taken together, at most
@@ -46,7 +53,7 @@ class VideoLenses:
     second: Second | None  # None: in the same frames
 
     def layout(self) -> "StitchedLayout":
-        """That of all its frames."""
+        """The layout that stitches its frames."""
         return _layout(self.pair)
 
 
@@ -63,7 +70,7 @@ class StitchedLayout:
         return self.stitcher.width
 
     def scaled(self, width: int) -> "StitchedLayout":
-        """That of panoramas that are at most `width` pixels wide."""
+        """The layout of panoramas that are at most `width` pixels wide."""
         return self if width >= self.width else _scaled(self, width)
 
     def panorama(self, picture: NDArray[Pixel]) -> NDArray[Pixel]:
@@ -101,13 +108,16 @@ class SecondLens:
     def __init__(self, container: av.container.InputContainer, stream: av.VideoStream) -> None:
         """Args: container, the open file; stream, the one of its streams to read."""
         self._container, self._stream = container, stream
-        self._frames = decoded(container, stream)
-        self._frame = next(self._frames, None)
         self._graph: tuple[object, Joiner] | None = None
+        self._restart()
 
     def seek(self, seconds: float) -> None:
         """The next frames are from there on, or from some before."""
         self._container.seek(round(seconds / (self._stream.time_base or 1)), stream=self._stream)
+        self._restart()
+
+    def _restart(self) -> None:
+        """Decodes from where the file is."""
         self._frames = decoded(self._container, self._stream)
         self._frame = next(self._frames, None)
 
@@ -164,18 +174,6 @@ class Joiner:
             both.time_base = base
         both.color_range, both.colorspace = frame.color_range, frame.colorspace
         return both
-
-
-def decoded(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.VideoFrame]:
-    """The frames of a stream that can be decoded, from where its file is."""
-    try:
-        for packet in container.demux(stream):
-            try:
-                yield from packet.decode()
-            except av.FFmpegError:
-                continue
-    except av.FFmpegError:  # the rest of the file cannot be read
-        return
 
 
 @contextmanager

@@ -7,10 +7,10 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from panolog.prepare.world.exif import Attitude, GpsFix
+from panolog.prepare.world.image_blocks import with_segments
 
 _SECOND = 1_000_000  # parts of a second; of a second of arc, one is 30 micrometres on the ground
 _LARGEST = 65_534  # ISO that fits; one more means that it does not
-_APP1 = b"\xff\xe1"
 _XMP = b"http://ns.adobe.com/xap/1.0/\0"
 
 
@@ -29,13 +29,12 @@ def stamped(
         taken: when it was taken, in UTC.
         exposure: seconds and ISO.
     """
-    segments = b""
+    contents = []
     if fix is not None or taken is not None or exposure is not None:
-        segments += _segment(_exif(fix, taken, exposure))
+        contents.append(_exif(fix, taken, exposure))
     if attitude is not None:
-        segments += _segment(_XMP + _packet(attitude))
-    behind = 4 + int.from_bytes(jpeg[4:6], "big")  # the JFIF segment, which has to be the first
-    return jpeg[:behind] + segments + jpeg[behind:]
+        contents.append(_XMP + _packet(attitude))
+    return with_segments(jpeg, *contents)
 
 
 def _exif(fix: GpsFix | None, taken: datetime | None, exposure: tuple[float, float] | None) -> bytes:
@@ -78,7 +77,3 @@ def _packet(attitude: Attitude) -> bytes:
         '<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
         f'GPano:ProjectionType="equirectangular" {written}/></rdf:RDF></x:xmpmeta>'
     ).encode()
-
-
-def _segment(content: bytes) -> bytes:
-    return _APP1 + (len(content) + 2).to_bytes(2, "big") + content

@@ -1,6 +1,7 @@
 """How FFmpeg opens video files and decodes their streams; what files say is not trusted."""
 
 import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -54,3 +55,20 @@ def prepare_stream(stream: av.VideoStream, effort: Effort) -> av.VideoStream:
 def often(stream: av.VideoStream, width: int) -> int:
     """Every how manieth frame is enough of a large video, for `_ENOUGH` a second; 1 of others."""
     return 1 if width < _LARGE else max(1, int(float(stream.average_rate or 0) / _ENOUGH))
+
+
+def decoded(
+    container: av.container.InputContainer, stream: av.VideoStream, damaged: Callable[[], None] = lambda: None
+) -> Iterator[av.VideoFrame]:
+    """The frames of a stream that can be decoded, from where its file is.
+
+    Args: damaged, called for each packet that cannot be decoded.
+    """
+    try:
+        for packet in container.demux(stream):
+            try:
+                yield from packet.decode()
+            except av.FFmpegError:
+                damaged()
+    except av.FFmpegError:  # the rest of the file cannot be read
+        return

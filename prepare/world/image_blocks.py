@@ -1,4 +1,4 @@
-"""The EXIF and XMP of image files as bytes, bounded in size for any content of the file."""
+"""The EXIF and XMP of image files as bytes, read with a bound for any content of a file, and written."""
 
 import io
 import struct
@@ -104,3 +104,14 @@ def _text(data: bytes) -> bytes:
         return zlib.decompressobj().decompress(text, _BLOCK) if data[0] else text
     except (ValueError, zlib.error):
         return b""
+
+
+def with_segments(jpeg: bytes, *contents: bytes) -> bytes:
+    """A JPEG with these contents, which begin as EXIF or XMP does, each as an APP1 segment.
+
+    Args: jpeg, as OpenCV writes it, with a JFIF segment at its beginning, which has to stay the first.
+    """
+    behind = 4 + int.from_bytes(jpeg[4:6], "big")
+    marker = bytes((0xFF, _APP1))
+    segments = b"".join(marker + (len(it) + 2).to_bytes(2, "big") + it for it in contents)
+    return jpeg[:behind] + segments + jpeg[behind:]

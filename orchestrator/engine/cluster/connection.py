@@ -97,7 +97,10 @@ def _own(nice: int | None) -> Iterator[None]:
 
 
 def _start(folder: str, nice: int | None) -> None:
-    """Starts Ray, once more if its 30 s were too short on a busy machine. Raises ClusterError."""
+    """Starts Ray; again if its 30 s were too short on a busy machine, at most `_STARTS` times.
+
+    Raises ClusterError if it does not start.
+    """
     for left in reversed(range(_STARTS)):
         try:
             _init(folder, nice)

@@ -30,7 +30,7 @@ class Memory:
 
 
 class Torch:
-    """As much of torch as `CudaMover` and `Staging` use; everything else is torch's own."""
+    """A torch with the parts of CUDA that `CudaMover` and `Staging` use; everything else is torch's own."""
 
     def __init__(self) -> None:
         self.log: list[str] = []

@@ -29,7 +29,7 @@ def without_pairs(kernel: str, grid: tuple[int, int], block: int, /, **arguments
 
 
 def _run(launch: Launch, op: str, *arguments: Any) -> Any:
-    """As `renderer.cuda.card.run`."""
+    """Runs an op as `renderer.cuda.card.run` does, with this `launch` in place of a card's."""
     return getattr(launches, op)(launch, **ops.named(op, arguments))
 
 
