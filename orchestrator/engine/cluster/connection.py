@@ -86,12 +86,13 @@ def _own(nice: int | None) -> Iterator[None]:
     folder = mkdtemp(prefix="panolog-ray-", dir=_TMP)
     command = [sys.executable, "-m", ray_cleaner.__name__, folder]
     cleaner = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+    others = set(psutil.Process().children(recursive=True))  # such as the follower of a run, which lives on
     try:
         _start(folder, nice)
         yield
     finally:
         try:
-            _shut_down(cleaner.pid)
+            _shut_down(others)
         finally:
             cleaner.communicate(b"ended")
 
@@ -139,8 +140,8 @@ def _niceness() -> int:
         raise ConfigError(f"RAY_worker_niceness={given}: give a number from 0 to 19, or unset it") from error
 
 
-def _shut_down(cleaner: int) -> None:
-    """Ends Ray and waits until its processes have stopped to write."""
-    processes = [p for p in psutil.Process().children(recursive=True) if p.pid != cleaner]
+def _shut_down(others: set[psutil.Process]) -> None:
+    """Ends Ray and waits until its processes, all but `others`, have stopped to write."""
+    processes = [p for p in psutil.Process().children(recursive=True) if p not in others]
     ray.shutdown()
     psutil.wait_procs(processes, timeout=_TIMEOUT_S)

@@ -96,9 +96,19 @@ def test_a_machine_too_busy_to_start_ray_is_tried_again(
         start(**options)
 
     monkeypatch.setattr(ray, "init", init)
+    wait, awaited = psutil.wait_procs, set[int]()
+    monkeypatch.setattr(
+        psutil, "wait_procs", lambda all_, timeout: awaited.update(p.pid for p in all_) or wait(all_, timeout)
+    )
     late = pytest.raises(ClusterError, match=r"^Ray does not start .* \(The current .* could\); end other")
-    with late if slow == 3 else nullcontext(), connect(None, tmp_path):
-        assert ray.is_initialized()
+    with subprocess.Popen(["sleep", "600"]) as other:
+        try:
+            with late if slow == 3 else nullcontext(), connect(None, tmp_path):
+                assert ray.is_initialized()
+        finally:
+            other.kill()
+    assert bool(awaited) == (slow == 1)
+    assert other.pid not in awaited
 
 
 def test_a_failure_of_ray_is_a_lost_cluster() -> None:
