@@ -84,6 +84,7 @@ def test_a_page_looks_right_and_can_be_read(page: Page, here: Site, shot: Shot, 
     assert {view: found for view, found in wrong.items() if found} == {}
 
 
+@pytest.mark.nightly
 def test_what_a_reader_would_see_is_found_and_no_more(browser: Browser, here: Site) -> None:
     (shot,) = (shot for shot in SHOTS if shot.name == "run-finished")
     with fixed_page(browser, here.root) as page:

@@ -28,7 +28,7 @@ from tests.orchestrator.cli.program import shown
 from tests.orchestrator.engine.cluster.hosts import Hosts, NoHostsError
 from tests.ray_head import BIN, cluster_environment, wait_until
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.nightly]  # Ray gives a lost machine a minute
 
 HEAD, ADDRESS = "10.77.0.1", "10.77.0.1:6379"
 WORKERS = {"one": "10.77.0.2", "two": "10.77.0.3"}

@@ -18,9 +18,10 @@ from tests.orchestrator.runs.storage.stored_runs import Driver, fetched, mirror_
 from tests.orchestrator.watch.follower.receivers import receiver
 
 pytestmark = pytest.mark.system
+AZURE = pytest.param("az", marks=pytest.mark.nightly)  # its server is installed from npm
 
 
-@pytest.fixture(scope="module", params=PROTOCOLS)
+@pytest.fixture(scope="module", params=[AZURE if name == "az" else name for name in PROTOCOLS])
 def server(request: pytest.FixtureRequest) -> Iterator[CloudStore]:
     with cloud_store(request.param) as found:
         yield found
@@ -105,7 +106,7 @@ def test_a_run_is_mirrored_and_comes_back_without_the_providers_secret(
     assert SECRET.encode() not in b"".join(store.read(name) or b"" for name in store.list())
 
 
-@pytest.mark.parametrize("server", ["az"], indirect=True)
+@pytest.mark.parametrize("server", [AZURE], indirect=True)
 def test_the_account_of_an_azure_url_is_the_one_that_is_used(server: CloudStore) -> None:
     named = open_store("abfs://places@account.dfs.core.windows.net/named", 5.0)
     named.write("a", b"x")
@@ -114,7 +115,7 @@ def test_the_account_of_an_azure_url_is_the_one_that_is_used(server: CloudStore)
         open_store("abfs://places@other.dfs.core.windows.net/named")
 
 
-@pytest.mark.parametrize("server", ["az"], indirect=True)
+@pytest.mark.parametrize("server", [AZURE], indirect=True)
 def test_an_azure_copy_that_is_answered_before_it_is_made_is_awaited(
     server: CloudStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -135,7 +136,7 @@ def test_an_azure_copy_that_is_answered_before_it_is_made_is_awaited(
     assert looks == [3]
 
 
-@pytest.mark.parametrize("server", ["az"], indirect=True)
+@pytest.mark.parametrize("server", [AZURE], indirect=True)
 @pytest.mark.parametrize("key", ["b3RoZXI=", ""])
 def test_credentials_that_azure_refuses_are_the_users_at_once(
     server: CloudStore, key: str, monkeypatch: pytest.MonkeyPatch
