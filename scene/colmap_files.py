@@ -341,7 +341,9 @@ def _numbers(where: str, words: Sequence[str]) -> list[float]:
     try:
         numbers = list(map(float, words))
     except ValueError as error:
-        raise SceneError(f"{where}: a number was expected; export the model again") from error
+        text = "".join(words)
+        how = ", with points in numbers" if "," in text else ", as UTF-8" if "\0" in text else ""
+        raise SceneError(f"{where}: a number was expected; export the model again{how}") from error
     if not all(map(math.isfinite, numbers)):
         raise SceneError(f"{where}: a number is not finite; export the model again")
     return numbers

@@ -260,7 +260,10 @@ def read_infos(paths: Sequence[Path]) -> list[ImageInfo]:
     """
     if missing := [path for path in paths if not path.is_file()]:
         more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
-        raise SceneError(f"{missing[0]}: the model names this image, but it is missing{more}")
+        raise SceneError(
+            f"{missing[0]}: the model names this image, but it is missing{more}; `panolog scene import` also "
+            "finds images in other folders, of other formats, and with names in another case"
+        )
     infos = [read_info(path) for path in paths]
     width, height = infos[0].width, infos[0].height
     for path, info in zip(paths, infos, strict=True):

@@ -242,8 +242,10 @@ def find_layer(root: Path, layer: str, names: Sequence[str]) -> list[Path | None
         paths = (file_of(folder, way) for way in ways)
         found.append(next((path for path in paths if path.is_file()), None))
     if not any(found):
-        expected = f"{stem_of(names[0])}.png"
-        raise SceneError(f"{folder}: no file here belongs to a panorama ({expected} would); rename them")
+        raise SceneError(
+            f"{folder}: no file here belongs to a panorama; {stem_of(names[0])}.png would: rename them, or save "
+            "other formats as PNG"
+        )
     return found
 
 

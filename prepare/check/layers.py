@@ -1,6 +1,9 @@
 """What the masks of a scene leave out, and files of its layers that belong to no panorama."""
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 
 from panolog.prepare.networks.masks import share_of_sphere
 from panolog.prepare.panorama_files import find_image_files
@@ -11,34 +14,45 @@ from panolog.scene.read import DEPTHS, MASKS, SKY_MASKS
 
 _LOOKED_AT = 12  # masks, evenly chosen
 _MOST = 0.5  # of the sphere that masks leave out, from which on they may be inverted
+_BLACK = "black or transparent is what is ignored"
 
 
-def describe_layers(scene: Scene) -> list[str]:
-    """One line each: how much of the sphere the masks leave out, and files in layers that match nothing.
+@dataclass(frozen=True)
+class Layers:
+    """What was found in the layers of a scene, one line each."""
+
+    lines: tuple[str, ...]  # how much of the sphere the masks leave out, and files that match nothing
+    problems: tuple[str, ...]  # what nothing can be trained with
+
+
+def look_at_layers(scene: Scene) -> Layers:
+    """What the masks of a scene leave out, and files in its layers that match nothing.
 
     Raises SceneError if a mask is damaged.
     """
-    return [*_masks(scene), *_unmatched(scene)]
+    shares, masks = _masks(scene)
+    blank = len(masks) > 0 and shares.min() == 1
+    wrong = (f"masks: nothing is left of {len(shares)} panoramas that were looked at; {_BLACK}",)
+    return Layers((*masks, *_unmatched(scene)), wrong if blank else ())
 
 
-def _masks(scene: Scene) -> list[str]:
+def _masks(scene: Scene) -> tuple[NDArray[np.float64], list[str]]:
+    """Shares of the sphere that masks leave out, evenly chosen, and a line of it; both empty without masks."""
     masks = [panorama.mask for panorama in scene.panoramas if panorama.mask is not None]
     if not masks:
-        return []
+        return np.zeros(0), []
     chosen = np.unique(np.linspace(0, len(masks) - 1, min(_LOOKED_AT, len(masks))).astype(int))
-    shares = [share_of_sphere(~read_mask(masks[row])) for row in chosen]
-    mean = float(np.mean(shares))
+    shares = np.array([share_of_sphere(~read_mask(masks[row])) for row in chosen])
+    mean = float(shares.mean())
     line = (
         f"masks: {len(masks)} of {len(scene.panoramas)} panoramas have one, and {mean:.1%} of the sphere is "
-        f"ignored ({min(shares):.1%} to {max(shares):.1%})"
+        f"ignored ({shares.min():.1%} to {shares.max():.1%})"
     )
     if mean == 0:
-        line += "; nothing is: black or transparent is what is ignored"
+        line += f"; nothing is: {_BLACK}"
     elif mean > _MOST:
-        line += (
-            "; that is most of it: black or transparent is what is ignored, invert them if it is to be used"
-        )
-    return [line]
+        line += f"; that is most of it: {_BLACK}, invert them if it is to be used"
+    return shares, [line]
 
 
 def _unmatched(scene: Scene) -> list[str]:

@@ -7,6 +7,7 @@ import numpy as np
 from panolog.prepare.check.conventions import FIT, GAIN, best_convention, residuals
 from panolog.prepare.check.evidence import Array, Evidence, gather_evidence
 from panolog.prepare.check.exposure import describe, measure_exposures
+from panolog.prepare.check.layers import look_at_layers
 from panolog.prepare.check.misplaced import find_misplaced, misplaced_lines
 from panolog.prepare.check.photometry import PixelShift, common_shift, fits_of_poses, patch_agreement
 from panolog.prepare.networks.nadir import black_nadir
@@ -39,6 +40,7 @@ class SceneCheck:
     exposure: str  # the same as text
     misplaced: dict[str, str]  # panoramas that are not where their poses say, and why
     black_nadir_degrees: float | None  # from straight down, within which the panoramas are black and unmasked
+    layers: tuple[str, ...]  # what masks leave out, and files of layers that match nothing
     problems: tuple[str, ...]
 
     @property
@@ -69,7 +71,7 @@ class SceneCheck:
             found.append(
                 f"pictures against points: {u:+.2f}, {v:+.2f} px (± {self.picture_shift_sigma_px:.2f})"
             )
-        found.append(self.exposure)
+        found += [self.exposure, *self.layers]
         axis = int(np.argmax(np.abs(self.up)))
         sign = "+" if self.up[axis] > 0 else "-"
         found.append(f"up is about {sign}{'xyz'[axis]} ({', '.join(f'{x:.2f}' for x in self.up)})")
@@ -98,6 +100,7 @@ def check_scene(scene: Scene) -> SceneCheck:
     reprojection = float(np.median(np.linalg.norm(apart, axis=1))) if len(apart) else None
     problems = _conventions(evidence, reprojection)
     colors, exposures = None, measure_exposures(scene, range(len(scene.panoramas)))
+    layers = look_at_layers(scene)
     names = [panorama.name for panorama in scene.panoramas]
     if not evidence.colorless:
         fits = fits_of_poses(evidence)
@@ -126,7 +129,8 @@ def check_scene(scene: Scene) -> SceneCheck:
         exposure=describe(names, exposures) if exposures else "exposure: too few common points to compare",
         misplaced=misplaced,
         black_nadir_degrees=_black_nadir(evidence),
-        problems=tuple(problems),
+        layers=layers.lines,
+        problems=(*problems, *layers.problems),
     )
 
 

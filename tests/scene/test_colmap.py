@@ -244,6 +244,8 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "half a track": (lambda f: append(f, "points3D.txt", "99 1 2 3 4 5 6 0.5 1 0 2\n"), "track of point 99"),
     "other camera id": (set_camera("7 EQUIRECTANGULAR 64 32 64 32"), "COLMAP cannot read"),
     "text image short": (set_image("1 1 0 0"), "image line"),
+    "text decimal commas": (set_image("1 0,9 0 0 0 0 0 0 1 a.jpg\n"), "again, with points in numbers"),
+    "text UTF-16": (set_image("1\0 1\0 0\0 0 0 0 0 0 1 a.jpg\n"), "again, as UTF-8"),
     "text half a point": (set_image("1 1 0 0 0 0 0 0 1 a.jpg\n3.5 4.5"), "triples"),
 }
 

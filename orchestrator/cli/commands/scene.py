@@ -5,7 +5,7 @@ from typing import Any
 
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.partition.bounds import baseline
-from panolog.prepare.check.layers import describe_layers
+from panolog.prepare.check.layers import look_at_layers
 from panolog.scene.model import Scene
 from panolog.scene.stores.outline import url_of
 
@@ -28,7 +28,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "sky_masks": sum(panorama.sky_mask is not None for panorama in panoramas),
         "depths": sum(panorama.depth is not None for panorama in panoramas),
         "depth_affines": sum(panorama.depth_affine is not None for panorama in panoramas),
-        "layers": describe_layers(scene),
+        "layers": list(look_at_layers(scene).lines),
         "points": len(scene.points),
         "observations": sum(len(panorama.observed) for panorama in panoramas),
         "baseline": baseline(centers),

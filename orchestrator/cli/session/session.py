@@ -55,7 +55,7 @@ from panolog.orchestrator.runs.state import OnChange, RunState, ignore
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import report_or_notice
 from panolog.partition.plan import Plan
-from panolog.prepare.check.layers import describe_layers
+from panolog.prepare.check.layers import look_at_layers
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import ClusterError, MissingPackageError, RunFolderError, RunLockedError, installed
 from panolog.scene.files import remove_partial
@@ -271,7 +271,7 @@ class _Beginning:
         done = PreflightSaved(folder.relative(folder.preflight), seconds, settings)
         if budget := self.journal.state.money.budget:
             require_enough(seconds, budget, workers.nodes())
-        layers = [Noticed(None, line) for line in describe_layers(self.scene)]
+        layers = [Noticed(None, line) for line in look_at_layers(self.scene).lines]
         self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), *layers, done])
         return found.config
 

@@ -171,6 +171,10 @@ def test_what_masks_ignore_and_files_that_match_nothing_are_shown(scene: Path) -
     assert shown[1] == f"masks: 2 files ({lost}): not used, as no panorama of the model is called so"
     assert shown[0] in call("info", scene).stdout
     for name in NAMES[:2]:
+        cv2.imwrite(str(folder / name), np.zeros((32, 64), np.uint8))
+    *_, problem = json.loads(call("check", scene, "--json").stdout)["problems"]
+    assert problem.startswith("masks: nothing is left of 2 panoramas that were looked at")
+    for name in NAMES[:2]:
         cv2.imwrite(str(folder / name), np.full((32, 64), 255, np.uint8))
     assert "nothing is: black or transparent is what is ignored" in call("info", scene).stdout
 
