@@ -243,8 +243,8 @@ def find_layer(root: Path, layer: str, names: Sequence[str]) -> list[Path | None
         found.append(next((path for path in paths if path.is_file()), None))
     if not any(found):
         raise SceneError(
-            f"{folder}: no file here belongs to a panorama; {stem_of(names[0])}.png would: rename them, or save "
-            "other formats as PNG"
+            f"{folder}: no file here belongs to a panorama; {stem_of(names[0])}.png would: rename them, or "
+            "save other formats as PNG"
         )
     return found
 

@@ -37,7 +37,7 @@ def look_at_layers(scene: Scene) -> Layers:
 
 
 def _masks(scene: Scene) -> tuple[NDArray[np.float64], list[str]]:
-    """Shares of the sphere that masks leave out, evenly chosen, and a line of it; both empty without masks."""
+    """The shares of the sphere that some masks leave out, and a line of it; both empty without masks."""
     masks = [panorama.mask for panorama in scene.panoramas if panorama.mask is not None]
     if not masks:
         return np.zeros(0), []
