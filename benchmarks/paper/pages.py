@@ -31,6 +31,7 @@ _METHOD = (
     " length of a run, down to least intervals."
 )
 _CURVES = (
+    "**WS-PSNR 2×** is at twice the width of training, where panoramas have that: as seen from nearer.\n\n"
     "**Curves.** All points of a line are states of one run on its way: its own checkpoints, evaluated after"
     " its end as the merged model that they would give. Diamonds are ends of Stage I. After a reset of"
     " opacities a state is worse than the model that it becomes. The first point is the first checkpoint."

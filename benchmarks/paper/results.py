@@ -9,7 +9,7 @@ from typing import Any
 
 from panolog.orchestrator.runs.folder import write_json
 
-METRICS = ("psnr", "ssim", "lpips", "lpips_3dgs", "ws_psnr", "ws_ssim")
+METRICS = ("psnr", "ssim", "lpips", "lpips_3dgs", "ws_psnr", "ws_ssim", "twice_ws_psnr")
 _UNTRAINED = ("measure", "eval", "")  # stages that no training needs
 
 

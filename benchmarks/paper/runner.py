@@ -238,7 +238,7 @@ class Bench:
             densified=densified,
             resets=resets,
             blocks=sum(block.train for block in replay(records).plan or ()),
-            metrics={name: evaluation["mean"].get(name) for name in results.METRICS},
+            metrics={name: evaluation["mean"].get(name) for name in results.METRICS} | _closer(root, device),
             gaussians=evaluation["gaussians"],
             bytes=evaluation["bytes"],
             haze=haze(read_ply(RunFolder(root).point_cloud)),
@@ -255,6 +255,15 @@ class Bench:
         points += snapshots.curve(root, kept, gallery, sum(borrowed.values()))
         last = Point(result.total, result.metrics["ws_psnr"] or 0.0, "merged")
         return replace(result, curve=(*points, last))
+
+
+def _closer(root: Path, device: str) -> dict[str, float | None]:
+    """The quality of the model at twice the width of training, where the panoramas have that."""
+    gallery = Gallery.of(root, device)
+    if gallery.scene.width < 2 * gallery.width:
+        return {}
+    twice = replace(gallery, width=2 * gallery.width)
+    return {"twice_ws_psnr": twice.quality(read_ply(RunFolder(root).point_cloud))["ws_psnr"]}
 
 
 @dataclass

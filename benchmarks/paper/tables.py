@@ -76,7 +76,7 @@ def _of_group(results: Results, group: Group, scene: Path, *, first: bool) -> Ta
     found = [reference.PUBLISHED[f"table/{group.source}"]] if group.source else []
     if group.name == "main" and (known := reference.published(scene)):
         found.append(known)
-    none = (None,) * 3
+    none = (None,) * 4
     for published in found:
         rows += [
             (f"{row.method} [1]", None, row.psnr, row.ssim, None, row.lpips, *none, row.size, *(None,) * 7)
@@ -97,7 +97,7 @@ def _without_empty(table: Table) -> Table:
     return Table(table.title, tuple(table.head[i] for i in kept), tuple(rows), table.notes)
 
 
-_METRICS = ("PSNR", "SSIM", "LPIPS", "LPIPS of 3DGS", "WS-PSNR", "WS-SSIM")  # as METRICS
+_METRICS = ("PSNR", "SSIM", "LPIPS", "LPIPS of 3DGS", "WS-PSNR", "WS-SSIM", "WS-PSNR 2×")  # as METRICS
 HEAD = (
     *("variant", "gain dB", *_METRICS, "Gaussians", "MB"),
     *("minutes", "on workers", "peak GB", "iterations", "densified", "resets", "notes"),
@@ -109,7 +109,7 @@ def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ..
     found = results.of(scene, name)
     if not found:
         why = results.failure(scene, name)
-        return (name, *(None,) * 15, f"failed: {why}") if why else None
+        return (name, *(None,) * 16, f"failed: {why}") if why else None
     first = found[0]
     steps = f"{first.iterations:,}" + (f" + {first.blocks} × {first.iterations:,}" if first.blocks else "")
     other = results.first(scene, base)

@@ -25,6 +25,7 @@ _SWITCHES = {  # settings of the panolog recipe that mean something only togethe
     ),
     "block growth": ("stage2.growth", "stage2.opacity_decay"),
     "angle": ("densify.measure", "densify.views", "densify.long_axis"),
+    "distance": ("optimizer.unit", "optimizer.least_pixels"),
     "depth": ("depth.unit", "depth.sky", "depth.wT"),
 }
 _FREE = ("recipe", "refine", "blocks", "partition.", "stage2.", "checkpoint.", "preview.")  # not in Stage I

@@ -245,6 +245,13 @@ class OptimizerConfig(Group):
         description="the extent of the task's cameras, as in 3DGS, or a Gaussian's distance from the nearest"
         " of them: then a step is as many pixels in a street as in a city, near as well as far",
     )
+    least_pixels: float = Field(
+        default=0.0,
+        ge=0,
+        le=2,
+        description="least scale of a scene Gaussian along each axis, in pixels of training at its"
+        " distance (`unit`): what is thinner is a needle for who comes closer; 0 = none, 3DGS",
+    )
     sh0: float = Field(default=2.5e-3, ge=0, description="rate of SH of degree 0; 3DGS, app. A")
     shN: float = Field(  # noqa: N815
         default=1.25e-4, ge=0, description="rate of SH of degrees 1 to 3, a twentieth of sh0; 3DGS"
@@ -367,5 +374,9 @@ class TrainConfig(CaptureConfig):
         if self.projection == "exact" and self.densify.split_gradient > 0:
             raise ValueError(
                 "densify.split_gradient is of affine splats: set it to 0, or projection to affine"
+            )
+        if self.optimizer.least_pixels > 0 and self.optimizer.unit != "distance":
+            raise ValueError(
+                "optimizer.least_pixels needs distances: set it to 0, or optimizer.unit to distance"
             )
         return self

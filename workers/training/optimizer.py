@@ -104,6 +104,17 @@ class ModelState:
             if (gradient := gradients.get(name)) is not None
         ]
 
+    def widen(self, angle: float) -> None:
+        """No axis of a scene Gaussian is less than `angle` radians for the nearest camera, as at its begin.
+
+        What is thinner than a pixel of all training panoramas is not determined by them. Seen from nearer, or
+        in a picture with more pixels, it is a needle (cf. the 3D smoothing of Mip-Splatting, Yu et al. 2024).
+        """
+        if angle > 0:
+            scales = self.gaussians.scales[self.gaussians.scene]
+            least = (self.units["means"][self.gaussians.scene] * angle).log_()
+            torch.maximum(scales, least[:, None], out=scales)
+
     def rearrange(self, source: Tensor, new: Tensor, sky: int) -> None:
         """Row i becomes a copy of row source[i], with zero moments if it is `new`.
 

@@ -46,6 +46,7 @@ class Plan:
     state: ModelState
     rates: dict[str, float]
     rows: dict[str, int]  # how many of each parameter move; parameters that are not in it do not
+    least: float  # radians, as in `ModelState.widen`
     statistics: Statistics | None  # where its screen gradients count
     learning: Learning | None  # of how the view was captured, in Stage I
 
@@ -98,6 +99,7 @@ class Direct:
         try:
             value = finite_loss(found.loss)
             plan.state.step(gradients, plan.rates, plan.rows, plan.iteration)
+            plan.state.widen(plan.least)
         except FloatingPointError as error:
             raise self._broken(str(error), plan) from error
         if plan.statistics is not None and screen is not None and screen.grad is not None:
@@ -182,6 +184,7 @@ class Pipeline:
         moved = {n: g for n, g in found.gradients.items() if n in plan.rows}
         updates = plan.state.updates(moved, plan.rates, plan.rows)
         parts.adam_step(self._launch, updates, *BETAS, EPSILON, plan.iteration, self._status)
+        plan.state.widen(plan.least)
         if plan.statistics is not None:
             into = plan.statistics
             iteration.add_statistics(

@@ -53,6 +53,7 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "optimizer.position": 1e-4,  # parts of that distance: by `short_runs` 2e-3 in a run of 1,500
         "optimizer.position_final": 1e-6,
         "optimizer.short_runs": 0.5,  # a short run at the rates of a long one ends before shapes arrive
+        "optimizer.least_pixels": 0.3,  # what is thinner is a needle, for who comes closer
         "optimizer.average": 0.125,  # what single views pull out of place at the end evens out
         "stage2.exterior": "baked",  # an iteration costs what a block keeps, not what it throws away
         "stage2.position": 0.3,  # positions begin near where they end

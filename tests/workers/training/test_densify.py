@@ -113,6 +113,16 @@ def test_a_step_may_be_a_part_of_the_distance() -> None:
     assert sorted(state.units["means"].tolist()) == [1, 1, 10, 10, 99, 99]
 
 
+def test_no_axis_is_less_than_an_angle_for_the_nearest_camera() -> None:
+    state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=1, moments=0)
+    state.units["means"] = torch.tensor([4.0, 10.0, 10.0])
+    state.gaussians.scales[:, 1] = math.log(0.2)
+    state.widen(0.01)
+    assert state.gaussians.scales[:, :2].exp().flatten().tolist() == pytest.approx(
+        [0.05, 0.2, 0.1, 0.2, 0.5, 0.2]
+    )
+
+
 def test_what_is_near_may_be_slow_to_depend_on_the_direction() -> None:
     state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0, moments=0)  # at x = 0, 100 and 200
     centers, full = np.array([[1.0, 0, 0], [210, 0, 0]]), schedule_of(sh={"near": 4})

@@ -1,7 +1,7 @@
 """Training as on a card: nothing waits for the device, and what goes wrong there is put right later."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -93,6 +93,19 @@ def test_a_card_collects_what_the_cpu_does(spec: TrainSpec) -> None:
     for name in ("gradient", "views", "absolute"):
         one, two = ours[f"statistics.{name}"], theirs[f"statistics.{name}"]
         assert float(two.max()) > 0 and float((one - two).norm() / two.norm()) < 1e-2, name
+
+
+@pytest.mark.parametrize("run", [lambda spec: list(train(spec)), on_card], ids=["cpu", "emulated"])
+def test_nothing_becomes_thinner_than_a_pixel(
+    spec: TrainSpec, run: Callable[[TrainSpec], list[Event]]
+) -> None:
+    optimizer = {"unit": "distance", "least_pixels": 1.0}
+    task = changed(spec, optimizer=optimizer, checkpoint={"every": 5, "share": 1})
+    tensors = next(event for event in run(task) if isinstance(event, Checkpoint)).tensors
+    scales = tensors["scales"][: len(tensors["scales"]) - int(tensors["sky"])]
+    least = (tensors["units.means"][: len(scales)] * 2 * math.pi / spec.width).log()[:, None]
+    assert bool((scales >= least - 1e-6).all())
+    assert bool(torch.isclose(scales, least).any()) and bool((scales > least + 0.01).any())
 
 
 def contents(events: list[Event]) -> list[object]:
