@@ -77,6 +77,7 @@ class Page:
     cameras: tuple[PageCamera, ...] = ()  # in the order in which one walks along them
     step: float | None = None  # world units: the sense of scale of the controls; None: as the model is large
     metres_per_unit: float | None = None  # None: distances are shown in units
+    frame: Frame | None = None  # in which the page has the model; None: not known
     sky: bytes | None = (
         None  # JPEG: equirectangular, its middle towards -z; None: the model has its own or none
     )
@@ -95,6 +96,8 @@ class Page:
             "cameras": [camera.as_json() for camera in self.cameras[:MOST_CAMERAS]],
             "step": self.step,
             "metres_per_unit": self.metres_per_unit,
+            "frame": self.frame
+            and {"rotation": self.frame.rotation.tolist(), "origin": self.frame.origin.tolist()},
         }
 
     def as_experience(self, sky: str | None) -> dict[str, Any]:

@@ -27,8 +27,27 @@ export function say(text, failed = false) {
   at("state").classList.toggle("failed", failed);
 }
 
+/** @param {string} name @param {BlobPart} content @param {string} type  Gives the user a file. */
+export function download(name, content, type) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(new Blob([content], { type }));
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}
+
+/** @param {HTMLElement} element  Copies its text, or selects it where the browser does not allow that. */
+export async function copy(element) {
+  try {
+    await navigator.clipboard.writeText(element.textContent ?? "");
+  } catch {
+    getSelection()?.selectAllChildren(element);
+  }
+}
+
 const SECTIONS = [
   ["list", "cameras"],
+  ["more", "extras"],
   ["how", "help"],
 ];
 

@@ -41,7 +41,7 @@ export class Color {
 export class GraphicsDevice {
   maxPixelRatio: number;
   readonly maxTextureSize: number;
-  readonly scope: { resolve(name: string): { setValue(value: number[]): void } };
+  readonly scope: { resolve(name: string): { setValue(value: number[] | Float32Array): void } };
   setResolution(width: number, height: number): void;
 }
 

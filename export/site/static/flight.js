@@ -8,7 +8,7 @@ const EASE = 9; // 1/s: how soon a key takes full effect
 const LONGEST = 0.1; // s of a frame that keys move for: a slow frame is no leap
 
 /** @param {number} degrees  The same angle within ±180. */
-const wrap = (degrees) => ((((degrees + 180) % 360) + 360) % 360) - 180;
+export const wrap = (degrees) => ((((degrees + 180) % 360) + 360) % 360) - 180;
 
 /** @param {number} t in [0, 1]; slow at both ends */
 const smooth = (t) => t * t * (3 - 2 * t);

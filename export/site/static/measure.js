@@ -1,11 +1,11 @@
 // Distances between two points of the model.
 
 import { at, press } from "./dom.js";
-import { between, distance } from "./flight.js";
+import { distance } from "./flight.js";
+import { line, shape, visible } from "./overlay.js";
 
 /** @typedef {import("./page.js").Point} Point */
 
-const SVG = "http://www.w3.org/2000/svg";
 const ROUNDS = 3; // of `Stage.pick`
 const NEAR = 1e-3; // of a step: a line is cut there, because what is behind the view has no place in the picture
 
@@ -98,11 +98,12 @@ export class Measure {
     const shapes = places
       .filter(({ ahead }) => ahead > this._near)
       .map(({ x, y }) => shape("circle", { cx: x, cy: y, r: 5 }));
-    const line = this._visible();
+    const [first, second] = this.points;
+    const ends = second ? visible(this._stage, first, second, this._near) : null;
     labels.replaceChildren();
-    if (line) {
-      const [from, to] = line;
-      shapes.unshift(shape("line", { x1: from.x, y1: from.y, x2: to.x, y2: to.y }));
+    if (ends) {
+      const [from, to] = ends;
+      shapes.unshift(line(ends));
       const label = document.createElement("p");
       label.textContent = written(/** @type {number} */ (this.length), this._metres);
       label.style.transform = `translate(calc(${((from.x + to.x) / 2).toFixed(1)}px - 50%), calc(${((from.y + to.y) / 2 - 22).toFixed(1)}px - 50%))`;
@@ -110,23 +111,4 @@ export class Measure {
     }
     lines.replaceChildren(...shapes);
   }
-
-  /** The ends of the line in the picture, cut where it goes behind the view; null if there is none. */
-  _visible() {
-    if (this.points.length < 2) return null;
-    let [a, b] = this.points;
-    const [from, to] = [this._stage.project(a).ahead, this._stage.project(b).ahead];
-    if (from <= this._near && to <= this._near) return null;
-    const cut = (this._near * 2 - from) / (to - from);
-    if (from <= this._near) a = between(a, b, cut);
-    if (to <= this._near) b = between(a, b, cut);
-    return [this._stage.project(a), this._stage.project(b)];
-  }
-}
-
-/** @param {string} name @param {Record<string, number>} attributes */
-function shape(name, attributes) {
-  const element = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value.toFixed(1));
-  return element;
 }

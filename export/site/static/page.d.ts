@@ -10,6 +10,12 @@ export interface Pose {
   pitch: number;
 }
 
+/** From the model's coordinates to those of the page: rotation · (place − origin). */
+export interface Frame {
+  rotation: [Point, Point, Point];
+  origin: Point;
+}
+
 export interface Camera extends Pose {
   name: string;
   /** The panorama's axes (x right, y down, z ahead) in the world, as a quaternion x y z w; null without a photograph. */
@@ -36,4 +42,6 @@ export interface Page {
   /** World units: the sense of scale of the controls; null where only the model's bounds say it. */
   step: number | null;
   metres_per_unit: number | null;
+  /** Null where it is not known. */
+  frame: Frame | null;
 }

@@ -2,6 +2,7 @@
 // can do.
 
 import * as pc from "./engine.js";
+import { ALL, DEPTH, KEPT } from "./shaders.js";
 
 const FOV = 85; // degrees along the longer side of the window
 const BUDGET = matchMedia("(pointer: coarse)").matches ? 800_000 : 2_000_000; // Gaussians that are drawn of a streamed model
@@ -14,20 +15,6 @@ const REST = 220; // ms without movement after which a picture is drawn in full 
 const SOLID = 100; // of 255: opacity from which on there is something that can be pointed at
 const REACH = [0.05, 2000]; // steps in which what is pointed at is searched
 const COARSEST = 0.4; // pixels of the picture for one of the screen
-
-// Draws, in place of colours, by uDepths.w: 0 the colours; 1 in each channel what is nearer along the view than one of
-// the depths; 2 of what is between the first two, where it is between them, and how much it is.
-const DEPTH = `
-uniform vec4 uDepths;
-void modifySplatColor(vec2 gaussianUV, inout vec4 color) {
-  float depth = 1.0 / gl_FragCoord.w;
-  if (uDepths.w == 1.0) color.rgb = step(vec3(depth), uDepths.xyz);
-  if (uDepths.w == 2.0) {
-    float place = (depth - uDepths.x) / (uDepths.y - uDepths.x);
-    color.rgb = place >= 0.0 && place <= 1.0 ? vec3(place, 1.0, 0.0) : vec3(0.0);
-  }
-}
-`;
 
 /** @typedef {import("./flight.js").Flight} Flight @typedef {import("./page.js").Page} Page @typedef {import("./page.js").Point} Point */
 
@@ -65,11 +52,15 @@ export class Stage {
     splats.splatBudget = FIRST;
     /** Called after each picture. @type {(() => void)[]} */
     this.onDrawn = [];
-    splats.material.getShaderChunks(pc.SHADERLANGUAGE_GLSL).set("gsplatModifyPS", DEPTH);
+    const chunks = splats.material.getShaderChunks(pc.SHADERLANGUAGE_GLSL);
+    chunks.set("gsplatModifyPS", DEPTH);
+    chunks.set("gsplatModifyVS", KEPT);
     splats.material.shaderChunksVersion = "2.8";
     splats.material.update();
     this._depths = device.scope.resolve("uDepths"); // of the device: a parameter of the material compiles its shaders anew
     this._depths.setValue([0, 0, 0, 0]);
+    this._kept = device.scope.resolve("uKept");
+    this._kept.setValue(ALL);
     this._step = 1;
     /** What is around the view, and not of the model. @type {pc.Entity[]} */
     this.backdrops = [];
@@ -248,13 +239,20 @@ export class Stage {
     this.fit();
   }
 
-  /** @returns {{ middle: Point, radius: number }} of the model */
+  /** @param {Float32Array | null} matrix  from the world to [0, 1] of what is shown of the model; null for all of it */
+  keep(matrix) {
+    this._kept.setValue(matrix ?? ALL);
+    this.draw();
+  }
+
+  /** @returns {{ middle: Point, half: Point, radius: number }} of the model */
   get bounds() {
     const box = this.model?.resource?.aabb;
-    if (!box) return { middle: [0, 0, 0], radius: 1 };
+    if (!box) return { middle: [0, 0, 0], half: [1, 1, 1], radius: 1 };
     const { center, halfExtents } = box;
     return {
       middle: [-center.x, -center.y, center.z],
+      half: [halfExtents.x, halfExtents.y, halfExtents.z],
       radius: Math.hypot(halfExtents.x, halfExtents.y, halfExtents.z) || 1,
     };
   }

@@ -7,6 +7,7 @@ import { listenToKeys, listenToPointers } from "./input.js";
 import { Measure } from "./measure.js";
 import { Panorama } from "./panorama.js";
 import { makeStage, StageError } from "./stage.js";
+import { offerTools } from "./tools.js";
 import { spacing, Walk } from "./walk.js";
 
 /** @typedef {import("./page.js").Page} Page @typedef {import("./page.js").Pose} Pose */
@@ -144,6 +145,7 @@ async function show() {
   const { page, contents } = await read();
   describe(page);
   at("how").addEventListener("click", () => toggle("help") && at("help").focus());
+  at("more").addEventListener("click", () => toggle("extras") && at("extras").focus());
   const canvas = /** @type {HTMLCanvasElement} */ (at("view"));
   const stage = await makeStage(canvas);
   const flight = new Flight(page.start ?? page.cameras[0] ?? START, page.step ?? (spacing(page.cameras) || 1));
@@ -187,6 +189,7 @@ async function show() {
       seconds = (now - last) / 1000;
     last = now;
     walk.update(seconds);
+    tools?.path.update(seconds);
     if (flight.update(seconds)) stage.follow(flight);
     const more = ready && stage.loading ? " · loading details" : "";
     if (at("loading").textContent !== more) at("loading").textContent = more;
@@ -198,6 +201,8 @@ async function show() {
   });
 
   let ready = false;
+  /** @type {ReturnType<typeof offerTools>} */
+  let tools = null;
   const progress = /** @type {HTMLProgressElement} */ (at("progress"));
   const sky = showSky(stage, page);
   await stage.load(
@@ -219,9 +224,10 @@ async function show() {
   progress.hidden = true;
   ready = true;
   say("");
-  for (const id of ["home", "list", "measure", "orbit"]) button(id).disabled = false;
+  tools = offerTools(stage, flight, page);
+  for (const id of ["home", "list", "measure", "orbit", "more"]) button(id).disabled = false;
   performance.mark("first picture");
-  Object.assign(window, { panolog: { stage, flight, walk, measure, ahead, shifted } });
+  Object.assign(window, { panolog: { stage, flight, walk, measure, tools, ahead, shifted } });
   document.documentElement.dataset.state = "ready";
   const backdrop = await sky;
   stage.draw();

@@ -143,6 +143,7 @@ def _page(title: str, model: Model, place: Georeference, wanted: Wanted) -> Page
         start=Pose.towards(middle + away, -away),
         step=radius / _STEPS,
         metres_per_unit=place.unit,
+        frame=place.frame,
         sky=None if model.sky is None or not wanted.sky else _sky_picture(model.sky, place.frame),
     )
 

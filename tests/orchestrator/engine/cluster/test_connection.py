@@ -97,9 +97,12 @@ def test_a_machine_too_busy_to_start_ray_is_tried_again(
 
     monkeypatch.setattr(ray, "init", init)
     wait, awaited = psutil.wait_procs, set[int]()
-    monkeypatch.setattr(
-        psutil, "wait_procs", lambda all_, timeout: awaited.update(p.pid for p in all_) or wait(all_, timeout)
-    )
+
+    def observed(processes: list[psutil.Process], timeout: float) -> Any:
+        awaited.update(process.pid for process in processes)
+        return wait(processes, timeout)
+
+    monkeypatch.setattr(psutil, "wait_procs", observed)
     late = pytest.raises(ClusterError, match=r"^Ray does not start .* \(The current .* could\); end other")
     with subprocess.Popen(["sleep", "600"]) as other:
         try:

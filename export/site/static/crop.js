@@ -1,0 +1,138 @@
+// A box of which the model is shown, as `panolog export --crop` takes it: axes are those of the model.
+
+import { at, button, copy } from "./dom.js";
+import { shifted } from "./flight.js";
+import { line, visible } from "./overlay.js";
+import { around, corners, placed, shown } from "./world.js";
+
+/** @typedef {import("./page.js").Point} Point @typedef {import("./world.js").Box} Box */
+
+const MARGIN = 20; // steps around the cameras within which the box is moved
+const PARTS = 1000; // of a slider
+const NEAR = 0.1; // of a step: what is nearer is behind the view; lines far outside of the picture take long
+const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((from) =>
+  [1, 2, 4].filter((bit) => !(from & bit)).map((bit) => /** @type {const} */ ([from, from | bit])),
+);
+
+/** @param {Box} box @param {import("./page.js").Frame} frame  The matrix by which the page's points are in [0, 1] inside. */
+export function into(box, { rotation, origin }) {
+  const matrix = new Float32Array(16);
+  matrix[15] = 1;
+  for (const i of [0, 1, 2]) {
+    const length = box.upper[i] - box.lower[i];
+    for (const j of [0, 1, 2]) matrix[4 * j + i] = rotation[j][i] / length;
+    matrix[12 + i] = (origin[i] - box.lower[i]) / length;
+  }
+  return matrix;
+}
+
+export class Crop {
+  /**
+   * @param {import("./stage.js").Stage} stage  with its model @param {import("./page.js").Frame} frame
+   * @param {Point[]} cameras  of the page @param {number} step  world units
+   */
+  constructor(stage, frame, cameras, step) {
+    this._stage = stage;
+    this._frame = frame;
+    this._near = step * NEAR;
+    /** All of the model. */
+    this.whole = around(corners(boxOf(stage.bounds)).map((corner) => placed(frame, corner)));
+    this._reach = reach(this.whole, around(cameras.map((camera) => placed(frame, camera))), MARGIN * step);
+    /** What is kept. @type {Box} */
+    this.box = { lower: [...this.whole.lower], upper: [...this.whole.upper] };
+    this._sliders = ["lower", "upper"].flatMap((side) => [0, 1, 2].map((axis) => this._slider(side, axis)));
+    stage.onDrawn.push(() => this._draw());
+    button("whole").addEventListener("click", () => this.reset());
+    button("copy").addEventListener("click", () => copy(at("option")));
+    this._show();
+  }
+
+  /** Whether something is left out. */
+  get cuts() {
+    const { lower, upper } = this.whole;
+    return [0, 1, 2].some((i) => this.box.lower[i] > lower[i] || this.box.upper[i] < upper[i]);
+  }
+
+  /** For the command line. */
+  get option() {
+    return `--crop=${[...this.box.lower, ...this.box.upper].map((value) => Number(value.toPrecision(6))).join(",")}`;
+  }
+
+  /** Shows all of the model again. */
+  reset() {
+    for (const { slider, side } of this._sliders) slider.value = side === "lower" ? slider.min : slider.max;
+    this._changed();
+  }
+
+  /** @param {string} name @param {number} axis */
+  _slider(name, axis) {
+    const side = /** @type {"lower" | "upper"} */ (name);
+    const slider = /** @type {HTMLInputElement} */ (at(`${side}-${"xyz"[axis]}`));
+    slider.min = side === "lower" ? "0" : "1";
+    slider.max = String(side === "lower" ? PARTS - 1 : PARTS);
+    slider.value = side === "lower" ? slider.min : slider.max;
+    slider.addEventListener("input", () => this._changed(side, axis));
+    return { slider, side, axis };
+  }
+
+  /** @param {"lower" | "upper"} [side] @param {number} [axis]  Of the slider that was moved: the other one of its axis gives way. */
+  _changed(side, axis) {
+    for (const { slider, ...other } of this._sliders) {
+      const twin = this._sliders.find((one) => one.axis === other.axis && one.side !== other.side);
+      if (other.axis !== axis || other.side === side || !twin) continue;
+      const least = Number(twin.slider.value) + (other.side === "upper" ? 1 : -1);
+      slider.value = String(
+        other.side === "upper" ? Math.max(least, Number(slider.value)) : Math.min(least, Number(slider.value)),
+      );
+    }
+    for (const one of this._sliders) {
+      const part = Number(one.slider.value) / PARTS,
+        { lower, upper } = this._reach,
+        end = one.side === "lower" ? part <= 0 : part >= 1;
+      this.box[one.side][one.axis] = end
+        ? this.whole[one.side][one.axis]
+        : lower[one.axis] + part * (upper[one.axis] - lower[one.axis]);
+    }
+    this._show();
+  }
+
+  _show() {
+    at("option").textContent = this.option;
+    at("kept").hidden = !this.cuts;
+    button("copy").disabled = button("whole").disabled = !this.cuts;
+    this._stage.keep(this.cuts ? into(this.box, this._frame) : null);
+  }
+
+  /** Draws the edges of the box while something is left out. */
+  _draw() {
+    const edges = at("edges");
+    if (!this.cuts) {
+      if (edges.childElementCount) edges.replaceChildren();
+      return;
+    }
+    const points = corners({
+      lower: /** @type {Point} */ (this.box.lower.map((value, i) => Math.max(value, this._reach.lower[i]))),
+      upper: /** @type {Point} */ (this.box.upper.map((value, i) => Math.min(value, this._reach.upper[i]))),
+    }).map((corner) => shown(this._frame, corner));
+    const ends = EDGES.map(([from, to]) => visible(this._stage, points[from], points[to], this._near));
+    edges.replaceChildren(...ends.flatMap((one) => (one ? [line(one)] : [])));
+  }
+}
+
+/** @param {{ middle: Point, half: Point }} bounds @returns {Box} */
+const boxOf = ({ middle, half }) => ({ lower: shifted(middle, half, -1), upper: shifted(middle, half, 1) });
+
+/** @param {Box} whole @param {Box} cameras  infinite without any @param {number} margin @returns {Box} in which the box is moved */
+function reach(whole, cameras, margin) {
+  /** @param {number} i */
+  const room = (i) => Math.max(margin, (cameras.upper[i] - cameras.lower[i]) / 2);
+  const any = Number.isFinite(cameras.lower[0]);
+  return {
+    lower: /** @type {Point} */ (
+      whole.lower.map((value, i) => (any ? Math.max(value, cameras.lower[i] - room(i)) : value))
+    ),
+    upper: /** @type {Point} */ (
+      whole.upper.map((value, i) => (any ? Math.min(value, cameras.upper[i] + room(i)) : value))
+    ),
+  };
+}
