@@ -151,6 +151,11 @@ def test_the_world_is_turned_so_that_y_is_up(folder: RunFolder) -> None:
     page = site_of_run(folder, Wanted()).page
     assert page.cameras[3].pose.position == (2.0, 1.0, -5.0)
     assert page.metres_per_unit == 2.5
+    assert page.as_json("model.sog", None)["frame"]["rotation"] == [
+        [1, 0, 0],
+        [0, 0, 1],
+        [0, -1, 0],
+    ]  # z is up
     for wrong in ("nonsense", "[]", "[" * 100_000):
         folder.georeference.write_text(wrong)
         with pytest.raises(InputError, match=r"georef\.json: .*remove it"):

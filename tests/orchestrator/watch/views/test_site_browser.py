@@ -285,7 +285,15 @@ def test_the_page_is_legible_fits_and_needs_no_mouse(browser: Browser, site: str
     with opened(browser, site, width=PHONE) as page:
         ready(page)
         assert page.evaluate(SMALL) == []
-        for opener, width in (("list", DESK), ("list", PHONE), ("how", PHONE), ("how", DESK)):
+        views = (
+            ("list", DESK),
+            ("list", PHONE),
+            ("more", PHONE),
+            ("more", DESK),
+            ("how", PHONE),
+            ("how", DESK),
+        )
+        for opener, width in views:
             page.set_viewport_size({"width": width, "height": 850})
             if page.locator(f"#{opener}").get_attribute("aria-expanded") != "true":
                 page.locator(f"#{opener}").focus()
@@ -303,7 +311,7 @@ def test_the_page_is_legible_fits_and_needs_no_mouse(browser: Browser, site: str
         page.keyboard.press("Tab")
         state = page.evaluate(KEYBOARD)
         assert (state["focused"], state["seen"]) == ("list", True)
-        wanted = {"view", "home", "list", "measure", "orbit", "sky", "how", "play", "along"}
+        wanted = {"view", "home", "list", "measure", "orbit", "sky", "more", "how", "play", "along"}
         assert wanted <= set(state["reachable"])
 
 
