@@ -31,7 +31,7 @@ def goals(rows: Sequence[Row]) -> Iterator[tuple[object, ...]]:
     """What, goal, measured, met. Args: rows of one model and size, on one thread and, if possible, on two."""
     last = rows[-1]
     where = f"trained model at {last.width}×{last.height}"
-    yield _goal(f"share of rasterization in an iteration, {where}", 0.7, last.times.share)
+    yield _goal(f"share of rasterization and Adam in an iteration, {where}", 0.7, last.times.share)
     if last.speed_up is not None:
         yield _goal(f"speed-up of two threads, {where}", 1.8, last.speed_up)
 

@@ -1,5 +1,7 @@
 """The compiled kernels, argument by argument as in csrc/bindings.cpp; a test compares both."""
 
+import collections.abc
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,11 +26,14 @@ def rasterize_backward(
     rotation: Floats, translation: Floats, width: int, height: int, sh_degree: int, near: float, exact: bool,
     threads: int, color: Floats, alpha: Floats, inverse_depth: Floats, splats: Floats, rays: Floats,
     slots: Ints, entries: Ints, tiles: Ints, grad_color: Floats, grad_alpha: Floats,
-    grad_inverse_depth: Floats, out_means: Floats, out_quats: Floats, out_scales: Floats,
-    out_opacities: Floats, out_sh0: Floats, out_shN: Floats, out_screen: Floats,
-    exterior: tuple[Floats, Floats, Ints, Floats, Floats, Floats] | None,
+    grad_inverse_depth: Floats, exterior: tuple[Floats, Floats, Ints, Floats, Floats, Floats] | None,
+    out: collections.abc.Sequence[Floats] | None = None, out_screen: Floats | None = None,
     out_motion: Doubles | None = None, out_absolute: Floats | None = None,
-) -> None: ...
+    step: tuple[
+        collections.abc.Sequence[tuple[Floats, Floats, Floats, int, float, Floats | None] | None],
+        float, float, float, int,
+    ] | None = None,
+) -> int: ...
 def bake(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, sh0: Floats, shN: Floats, screen: Floats,
     own: int, rotation: Floats, translation: Floats, width: int, height: int, sh_degree: int, near: float,
@@ -44,8 +49,4 @@ def ssim_map(a: Floats, b: Floats, width: int, height: int, threads: int, out: F
 def absolute_difference(
     rendered: Floats, target: Floats, valid: Bytes, threads: int, gradient: Floats,
 ) -> float: ...
-def adam(
-    parameter: Floats, gradient: Floats, exp_avg: Floats, exp_avg_sq: Floats, count: int, lr: float,
-    beta1: float, beta2: float, eps: float, step: int, threads: int, units: Floats | None = None,
-) -> bool: ...
 def stages() -> tuple[float, float, float, float, float]: ...

@@ -1,63 +1,43 @@
-"""Adam, fused: one pass over parameter, gradient and both moments."""
+"""Adam (Kingma and Ba 2015, algorithm 1): what a step of it moves. The backward pass takes the step."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from panolog.renderer import ops
 
 BETAS = (0.9, 0.999)  # 3DGS
 EPSILON = 1e-15  # 3DGS
 
 
-def adam_(
-    parameter: Tensor,
-    gradient: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    *,
-    lr: float,
-    step: int,
-    rows: int | None = None,
-    units: Tensor | None = None,
-    betas: tuple[float, float] = BETAS,
-    eps: float = EPSILON,
-) -> None:
-    """One step in place (Kingma and Ba 2015, algorithm 1), on the first `rows` rows only if that is given.
+class Moving(NamedTuple):
+    """One parameter in a step: float32, contiguous, with its moments, which all change in place.
 
-    Args:
-        parameter, gradient, exp_avg, exp_avg_sq: (N, …) float32 of one shape, contiguous.
-        lr: learning rate in the parameter's unit.
-        step: 1 for the first step; the bias correction needs it.
-        units: (N,) float32, what the learning rate of each row is a multiple of; None: all 1.
-        rows: how many rows take part; the others keep parameter and moments (a frozen sky).
-
-    Raises:
-        ValueError: a shape or type differs, something is not contiguous, `step` or `rows` is out of range.
-        FloatingPointError: the gradient on the CPU is not finite; parameter and moments are then invalid.
+    The definition holds also where a gradient is 0: moments decay, and what they still are moves the value.
     """
-    tensors = parameter, gradient, exp_avg, exp_avg_sq
-    if any(t.shape != parameter.shape or t.dtype != torch.float32 for t in tensors):
-        found = [f"{t.dtype} {tuple(t.shape)}" for t in tensors]
-        raise ValueError(f"parameter, gradient and moments must be float32 of one shape, not {found}")
-    if units is not None and (units.shape != parameter.shape[:1] or units.dtype != torch.float32):
-        found_units = f"{units.dtype} {tuple(units.shape)}"
-        raise ValueError(f"units must be float32, one for each of {len(parameter)} rows, not {found_units}")
-    if not all(t.is_contiguous() for t in (parameter, exp_avg, exp_avg_sq)):
-        raise ValueError("parameter and moments change in place: they must be contiguous")
-    if step < 1 or (rows is not None and not 0 <= rows <= len(parameter)):
-        raise ValueError(f"step {step} and rows {rows} must be at least 1 and within 0 to {len(parameter)}")
-    count = parameter.numel() if rows is None else parameter[:rows].numel()
-    beta1, beta2 = betas
-    ops.adam(
-        parameter=parameter.detach(),
-        gradient=gradient,
-        exp_avg=exp_avg,
-        exp_avg_sq=exp_avg_sq,
-        count=count,
-        lr=lr,
-        beta1=beta1,
-        beta2=beta2,
-        eps=eps,
-        step=step,
-        units=units,
-    )
+
+    parameter: Tensor  # (N, …)
+    exp_avg: Tensor  # (N, …)
+    exp_avg_sq: Tensor  # (N, …)
+    values: int  # how many of its values move, from the first
+    lr: float  # in the parameter's unit
+    units: Tensor | None = None  # (N,) what the rate of each row is a multiple of; None: all 1
+
+
+def check_moving(moving: Mapping[str, Moving], step: int) -> None:
+    """Raises ValueError: types or shapes differ, something is not contiguous, a number is out of range."""
+    if step < 1:
+        raise ValueError(f"step {step} must be at least 1")
+    for name, (parameter, *moments, values, _, units) in moving.items():
+        tensors = parameter, *moments
+        if any(t.dtype != torch.float32 or t.shape != parameter.shape for t in tensors):
+            found = [f"{t.dtype} {tuple(t.shape)}" for t in tensors]
+            raise ValueError(f"{name} and its moments must be float32 of one shape, not {found}")
+        if not all(t.is_contiguous() for t in tensors):
+            raise ValueError(f"{name} and its moments change in place: they must be contiguous")
+        if units is not None and (units.shape != parameter.shape[:1] or units.dtype != torch.float32):
+            found_units = f"{units.dtype} {tuple(units.shape)}"
+            rows = f"each of {len(parameter)} rows"
+            raise ValueError(f"units of {name} must be float32, one for {rows}, not {found_units}")
+        if not 0 <= values <= parameter.numel():
+            raise ValueError(f"{values} values of {name} must be within 0 to {parameter.numel()}")

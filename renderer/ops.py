@@ -1,6 +1,6 @@
 """The kernels as torch custom ops: torch's dispatcher selects the device, autograd the backward pass."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from inspect import signature
 from typing import Any
@@ -19,13 +19,13 @@ _NAMES: dict[str, tuple[str, ...]] = {}  # of the arguments, by op
 _LIBRARY: Any = torch.library.Library("panolog", "DEF")  # type: ignore[no-untyped-call]
 
 
-def _op(function: Callable[..., Any], mutates: tuple[str, ...] = ()) -> Callable[..., Any]:
+def _op(function: Callable[..., Any]) -> Callable[..., Any]:
     """A kernel of the CPU as an op of the same name and signature; on CUDA it is that of `cuda.card`.
 
     `torch.library.custom_op` would import torch's compiler at the first call: 100 MB and 2 s of each worker.
     """
     name = function.__name__
-    _LIBRARY.define(name + torch.library.infer_schema(function, mutates_args=mutates))
+    _LIBRARY.define(name + torch.library.infer_schema(function, mutates_args=()))
     _LIBRARY.impl(name, function, "CPU")
     _NAMES[name] = tuple(signature(function).parameters)
     _LIBRARY.impl(name, partial(_on_gpu, name), "CUDA")
@@ -152,37 +152,48 @@ def rasterize_backward(
     Args: those of `rasterize`, its images, and `frame`, the last five tensors that it returned; moving,
     whether the last result holds the sums of the camera's motion, (27,) float64, or is empty.
     """
-    parameters = _arrays(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
-    parameters |= _arrays(screen=screen[:, :2])
-    absolute = torch.empty(len(screen), screen.shape[1] - 2)
-    out = {f"out_{name}": torch.empty(array.shape) for name, array in parameters.items()}
+    parameters = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    parameters |= {"sh0": sh0, "shN": shN}
+    found = [torch.empty(parameter.shape) for parameter in parameters.values()]
+    by_screen, absolute = torch.empty(len(screen), 2), torch.empty(len(screen), screen.shape[1] - 2)
     motion = torch.empty(MOTION_SUMS if moving else 0, dtype=torch.float64)
-    splats, rays, slots, entries, tiles = frame
-    _core.rasterize_backward(
-        **parameters,
-        **_arrays(rotation=rotation, translation=translation),
-        width=width,
-        height=height,
-        sh_degree=sh_degree,
-        near=near,
-        exact=exact,
-        threads=threads(),
-        **_arrays(color=color, alpha=alpha, inverse_depth=inverse_depth),
-        **_arrays(splats=splats, rays=rays, slots=slots, entries=entries, tiles=tiles),
-        **_arrays(grad_color=grad_color, grad_alpha=grad_alpha, grad_inverse_depth=grad_inverse_depth),
-        **_arrays(**out),
-        exterior=_exterior(exterior),
+    backward_into(
+        {
+            **parameters,
+            **{"screen": screen, "rotation": rotation, "translation": translation, "width": width},
+            **{"height": height, "sh_degree": sh_degree, "near": near, "exact": exact, "exterior": exterior},
+            **{"color": color, "alpha": alpha, "inverse_depth": inverse_depth, "grad_color": grad_color},
+            **{"grad_alpha": grad_alpha, "grad_inverse_depth": grad_inverse_depth},
+        },
+        frame,
+        out=tuple(map(_array, found)),
+        out_screen=by_screen.numpy(),
         out_motion=motion.numpy() if moving else None,
         out_absolute=absolute.numpy() if absolute.shape[1] else None,
     )
-    means, quats, scales, opacities, sh0, shN, screen = out.values()
-    return means, quats, scales, opacities, sh0, shN, torch.cat([screen, absolute], 1), motion
+    means, quats, scales, opacities, sh0, shN = found
+    return means, quats, scales, opacities, sh0, shN, torch.cat([by_screen, absolute], 1), motion
+
+
+def backward_into(given: Mapping[str, Any], frame: Sequence[Tensor], **results: Any) -> int:
+    """The kernel of the backward pass on the CPU, as `_core.rasterize_backward` has it.
+
+    Args: given, what `rasterize_backward` takes, but for `frame` and `moving`; results, where gradients go,
+    or the step that they take. Returns a bit for each parameter that should move by what is not finite.
+    """
+    tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
+    numbers = {name: value for name, value in given.items() if name not in tensors}
+    tensors |= {"screen": given["screen"][:, :2], **dict(zip(_FRAME, frame, strict=True))}
+    around = _exterior(numbers.pop("exterior"))
+    arguments: dict[str, Any] = {**_arrays(**tensors), **numbers, **results}
+    return _core.rasterize_backward(**arguments, exterior=around, threads=threads())
 
 
 _TENSORS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen", "rotation", "translation")
 _SETTINGS = ("width", "height", "sh_degree", "near", "exact")
 _EXTERIOR = "exterior"
 _IMAGES = ("color", "alpha", "inverse_depth")
+_FRAME = ("splats", "rays", "slots", "entries", "tiles")  # what `rasterize` returns last
 
 
 def _save(ctx, inputs, output) -> None:  # type: ignore[no-untyped-def]
@@ -275,41 +286,6 @@ def _scale_gradient(ctx, value, *_others):  # type: ignore[no-untyped-def]
 
 _differentiable("photometric", _scale_gradient, _save_gradient)
 _differentiable("absolute_difference", _scale_gradient, _save_gradient)
-
-
-@partial(_op, mutates=("parameter", "exp_avg", "exp_avg_sq"))
-def adam(
-    parameter: Tensor,
-    gradient: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    count: int,
-    lr: float,
-    beta1: float,
-    beta2: float,
-    eps: float,
-    step: int,
-    units: Tensor | None = None,
-) -> None:
-    """One step of Adam (Kingma and Ba 2015, algorithm 1) on the first `count` values, in place.
-
-    Args: units (N,) of lr, for each of the N rows of the parameter; None: all 1.
-
-    Raises FloatingPointError if their gradient is not finite: the check is part of the pass over it.
-    """
-    broken = _core.adam(
-        **_arrays(parameter=parameter, gradient=gradient, exp_avg=exp_avg, exp_avg_sq=exp_avg_sq),
-        units=None if units is None else _array(units),
-        count=count,
-        lr=lr,
-        beta1=beta1,
-        beta2=beta2,
-        eps=eps,
-        step=step,
-        threads=threads(),
-    )
-    if broken:
-        raise FloatingPointError("gradient")
 
 
 def launcher(device: torch.device) -> Launch | None:

@@ -3,9 +3,11 @@
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import torch
+
 from benchmarks import performance
 from benchmarks.first_hour.outcome import NO_CARD, ROOT, Context, Outcome, shown
-from benchmarks.rasterizer import peers
+from benchmarks.rasterizer import peers, roofline
 from benchmarks.rasterizer.cases import CaseSpec
 from benchmarks.rasterizer.rows import Row, tables
 from panolog.orchestrator.runs.machines.machine import cores
@@ -44,6 +46,27 @@ def iterations(context: Context) -> Outcome:
 def _figure(row: Row) -> str:
     size = f"{row.gaussians:,} Gaussians at {row.width}×{row.height}"
     return f"{row.times.iteration:.2f} ms for an iteration of {size}"
+
+
+def kernels(context: Context) -> Outcome:
+    """Each kernel of an iteration against `benchmarks.rasterizer.roofline`, if it knows the card."""
+    prepare(cores())
+    size = (2048, 1_000_000)
+    spec = CaseSpec(*size)
+    name = torch.cuda.get_device_name()
+    took = roofline.measured(spec.make().to(context.device), _REPEATS)
+    command = f"python -m benchmarks.rasterizer.roofline --width {size[0]} --gaussians {size[1]}"
+    card = roofline.card_of(name)
+    expected = {} if card is None else {n: ms for n, ms, _ in roofline.milliseconds(card, spec)}
+    figure = f"{sum(took.values()):.2f} ms in the kernels of an iteration"
+    return Outcome(
+        "passed",
+        figure,
+        "",
+        (command,),
+        {"card": name, "measured_ms": took, "model_ms": expected},
+        roofline.comparison(took, expected),
+    )
 
 
 def gsplat(context: Context) -> Outcome:

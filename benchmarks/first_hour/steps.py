@@ -26,6 +26,7 @@ STEPS = {
     "waits": Step("waits for the card and host time of an iteration", 4, "waits", "count"),
     "memory": Step("memory of a training step against its estimate", 5, "memory", "compare"),
     "performance": Step("a training iteration and its parts", 12, "speed", "iterations"),
+    "kernels": Step("each kernel, and what the model of cards expects", 4, "speed", "kernels", card=True),
     "demo": Step("the demo's town, trained on card and CPU", 15, "quality", "demo"),
     "scene": Step("a scene, trained on card and CPU", 10, "quality", "scene"),
     "gsplat": Step("gsplat on the same Gaussians", 8, "speed", "gsplat"),

@@ -10,14 +10,15 @@ from torch import Tensor
 
 from benchmarks.rasterizer.cases import Case, TrainingView
 from panolog.renderer import _core, ops
-from panolog.renderer.adam import BETAS, EPSILON
+from panolog.renderer.adam import BETAS, EPSILON, Moving
 from panolog.renderer.cuda.iteration import Problem, gradients
 from panolog.renderer.cuda.parts import Launch, adam_step
+from panolog.renderer.iteration import backward, forward, loss_of, take
 from panolog.renderer.losses import photometric_loss
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.optimizer import ModelState, finite_loss
+from panolog.workers.training.optimizer import ModelState
 
 SH_DEGREE = 3
 
@@ -28,8 +29,7 @@ class Times:
 
     forward: float
     loss: float
-    backward: float
-    adam: float
+    backward: float  # with the step of Adam, which is a part of it
     iteration: float
 
     @property
@@ -39,8 +39,8 @@ class Times:
 
     @property
     def share(self) -> float:
-        """The fraction of the parts that is rasterization."""
-        return self.rasterization / (self.rasterization + self.loss + self.adam)
+        """The fraction of the parts that is rasterization and Adam."""
+        return self.rasterization / (self.rasterization + self.loss)
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Stages:
     order: float  # by depth, then into tiles
     composite: float
     composite_backward: float
-    project_backward: float
+    project_backward: float  # with the step of Adam
 
 
 class TrainingStep:
@@ -68,53 +68,10 @@ class TrainingStep:
         self.rows = dict.fromkeys(case.gaussians.tensors(), len(case.gaussians))
         self.room: int | None = None  # for pairs of splats and tiles, on a card after the first iteration
 
-    def forward(self) -> tuple[Gaussians, Render]:
-        """The leaves and their image."""
-        leaves = self.state.leaves(SH_DEGREE)
-        screen = leaves.means.new_zeros(len(leaves), 2).requires_grad_()
-        rendered = render(
-            leaves,
-            self.view.camera,
-            sh_degree=SH_DEGREE,
-            near=self.near,
-            screen=screen,
-            exterior=self.view.around,
-        )
-        return leaves, rendered
-
-    def loss(self, color: Tensor) -> Tensor:
-        """Eq. 6 without depth; color (H, W, 3)."""
+    def problem(self) -> Problem:
+        """The iteration's model and image, without depth."""
         mask, share = self.active()
-        loss = photometric_loss(color, self.view.target, mask, TrainConfig().loss.lambda_ssim).loss
-        return loss if share is None else loss * share
-
-    def active(self) -> tuple[Tensor, Tensor] | tuple[None, None]:
-        """Within an exterior the (H, W) pixels that count and their share, as `Loss.targets` finds them."""
-        if self.view.around is None:
-            return None, None
-        mask = self.view.around.active(self.view.camera.width, self.view.camera.height)
-        return mask, mask.sum(dtype=torch.float64) / mask.numel()
-
-    def adam(self, leaves: Gaussians, loss: Tensor) -> None:
-        """The check that all values are finite, and the step."""
-        found = {name: leaf.grad for name, leaf in leaves.tensors().items() if leaf.grad is not None}
-        finite_loss(loss)
-        self.state.step(found, self.rates, self.rows, step=1)
-
-    def iteration(self) -> None:
-        """A whole iteration, on a card as in `workers.training.pipeline`."""
-        launch = ops.launcher(self.view.target.device)
-        if launch is not None:
-            self._on_card(launch)
-            return
-        leaves, rendered = self.forward()
-        loss = self.loss(rendered.color)
-        loss.backward()  # type: ignore[no-untyped-call]
-        self.adam(leaves, loss)
-
-    def _on_card(self, launch: Launch) -> None:
-        mask, share = self.active()
-        problem = Problem(
+        return Problem(
             model=self.state.gaussians.tensors(),
             camera=self.view.camera,
             image=self.view.target,
@@ -129,33 +86,80 @@ class TrainingStep:
             near=self.near,
             exact=self.state.gaussians.exact,
         )
+
+    def active(self) -> tuple[Tensor, Tensor] | tuple[None, None]:
+        """Within an exterior the (H, W) pixels that count and their share, as `Loss.targets` finds them."""
+        if self.view.around is None:
+            return None, None
+        mask = self.view.around.active(self.view.camera.width, self.view.camera.height)
+        return mask, mask.sum(dtype=torch.float64) / mask.numel()
+
+    def moving(self) -> dict[str, Moving]:
+        """What Adam moves: everything."""
+        return self.state.moving(self.rates, self.rows)
+
+    def iteration(self) -> None:
+        """A whole iteration, as in `workers.training.pipeline`."""
+        launch, problem = ops.launcher(self.view.target.device), self.problem()
+        if launch is None:
+            take(problem, self.moving(), 1, screen=True)
+            return
         status = torch.zeros(1, dtype=torch.int32, device=self.view.target.device)
         found = gradients(launch, problem, status, self.room)
         if self.room is None:
             self.room = int(1.25 * float(found.report[2])) + 1
-        updates = self.state.updates(found.gradients, self.rates, self.rows)
-        adam_step(launch, updates, *BETAS, EPSILON, 1, status)
+        adam_step(launch, found.gradients, self.moving(), *BETAS, EPSILON, 1, status)
+
+    def forward(self) -> tuple[Gaussians, Render]:
+        """The model as leaves of autograd, and its image."""
+        model = self.state.gaussians
+        leaves = model.with_tensors({n: it.detach().requires_grad_() for n, it in model.tensors().items()})
+        screen = leaves.means.new_zeros(len(leaves), 2).requires_grad_()
+        rendered = render(
+            leaves,
+            self.view.camera,
+            sh_degree=SH_DEGREE,
+            near=self.near,
+            screen=screen,
+            exterior=self.view.around,
+        )
+        return leaves, rendered
 
     def rasterize(self) -> None:
-        """Forward and backward alone, with a gradient of ones."""
+        """Forward and backward pass through autograd, with a gradient of ones."""
         _, rendered = self.forward()
         rendered.color.backward(torch.ones_like(rendered.color))  # type: ignore[no-untyped-call]
 
     def parts(self) -> Iterator[float]:
-        """Seconds of forward, loss with its gradient, backward and Adam of one iteration."""
+        """Seconds of forward, loss with its gradient, and backward with Adam of one iteration."""
+        launch, problem, moving = ops.launcher(self.view.target.device), self.problem(), self.moving()
+        if launch is not None:
+            yield from self._parts_on_card(launch, problem)
+            return
+        start = self.now()
+        seen = forward(problem)
+        yield self.now() - start
+        start = self.now()
+        loss = loss_of(problem, seen.color, seen.inverse_depth)
+        yield self.now() - start
+        start = self.now()
+        backward(problem, seen, loss, moving, 1, screen=True)
+        yield self.now() - start
+
+    def _parts_on_card(self, launch: Launch, problem: Problem) -> Iterator[float]:
+        """The same through autograd: an iteration on a card is launched as a whole."""
         start = self.now()
         leaves, rendered = self.forward()
         yield self.now() - start
         start = self.now()
         color = rendered.color.detach().requires_grad_()
-        loss = self.loss(color)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss = photometric_loss(color, problem.image, problem.mask, problem.lambda_ssim).loss
+        (loss if problem.share is None else loss * problem.share).backward()  # type: ignore[no-untyped-call]
         yield self.now() - start
         start = self.now()
         rendered.color.backward(color.grad)  # type: ignore[no-untyped-call]
-        yield self.now() - start
-        start = self.now()
-        self.adam(leaves, loss)
+        found = {name: leaf.grad for name, leaf in leaves.tensors().items() if leaf.grad is not None}
+        adam_step(launch, found, self.moving(), *BETAS, EPSILON, 1)
         yield self.now() - start
 
     def now(self) -> float:
@@ -192,7 +196,7 @@ def stages(case: Case, threads: int, repeats: int) -> Stages:
         step = TrainingStep(case, view)
         found = []
         for _ in range(repeats + 1):
-            step.rasterize()
+            step.iteration()
             found.append(_core.stages())
         medians.append([median(stage) * 1e3 for stage in zip(*found[1:], strict=True)])
     return Stages(*(fmean(stage) for stage in zip(*medians, strict=True)))

@@ -56,8 +56,7 @@ TIMES: tuple[tuple[str, Column], ...] = (
     *_CASE,
     ("forward ms", lambda row: row.times.forward),
     ("loss ms", lambda row: row.times.loss),
-    ("backward ms", lambda row: row.times.backward),
-    ("Adam ms", lambda row: row.times.adam),
+    ("backward, Adam ms", lambda row: row.times.backward),
     ("iteration ms", lambda row: row.times.iteration),
     ("rasterization %", lambda row: 100 * row.times.share),
     ("Mpx/s", lambda row: row.width * row.height / row.times.iteration / 1e3),
@@ -70,7 +69,7 @@ STAGES: tuple[tuple[str, Column], ...] = (
     ("order ms", lambda row: row.stages and row.stages.order),
     ("composite ms", lambda row: row.stages and row.stages.composite),
     ("composite back ms", lambda row: row.stages and row.stages.composite_backward),
-    ("project back ms", lambda row: row.stages and row.stages.project_backward),
+    ("project back, Adam ms", lambda row: row.stages and row.stages.project_backward),
 )
 
 

@@ -1,11 +1,11 @@
 // The kernels on plain arrays: C-contiguous, float32 unless said otherwise, checked for type and contiguity here.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
-#include <atomic>
-#include <bit>
+#include <array>
 #include <cmath>
 #include <limits>
 #include <memory>
@@ -39,7 +39,7 @@ template <class Scalar, class T>
 Out<Scalar> to_numpy(panolog::Buffer<T>&& buffer) {
   const size_t size = buffer.size * sizeof(T) / sizeof(Scalar);
   T* data = buffer.data.release();
-  nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+  nb::capsule owner(data, [](void* memory) noexcept { std::free(memory); });
   return Out<Scalar>(data, {size}, owner);
 }
 
@@ -55,13 +55,6 @@ panolog::Camera camera_of(const In<float>& rotation, const In<float>& translatio
 
 void expect(bool fits, const char* what) {
   if (!fits) throw std::invalid_argument(what);
-}
-
-// Whether no value is infinite or NaN: all bits of their exponents are set, and one more is a carry.
-bool all_finite(const float* values, int64_t begin, int64_t end) {
-  uint32_t carry = 0;
-  for (int64_t i = begin; i < end; ++i) carry |= (std::bit_cast<uint32_t>(values[i]) & 0x7f800000u) + 0x00800000u;
-  return !(carry & 0x80000000u);
 }
 
 constexpr size_t kSplatFloats = sizeof(panolog::Splat) / sizeof(float);
@@ -175,6 +168,64 @@ void bind_rasterize(nb::module_& m) {
       "Eq. 1. Writes the images and states; returns splats, rays, slots, entries and tiles for the backward pass.");
 }
 
+// Of means, quats, scales, opacities, sh0 and shN.
+using ParameterArrays = std::array<InOut<float>, panolog::kParameters>;
+
+// A parameter of a step, its moments, how many of its values move, its rate and that rate's units: panolog::Moving.
+using MovingArrays = std::tuple<InOut<float>, InOut<float>, InOut<float>, int64_t, float, std::optional<In<float>>>;
+
+// The parameters that move, β₁, β₂, ε and the number of the step.
+using StepArrays =
+    std::tuple<std::array<std::optional<MovingArrays>, panolog::kParameters>, float, float, float, int64_t>;
+
+panolog::Step step_of(const StepArrays& arrays, size_t count) {
+  const auto& [parameters, beta1, beta2, eps, number] = arrays;
+  panolog::Step step = {};
+  for (int k = 0; k < panolog::kParameters; ++k) {
+    if (!parameters[k]) continue;
+    const auto& [values, exp_avg, exp_avg_sq, moving, lr, units] = *parameters[k];
+    const int64_t stride = panolog::kParameterFloats[k];
+    expect(values.size() == count * stride && exp_avg.size() == values.size() && exp_avg_sq.size() == values.size() &&
+               0 <= moving && moving <= int64_t(values.size()) && (!units || units->size() == count),
+           "a parameter that moves, its moments or units are not of equally many Gaussians");
+    step.parameters[k] = {.values = values.data(),
+                          .exp_avg = exp_avg.data(),
+                          .exp_avg_sq = exp_avg_sq.data(),
+                          .count = moving,
+                          .stride = stride,
+                          .step = {.lr = lr,
+                                   .beta1 = beta1,
+                                   .beta2 = beta2,
+                                   .eps = eps,
+                                   .correction1 = float(1 - std::pow(double(beta1), double(number))),
+                                   .correction2 = float(1 - std::pow(double(beta2), double(number))),
+                                   .units = units ? units->data() : nullptr,
+                                   .values = stride}};
+  }
+  return step;
+}
+
+panolog::GradientArrays gradients_of(const std::optional<ParameterArrays>& out,
+                                     const std::optional<InOut<float>>& screen,
+                                     const std::optional<InOut<float>>& absolute,
+                                     const std::optional<InOut<double>>& motion, size_t count) {
+  for (int k = 0; out && k < panolog::kParameters; ++k)
+    expect((*out)[k].size() == count * panolog::kParameterFloats[k], "a gradient has not the size of its parameter");
+  expect((!screen || screen->size() == 2 * count) && (!absolute || absolute->size() == 2 * count) &&
+             (!motion || motion->size() == panolog::kMotionSums),
+         "the gradients of screen or motion have another size");
+  const auto at = [&](int k) { return out ? (*out)[k].data() : nullptr; };
+  return {.means = at(0),
+          .quats = at(1),
+          .scales = at(2),
+          .opacities = at(3),
+          .sh0 = at(4),
+          .shN = at(5),
+          .screen = screen ? screen->data() : nullptr,
+          .absolute = absolute ? absolute->data() : nullptr,
+          .motion = motion ? motion->data() : nullptr};
+}
+
 void bind_backward(nb::module_& m) {
   m.def(
       "rasterize_backward",
@@ -182,19 +233,22 @@ void bind_backward(nb::module_& m) {
          In<float> screen, In<float> rotation, In<float> translation, int width, int height, int sh_degree, float near,
          bool exact, int threads, In<float> color, In<float> alpha, In<float> inverse_depth, In<float> splats,
          In<float> rays, In<int32_t> slots, In<int32_t> entries, In<int32_t> tiles, In<float> grad_color,
-         In<float> grad_alpha, In<float> grad_inverse_depth, InOut<float> out_means, InOut<float> out_quats,
-         InOut<float> out_scales, InOut<float> out_opacities, InOut<float> out_sh0, InOut<float> out_shN,
-         InOut<float> out_screen, const std::optional<ExteriorArrays>& exterior,
-         std::optional<InOut<double>> out_motion, std::optional<InOut<float>> out_absolute) {
+         In<float> grad_alpha, In<float> grad_inverse_depth, const std::optional<ExteriorArrays>& exterior,
+         const std::optional<ParameterArrays>& out, std::optional<InOut<float>> out_screen,
+         std::optional<InOut<double>> out_motion, std::optional<InOut<float>> out_absolute,
+         const std::optional<StepArrays>& step) {
         const Model model{means, quats, scales, opacities, sh0, shN, screen};
         const panolog::Camera camera = camera_of(rotation, translation, width, height, near, exact);
         const size_t pixels = size_t(width) * height;
         expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
                    grad_color.size() == 3 * pixels && grad_alpha.size() == pixels &&
                    grad_inverse_depth.size() == pixels && slots.size() == opacities.size() + 1 &&
-                   (!out_motion || out_motion->size() == panolog::kMotionSums) &&
-                   (!out_absolute || (out_absolute->size() == 2 * opacities.size() && !exact)),
+                   !(out_absolute && exact),
                "the images or the frame are not those of the forward pass");
+        expect(bool(out) != bool(step), "gradients are written or take a step");
+        const panolog::GradientArrays gradients =
+            gradients_of(out, out_screen, out_absolute, out_motion, opacities.size());
+        panolog::Step taken = step ? step_of(*step, opacities.size()) : panolog::Step{};
         const std::optional<panolog::Exterior> frozen = view_of(exterior, camera);
         nb::gil_scoped_release release;
         const panolog::FrameView frame = {
@@ -210,23 +264,17 @@ void bind_backward(nb::module_& m) {
              .alpha = const_cast<float*>(alpha.data()),
              .inverse_depth = const_cast<float*>(inverse_depth.data())},
             {.color = grad_color.data(), .alpha = grad_alpha.data(), .inverse_depth = grad_inverse_depth.data()},
-            {.means = out_means.data(),
-             .quats = out_quats.data(),
-             .scales = out_scales.data(),
-             .opacities = out_opacities.data(),
-             .sh0 = out_sh0.data(),
-             .shN = out_shN.data(),
-             .screen = out_screen.data(),
-             .absolute = out_absolute ? out_absolute->data() : nullptr,
-             .motion = out_motion ? out_motion->data() : nullptr});
+            gradients, step ? &taken : nullptr);
+        return taken.broken;
       },
       "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "rotation"_a, "translation"_a,
       "width"_a, "height"_a, "sh_degree"_a, "near"_a, "exact"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a,
       "splats"_a, "rays"_a, "slots"_a, "entries"_a, "tiles"_a, "grad_color"_a, "grad_alpha"_a, "grad_inverse_depth"_a,
-      "out_means"_a, "out_quats"_a, "out_scales"_a, "out_opacities"_a, "out_sh0"_a, "out_shN"_a, "out_screen"_a,
-      "exterior"_a.none(), "out_motion"_a = nb::none(), "out_absolute"_a = nb::none(),
-      "Writes the gradients of the parameters and, with out_motion, the sums of camera motion and, with out_absolute, "
-      "absolute gradients of affine splats (csrc/gradients.h), from those of the three images.");
+      "exterior"_a.none(), "out"_a = nb::none(), "out_screen"_a = nb::none(), "out_motion"_a = nb::none(),
+      "out_absolute"_a = nb::none(), "step"_a = nb::none(),
+      "From the gradients of the three images writes those of the parameters, or moves these by a step of Adam, and "
+      "returns a bit for each whose gradient is not finite. With out_screen, out_motion and out_absolute also those of "
+      "the pixels, the sums of camera motion, and absolute gradients of affine splats (csrc/gradients.h).");
 }
 
 void bind_bake(nb::module_& m) {
@@ -305,35 +353,6 @@ void bind_losses(nb::module_& m) {
       "Returns the mean over valid pixels (eq. 5); writes its gradient.");
 }
 
-void bind_adam(nb::module_& m) {
-  m.def(
-      "adam",
-      [](InOut<float> parameter, In<float> gradient, InOut<float> exp_avg, InOut<float> exp_avg_sq, int64_t count,
-         float lr, float beta1, float beta2, float eps, int64_t step, int threads, std::optional<In<float>> units) {
-        nb::gil_scoped_release release;
-        const panolog::AdamStep state = {.lr = lr,
-                                         .beta1 = beta1,
-                                         .beta2 = beta2,
-                                         .eps = eps,
-                                         .correction1 = float(1 - std::pow(double(beta1), double(step))),
-                                         .correction2 = float(1 - std::pow(double(beta2), double(step))),
-                                         .units = units ? units->data() : nullptr,
-                                         .values = units ? int64_t(parameter.size() / units->size()) : 0};
-        std::atomic<bool> broken{false};
-        panolog::each_span(count, threads, 1 << 15, [&](int64_t begin, int64_t end) {
-          if (all_finite(gradient.data(), begin, end))
-            panolog::kernels().adam(state, begin, end, gradient.data(), parameter.data(), exp_avg.data(),
-                                    exp_avg_sq.data());
-          else
-            broken = true;
-        });
-        return broken.load();
-      },
-      "parameter"_a, "gradient"_a, "exp_avg"_a, "exp_avg_sq"_a, "count"_a, "lr"_a, "beta1"_a, "beta2"_a, "eps"_a,
-      "step"_a, "threads"_a, "units"_a = nb::none(),
-      "One step on the first `count` values, in place. Returns whether a value of their gradient is not finite.");
-}
-
 }  // namespace
 
 NB_MODULE(_core, m) {
@@ -343,5 +362,4 @@ NB_MODULE(_core, m) {
   bind_backward(m);
   bind_bake(m);
   bind_losses(m);
-  bind_adam(m);
 }

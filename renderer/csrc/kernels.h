@@ -13,12 +13,22 @@ constexpr int kWindowRadius = 5;  // of SSIM
 struct GaussianArrays {  // N Gaussians, row-major
   const float *means, *quats, *scales, *opacities, *sh0, *shN, *screen;
   int64_t count;
+  GaussianArrays from(int64_t row) const {
+    return {means + 3 * row, quats + 4 * row, scales + 3 * row, opacities + row,
+            sh0 + 3 * row,   shN + 45 * row,  screen + 2 * row, count - row};
+  }
 };
 
 struct GradientArrays {  // the same shapes
   float *means, *quats, *scales, *opacities, *sh0, *shN, *screen;
-  float* absolute;  // null, or as `screen`: of ParameterGradients
-  double* motion;   // null, or kMotionSums: to which is added
+  float* absolute;                          // null, or as `screen`: of ParameterGradients
+  double* motion;                           // null, or kMotionSums: to which is added
+  bool streaming = false;                   // whether they are written past the caches
+  GradientArrays from(int64_t row) const {  // those that are there
+    const auto at = [row](float* array, int64_t stride) { return array ? array + stride * row : nullptr; };
+    return {at(means, 3), at(quats, 4),  at(scales, 3),   at(opacities, 1), at(sh0, 3),
+            at(shN, 45),  at(screen, 2), at(absolute, 2), motion,           streaming};
+  }
 };
 
 constexpr int kTileRoom = 4;
@@ -82,17 +92,16 @@ struct Kernels {
   // Gaussians [begin, end): splats and states (eq. 2, appendix B)
   void (*project)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, Splat*,
                   uint8_t* state);
-  // Gaussians [begin, end): their gradients, sums of what the tiles wrote to their slots; 0 without slots
-  void (*project_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, const Splat*,
+  // The first `count` Gaussians: their gradients, sums of what the tiles wrote to their slots; 0 without slots
+  void (*project_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t count, const Splat*,
                            const uint32_t* slots, const SplatGradient* parts, const GradientArrays&);
-  void (*project_absolute_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end,
-                                    const Splat*, const uint32_t* slots, const AbsoluteGradient* parts,
-                                    const GradientArrays&);
+  void (*project_absolute_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t count, const Splat*,
+                                    const uint32_t* slots, const AbsoluteGradient* parts, const GradientArrays&);
   // The same with exact projection
   void (*project_rays)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, Splat*,
                        RaySplat*, uint8_t* state);
-  void (*project_rays_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end,
-                                const Splat*, const uint32_t* slots, const RayGradient* parts, const GradientArrays&);
+  void (*project_rays_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t count, const Splat*,
+                                const uint32_t* slots, const RayGradient* parts, const GradientArrays&);
   // Of up to sixteen splats in turn the tiles with a pixel centre inside the footprint, exact for elongated ones,
   // periodic in u; those without state, if that is given, have none. Returns how many in all, and in `many` of each.
   // `tiles` has room for all tiles of the image sixteen times and kTileRoom more.
@@ -125,7 +134,8 @@ struct Kernels {
   // The loss's gradient from those derivatives, spread over their windows, and the L1 part.
   void (*gradient_row)(const float* const by[3], const float* x, const float* y, const uint8_t* counts, int count,
                        float l1_weight, float* out);
-  void (*adam)(const AdamStep&, int64_t begin, int64_t end, const float* gradient, float* parameter, float* exp_avg,
+  // The first `count` values, in place. Whether all of their gradient is finite; else they are invalid.
+  bool (*adam)(const AdamStep&, int64_t count, const float* gradient, float* parameter, float* exp_avg,
                float* exp_avg_sq);
 };
 

@@ -1,233 +1,22 @@
 #include "rasterize.h"
 
 #include <algorithm>
-#include <array>
 #include <atomic>
-#include <chrono>
-#include <cmath>
 #include <cstring>
 #include <functional>
-#include <stdexcept>
+#include <new>
 #include <type_traits>
-#include <utility>
 #include <vector>
+
+#include "directions.h"
+#include "stopwatch.h"
+
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 
 namespace panolog {
 namespace {
-
-constexpr int64_t kSpan = 1024;  // Gaussians per unit of work of a thread
-constexpr size_t kMaxPairs = size_t(1) << 31;
-constexpr int64_t kParts = 4;   // per thread, of loops whose parts have tables of their own
-constexpr int64_t kAhead = 12;  // prefetch distance of reads in the order of depth
-
-// Contiguous parts of `count` items that threads share: few, because each has a table of its own.
-struct Parts {
-  int64_t count, parts;
-  Parts(int64_t count, int threads)
-      : count(count), parts(std::clamp<int64_t>(count / kSpan, 1, threads == 1 ? 1 : threads * kParts)) {}
-  int64_t begin(int64_t part) const { return count * part / parts; }
-};
-
-// The visible ones of `count` Gaussians and all splats of the exterior, nearest first; those at equal distance in the
-// order of their rows. A radix sort, least significant digit first, 11 bits at a time: positive floats order as their
-// bits do.
-Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_t count, int64_t exterior,
-                               int threads) {
-  struct Item {
-    uint32_t key, row;
-  };
-  using Table = std::array<uint32_t, 2048>;
-  const Parts all(count, threads);
-  std::vector<size_t> first(all.parts + 1);  // of each part among the visible ones
-  for (int64_t part = 0; part < all.parts; ++part)
-    first[part + 1] = first[part] + std::count(state + all.begin(part), state + all.begin(part + 1), uint8_t(kVisible));
-  const size_t own = first.back(), visible = own + size_t(exterior);
-  Buffer<Item> items(visible), other(visible);
-  const auto put = [&](size_t at, int64_t row) {
-    std::memcpy(&items[at].key, &splats[row].distance, sizeof(float));
-    items[at].row = uint32_t(row);
-  };
-  share(all.parts, threads, [&](int64_t part) {
-    size_t next = first[part];
-    for (int64_t i = all.begin(part); i < all.begin(part + 1); ++i)
-      if (state[i] == kVisible) put(next++, i);
-  });
-  for (int64_t i = 0; i < exterior; ++i) put(own + size_t(i), count + i);
-  const Parts ranges(int64_t(visible), threads);
-  std::vector<Table> tables(ranges.parts);  // of each digit: how many there are in the part, then where they go
-  for (int shift = 0; shift < 32; shift += 11) {
-    share(ranges.parts, threads, [&](int64_t part) {
-      tables[part].fill(0);
-      for (int64_t i = ranges.begin(part); i < ranges.begin(part + 1); ++i)
-        ++tables[part][items[i].key >> shift & 2047];
-    });
-    uint32_t sum = 0;
-    for (size_t digit = 0; digit < 2048; ++digit)
-      for (Table& table : tables) sum += table[digit], table[digit] = sum - table[digit];
-    share(ranges.parts, threads, [&](int64_t part) {
-      for (int64_t i = ranges.begin(part); i < ranges.begin(part + 1); ++i)
-        other[tables[part][items[i].key >> shift & 2047]++] = items[i];
-    });
-    std::swap(items, other);
-  }
-  Buffer<uint32_t> rows(visible);
-  for (size_t i = 0; i < visible; ++i) rows[i] = items[i].row;
-  return rows;
-}
-
-// Directions on a grid of `step` pixels, which covers whole tiles: `Grid` over memory of its own.
-class Directions {
- public:
-  Directions() = default;  // none, as affine projection needs
-  Directions(const Camera& camera, int step) {
-    const int columns = tiles_across(camera.width) * kTile / step, rows = tiles_across(camera.height) * kTile / step;
-    const auto angles = [&](int count, double turn, double middle, std::vector<float>& sines,
-                            std::vector<float>& cosines) {
-      for (int i = 0; i < count; ++i) {
-        const double angle = turn * ((i + 0.5) * step - middle);
-        sines.push_back(float(std::sin(angle))), cosines.push_back(float(std::cos(angle)));
-      }
-    };
-    constexpr double kPiExact = 3.14159265358979323846;
-    angles(columns, 2 * kPiExact / camera.width, 0.5 * camera.width, sin_u_, cos_u_);
-    angles(rows, kPiExact / camera.height, 0.5 * camera.height, sin_v_, cos_v_);
-  }
-  Grid grid() const { return {sin_u_.data(), cos_u_.data(), sin_v_.data(), cos_v_.data()}; }
-
- private:
-  std::vector<float> sin_u_, cos_u_, sin_v_, cos_v_;
-};
-
-// Of a splat's tiles those in which it composites; returns how many.
-uint32_t drawn_tiles(const Exterior& exterior, bool frozen, float distance, const uint32_t* from, uint32_t count,
-                     uint32_t* to) {
-  uint32_t left = 0;
-  for (uint32_t k = 0; k < count; ++k) {
-    const uint32_t tile = from[k];
-    const float* span = exterior.spans + 2 * tile;
-    const bool among = !frozen || (span[0] <= distance && distance <= span[1]);
-    to[left] = tile, left += exterior.places[tile] >= 0 && among;
-  }
-  return left;
-}
-
-// The tiles of each splat, row by row.
-struct Pairs {
-  Buffer<uint32_t> starts;      // rows + 1
-  std::vector<uint32_t> tiles;  // those of row i: starts[i] .. starts[i + 1]
-};
-
-// The tiles of a span of splats, the first of which are own ones with a state.
-class TileFinder {
- public:
-  TileFinder(const Camera& camera, const Frame& frame, const uint8_t* state, int64_t gaussians,
-             const Exterior* exterior)
-      : camera_(camera),
-        frame_(frame),
-        state_(state),
-        gaussians_(gaussians),
-        exterior_(exterior),
-        middles_(camera.exact ? Directions(camera, kTile) : Directions()),
-        room_(size_t(kAtOnce) * tiles_across(camera.width) * tiles_across(camera.height) + kTileRoom) {}
-
-  // Appends the tiles of splats begin .. end to `tiles`, and writes how many each has to `many`.
-  void find(int64_t begin, int64_t end, std::vector<uint32_t>& tiles, uint32_t* many) const {
-    Buffer<uint32_t> found(room_);
-    for (int64_t at = begin, count; at < end; at += count) {
-      count = std::min<int64_t>(kAtOnce, (at < gaussians_ ? std::min(end, gaussians_) : end) - at);
-      const uint8_t* state = at < gaussians_ ? state_ + at : nullptr;
-      const Splat* splats = frame_.splats.data.get() + at;
-      uint32_t total = camera_.exact
-                           ? kernels().ray_tiles_of(splats, frame_.rays.data.get() + at, state, int(count), camera_,
-                                                    middles_.grid(), found.data.get(), many + at)
-                           : kernels().tiles_of(splats, state, int(count), camera_, found.data.get(), many + at);
-      if (exterior_) total = drawn(at, splats, int(count), found.data.get(), many + at);
-      tiles.insert(tiles.end(), found.data.get(), found.data.get() + total);
-      if (tiles.size() > kMaxPairs) break;
-    }
-  }
-
- private:
-  static constexpr int kAtOnce = 16;
-  uint32_t drawn(int64_t at, const Splat* splats, int count, uint32_t* found, uint32_t* many) const {
-    uint32_t from = 0, to = 0;
-    for (int i = 0; i < count; ++i) {
-      const uint32_t all = many[i];
-      many[i] = drawn_tiles(*exterior_, at >= gaussians_, splats[i].distance, found + from, all, found + to);
-      from += all, to += many[i];
-    }
-    return to;
-  }
-  const Camera& camera_;
-  const Frame& frame_;
-  const uint8_t* state_;
-  int64_t gaussians_;
-  const Exterior* exterior_;
-  Directions middles_;
-  size_t room_;
-};
-
-Pairs find_tiles(const Camera& camera, const Frame& frame, const uint8_t* state, int64_t gaussians, int threads,
-                 const Exterior* exterior) {
-  const int64_t rows = int64_t(frame.splats.size);
-  const TileFinder finder(camera, frame, state, gaussians, exterior);
-  Pairs pairs{Buffer<uint32_t>(rows + 1), {}};
-  const Parts parts(rows, threads);
-  std::vector<std::vector<uint32_t>> found(parts.parts);
-  std::atomic<size_t> total{0};
-  share(parts.parts, threads, [&](int64_t part) {
-    finder.find(parts.begin(part), parts.begin(part + 1), found[part], pairs.starts.data.get() + 1);
-    total += found[part].size();
-  });
-  if (total > kMaxPairs) throw std::length_error("more than 2^31 pairs of splats and tiles: too many, or too large");
-  pairs.starts[0] = 0;
-  for (int64_t i = 0; i < rows; ++i) pairs.starts[i + 1] += pairs.starts[i];
-  pairs.tiles = std::move(found[0]);
-  if (parts.parts == 1) return pairs;
-  pairs.tiles.resize(total);
-  share(parts.parts - 1, threads, [&](int64_t before) {
-    const int64_t part = before + 1;
-    std::copy(found[part].begin(), found[part].end(), pairs.tiles.data() + pairs.starts[parts.begin(part)]);
-  });
-  return pairs;
-}
-
-// Counting sort of (tile, splat) pairs by tile; splats come nearest first, so each tile's entries do too.
-// Each part bins a contiguous range of splats: the result does not depend on how many there are.
-void bin(const Camera& camera, int64_t gaussians, const Buffer<uint32_t>& rows, const Pairs& pairs, int threads,
-         Frame& frame) {
-  const size_t tiles = size_t(tiles_across(camera.width)) * tiles_across(camera.height);
-  const Parts parts(int64_t(rows.size), threads);
-  std::vector<std::vector<uint32_t>> places(parts.parts);  // of each tile: how many entries the part has, then where
-  const uint32_t *starts = pairs.starts.data.get(), *tile_of = pairs.tiles.data();
-  share(parts.parts, threads, [&](int64_t part) {
-    places[part].assign(tiles, 0);
-    if (parts.parts == 1)  // all splats: in the order of memory
-      for (size_t pair = 0; pair < pairs.tiles.size(); ++pair) ++places[0][tile_of[pair]];
-    else
-      for (int64_t i = parts.begin(part); i < parts.begin(part + 1); ++i)
-        for (uint32_t pair = starts[rows[i]]; pair < starts[rows[i] + 1]; ++pair) ++places[part][tile_of[pair]];
-  });
-  frame.tiles = Buffer<uint32_t>(tiles + 1);
-  uint32_t sum = frame.tiles[0] = 0;
-  for (size_t tile = 0; tile < tiles; ++tile) {
-    for (auto& place : places) sum += place[tile], place[tile] = sum - place[tile];
-    frame.tiles[tile + 1] = sum;
-  }
-  frame.entries = Buffer<Entry>(pairs.tiles.size());
-  share(parts.parts, threads, [&](int64_t part) {
-    uint32_t* const place = places[part].data();
-    const int64_t end = parts.begin(part + 1);
-    for (int64_t i = parts.begin(part); i < end; ++i) {
-      if (i + 2 * kAhead < end) __builtin_prefetch(&starts[rows[i + 2 * kAhead]]);
-      if (i + kAhead < end) __builtin_prefetch(&tile_of[starts[rows[i + kAhead]]]);
-      const uint32_t row = rows[i];
-      const bool own = row < gaussians;
-      for (uint32_t pair = starts[row]; pair < starts[row + 1]; ++pair)
-        frame.entries[place[tile_of[pair]]++] = {row, own ? pair : kNoSlot, 0};
-    }
-  });
-}
 
 bool runs_here(const Kernels& kernels) {
 #if defined(__x86_64__)
@@ -265,43 +54,16 @@ bool choose_kernels(const char* name) {
 
 Stages latest;
 
-namespace {
-
-class Stopwatch {
- public:
-  void lap(double& seconds) {
-    const Clock::time_point now = Clock::now();
-    seconds = std::chrono::duration<double>(now - last_).count(), last_ = now;
-  }
-
- private:
-  using Clock = std::chrono::steady_clock;
-  Clock::time_point last_ = Clock::now();
-};
-
-}  // namespace
-
-void order(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, const Exterior* exterior,
-           Frame& frame, uint8_t* state) {
-  Stopwatch watch;
-  const int64_t frozen = exterior ? exterior->count : 0;
-  frame.splats = Buffer<Splat>(gaussians.count + frozen);
-  if (camera.exact) frame.rays = Buffer<RaySplat>(gaussians.count + frozen);
-  Splat* splats = frame.splats.data.get();
-  each_span(gaussians.count, threads, kSpan, [&](int64_t begin, int64_t end) {
-    if (camera.exact)
-      kernels().project_rays(gaussians, camera, sh_count, begin, end, splats, frame.rays.data.get(), state);
-    else
-      kernels().project(gaussians, camera, sh_count, begin, end, splats, state);
-  });
-  if (frozen) std::copy_n(exterior->splats, frozen, splats + gaussians.count);
-  if (frozen && camera.exact) std::copy_n(exterior->rays, frozen, frame.rays.data.get() + gaussians.count);
-  watch.lap(latest.project);
-  Pairs pairs = find_tiles(camera, frame, state, gaussians.count, threads, exterior);
-  const Buffer<uint32_t> rows = nearest_first(splats, state, gaussians.count, frozen, threads);
-  bin(camera, gaussians.count, rows, pairs, threads, frame);
-  frame.slots = std::move(pairs.starts), frame.slots.size = gaussians.count + 1;
-  watch.lap(latest.order);
+void* allocate(size_t bytes) {
+  constexpr size_t kLine = 64, kLarge = size_t(1) << 21;  // of x86 and of ARM with pages of 4 KiB
+  const size_t step = bytes >= 4 * kLarge ? kLarge : kLine,
+               whole = (std::max<size_t>(bytes, 1) + step - 1) / step * step;
+  void* const memory = std::aligned_alloc(step, whole);
+  if (!memory) throw std::bad_alloc();
+#if defined(__linux__)
+  if (step == kLarge) madvise(memory, whole, MADV_HUGEPAGE);  // a wish: nothing depends on it
+#endif
+  return memory;
 }
 
 void each_tile(const Camera& camera, const FrameView& frame, int threads, const Exterior* exterior,
@@ -356,22 +118,47 @@ void backward(const GaussianArrays& gaussians, const Camera& camera, int threads
   watch.lap(latest.project_backward);
 }
 
+// The gradients of the parameters of a span: they stay in a cache until the step has used them.
+struct SpanGradients {
+  alignas(64) float means[3 * kSpan], quats[4 * kSpan], scales[3 * kSpan], opacities[kSpan], sh0[3 * kSpan];
+  alignas(64) float shN[45 * kSpan];
+
+  GradientArrays with(GradientArrays others) {
+    others.means = means, others.quats = quats, others.scales = scales, others.opacities = opacities;
+    others.sh0 = sh0, others.shN = shN;
+    return others;
+  }
+};
+
+// From as many Gaussians on their gradients are larger than most caches, and only a later pass reads them: writing them
+// past the caches saves reading those lines first.
+constexpr int64_t kStreamed = 1 << 18;
+
 }  // namespace
 
 void rasterize_backward(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads,
                         const Exterior* exterior, const FrameView& frame, const Images& images,
-                        const ImageGradients& image_gradients, const GradientArrays& gradients) {
+                        const ImageGradients& image_gradients, const GradientArrays& gradients, Step* step) {
   const int64_t spans = (gaussians.count + kSpan - 1) / kSpan;
   std::vector<double> motion(gradients.motion ? kMotionSums * spans : 0);  // of each span
+  std::atomic<uint32_t> broken{0};
   const auto pass = [&](auto tile_backward, auto project_backward, auto* sums) {
     using Sums = std::remove_pointer_t<decltype(sums)>;
     backward<Sums>(
         gaussians, camera, threads, exterior, frame,
         [&](const TileInput& tile, Sums* parts) { tile_backward(tile, images, image_gradients, parts); },
         [&](int64_t begin, int64_t end, const Sums* parts) {
-          GradientArrays out = gradients;
+          GradientArrays out = gradients.from(begin);
+          out.streaming = !step && gaussians.count >= kStreamed;
           if (out.motion) out.motion = &motion[kMotionSums * (begin / kSpan)];
-          project_backward(gaussians, camera, sh_count, begin, end, frame.splats, frame.slots, parts, out);
+          const auto into = [&](const GradientArrays& arrays) {
+            project_backward(gaussians.from(begin), camera, sh_count, end - begin, frame.splats + begin,
+                             frame.slots + begin, parts, arrays);
+          };
+          if (!step) return into(out);
+          SpanGradients found;
+          into(found.with(out));
+          broken |= step->take(found.with(out), begin, end - begin);
         });
   };
   const Kernels& k = kernels();
@@ -381,10 +168,20 @@ void rasterize_backward(const GaussianArrays& gaussians, const Camera& camera, i
     pass(k.tile_absolute_backward, k.project_absolute_backward, static_cast<AbsoluteGradient*>(nullptr));
   else
     pass(k.tile_backward, k.project_backward, static_cast<SplatGradient*>(nullptr));
+  if (step) step->broken = broken;
   if (gradients.motion) {
     std::fill_n(gradients.motion, kMotionSums, 0);
     for (size_t i = 0; i < motion.size(); ++i) gradients.motion[i % kMotionSums] += motion[i];
   }
+}
+
+uint32_t Step::take(const GradientArrays& found, int64_t row, int64_t rows) const {
+  const float* const gradients[kParameters] = {found.means,     found.quats, found.scales,
+                                               found.opacities, found.sh0,   found.shN};
+  uint32_t bad = 0;
+  for (int k = 0; k < kParameters; ++k)
+    if (!move_rows(parameters[k], gradients[k], row, rows)) bad |= 1u << k;
+  return bad;
 }
 
 }  // namespace panolog

@@ -2,21 +2,31 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
+#include <cstdlib>
 #include <functional>
 #include <memory>
 
+#include "adam.h"
 #include "kernels.h"
 #include "team.h"
 
 namespace panolog {
 
+// Memory of at least `bytes`, aligned to 64; of large pages where there is much of it: splats are read in any order.
+// Throws std::bad_alloc.
+void* allocate(size_t bytes);
+
+struct Free {
+  void operator()(void* memory) const { std::free(memory); }
+};
+
 // Memory whose values are all about to be written: no time is spent on zeros.
 template <class T>
 struct Buffer {
-  std::unique_ptr<T[]> data;
+  std::unique_ptr<T[], Free> data;
   size_t size = 0;
   Buffer() = default;
-  explicit Buffer(size_t size) : data(new T[size]), size(size) {}
+  explicit Buffer(size_t size) : data(static_cast<T*>(allocate(size * sizeof(T)))), size(size) {}
   T& operator[](size_t i) { return data[i]; }
   const T& operator[](size_t i) const { return data[i]; }
 };
@@ -58,6 +68,18 @@ struct Stages {
 };
 extern Stages latest;
 
+constexpr int64_t kSpan = 1024;  // Gaussians per unit of work of a thread
+constexpr int kParameters = 6;   // means, quats, scales, opacities, sh0, shN
+constexpr int kParameterFloats[kParameters] = {3, 4, 3, 1, 3, 45};
+
+// A step of Adam in a backward pass: the gradients of the parameters need no memory.
+struct Step {
+  Moving parameters[kParameters];
+  uint32_t broken = 0;  // a bit for each of them: whether its gradient was not finite; then all are invalid
+  // Returns such bits of these rows.
+  uint32_t take(const GradientArrays& found, int64_t row, int64_t rows) const;
+};
+
 // Fills `frame` and state (N, of State). Throws std::length_error beyond 2³¹ tile entries.
 void order(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, const Exterior* exterior,
            Frame& frame, uint8_t* state);
@@ -70,8 +92,9 @@ void each_tile(const Camera& camera, const FrameView& frame, int threads, const 
 void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads,
                const Exterior* exterior, Frame& frame, const Images& images, uint8_t* state);
 
+// With a step the parameters move, and of the gradients only `screen`, `absolute` and `motion` are written.
 void rasterize_backward(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads,
                         const Exterior* exterior, const FrameView& frame, const Images& images,
-                        const ImageGradients& image_gradients, const GradientArrays& gradients);
+                        const ImageGradients& image_gradients, const GradientArrays& gradients, Step* step = nullptr);
 
 }  // namespace panolog

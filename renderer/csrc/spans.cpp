@@ -33,6 +33,16 @@ void fetch(const float* from, int64_t row, int stride) {
   for (int i = 0; i < stride * kLanes * int(sizeof(float)); i += 64) __builtin_prefetch(first + i);
 }
 
+// Whether each lane has a row of its own.
+bool whole(const Rows& rows) { return rows.row[kLanes - 1] - rows.row[0] == kLanes - 1; }
+
+// Sixteen rows in turn from `out` on, which is aligned to 64 bytes, past the caches.
+void stream_rows(const F* columns, int stride, float* out) {
+  alignas(64) float block[45 * kLanes];
+  scatter(columns, rows_from(0, kLanes), stride, stride, block);
+  for (int i = 0; i < stride * kLanes; i += kLanes) stream(out + i, load(block + i));
+}
+
 Parameters<F> parameters(const GaussianArrays& g, const Rows& rows, int sh_count, Sixteen& to) {
   if (const int64_t next = rows.row[0] + kNext; next + kLanes <= g.count) {
     fetch(g.means, next, 3), fetch(g.quats, next, 4), fetch(g.scales, next, 3), fetch(g.sh0, next, 3);
@@ -44,28 +54,17 @@ Parameters<F> parameters(const GaussianArrays& g, const Rows& rows, int sh_count
   return {to.mean, to.quat, to.scale, to.opacity, to.sh0, to.shN};
 }
 
-// From as many Gaussians on their gradients are larger than most caches, and only a later pass reads them: writing them
-// past the caches saves reading those lines first.
-constexpr int64_t kStreamed = 1 << 18;
-
-// Sixteen rows in turn from `out` on, which is aligned to 64 bytes, past the caches.
-void stream_rows(const F* columns, int stride, float* out) {
-  alignas(64) float block[45 * kLanes];
-  scatter(columns, rows_from(0, kLanes), stride, stride, block);
-  for (int i = 0; i < stride * kLanes; i += kLanes) stream(out + i, load(block + i));
-}
-
-void write(const Sixteen& from, const Rows& rows, bool streaming, const GradientArrays& out) {
+void write(const Sixteen& from, const Rows& rows, const GradientArrays& out) {
   const auto put = [&](const F* columns, int stride, float* to) {
     float* const first = to + stride * rows.row[0];
-    if (streaming && rows.row[kLanes - 1] - rows.row[0] == kLanes - 1 && uintptr_t(first) % 64 == 0)
+    if (out.streaming && whole(rows) && uintptr_t(first) % 64 == 0)
       stream_rows(columns, stride, first);
     else
       scatter(columns, rows, stride, stride, to);
   };
   put(from.mean, 3, out.means), put(from.quat, 4, out.quats), put(from.scale, 3, out.scales);
   put(&from.opacity, 1, out.opacities), put(from.sh0, 3, out.sh0), put(from.shN, 45, out.shN);
-  put(from.screen, 2, out.screen);
+  if (out.screen) put(from.screen, 2, out.screen);
   if (out.absolute) put(from.absolute, 2, out.absolute);
 }
 
@@ -104,14 +103,21 @@ struct MotionSums {
   }
 };
 
-void note_states(const Visibility<F>& seen, const Rows& rows, const Camera& camera, const Splat* splats,
+void note_states(const Visibility<F>& seen, const Rows& rows, const SplatOf<F>& s, const Camera& camera,
                  uint8_t* state) {
   const uint32_t visible = bits(seen.visible), invalid = bits(seen.invalid);
-  for (int lane = 0; lane < kLanes; ++lane) {
-    const int64_t i = rows.row[lane];
-    const bool drawn = (visible >> lane & 1) && !above_or_below(splats[i], camera);
-    state[i] = drawn ? kVisible : invalid >> lane & 1 ? kInvalid : kHidden;
-  }
+  const Mask beyond = s.v + s.reach<0.5f, below = s.v - s.reach> F(camera.height - 0.5f);  // as above_or_below
+  const uint32_t drawn = visible & ~bits(beyond | below);
+  for (int lane = 0; lane < kLanes; ++lane)
+    state[rows.row[lane]] = drawn >> lane & 1 ? kVisible : invalid >> lane & 1 ? kInvalid : kHidden;
+}
+
+// Sixteen rows of a cache line each, past the caches: they are read when all are there.
+void write_lines(const F* columns, const Rows& rows, float* to) {
+  if (whole(rows))
+    stream_rows(columns, kSplatFloats, to + kSplatFloats * rows.row[0]);
+  else
+    scatter(columns, rows, kSplatFloats, kSplatFloats, to);
 }
 
 void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
@@ -123,9 +129,10 @@ void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, i
     const Parameters<F> p = parameters(g, rows, sh_count, from);
     gather(g.screen, rows, 2, 2, from.screen);
     const Visibility<F> seen = project(p, camera, sh_count, from.screen, s);
-    scatter(&s.u, rows, kSplatFloats, kSplatFloats, reinterpret_cast<float*>(splats));
-    note_states(seen, rows, camera, splats, state);
+    note_states(seen, rows, s, camera, state);
+    write_lines(&s.u, rows, reinterpret_cast<float*>(splats));
   }
+  streamed();
 }
 
 void project_rays_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
@@ -136,10 +143,11 @@ void project_rays_span(const GaussianArrays& g, const Camera& camera, int sh_cou
   for (int64_t at = begin; at < end; at += kLanes) {
     const Rows rows = rows_from(at, end);
     const Visibility<F> seen = project_ray(parameters(g, rows, sh_count, from), camera, sh_count, s, ray);
-    scatter(&s.u, rows, kSplatFloats, kSplatFloats, reinterpret_cast<float*>(splats));
-    scatter(ray.x, rows, kSplatFloats, kSplatFloats, reinterpret_cast<float*>(rays));
-    note_states(seen, rows, camera, splats, state);
+    note_states(seen, rows, s, camera, state);
+    write_lines(&s.u, rows, reinterpret_cast<float*>(splats));
+    write_lines(ray.x, rows, reinterpret_cast<float*>(rays));
   }
+  streamed();
 }
 
 // Of structs of floats. Most splats have one part or two: no branch depends on which.
@@ -158,7 +166,7 @@ Sums sum_of_parts(const Sums* part, int64_t count) {
 }
 
 template <template <class> class SumsOf>
-void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
+void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t count,
                            const Splat* splats, const uint32_t* slots, const SumsOf<float>* parts,
                            const GradientArrays& out) {
   constexpr int kFloats = sizeof(SumsOf<float>) / sizeof(float);
@@ -169,8 +177,8 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
   const ParameterGradients<F> gradients = {to.mean,     to.quat,     to.scale,
                                            &to.opacity, to.sh0,      to.shN,
                                            to.screen,   to.absolute, out.motion ? to.motion : nullptr};
-  for (int64_t at = begin; at < end; at += kLanes) {
-    const Rows rows = rows_from(at, end);
+  for (int64_t at = 0; at < count; at += kLanes) {
+    const Rows rows = rows_from(at, count);
     alignas(64) float met[kLanes];
     SumsOf<float> totals[kLanes];
     Rows own;
@@ -179,7 +187,7 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
       totals[lane] = sum_of_parts(parts + first, last - first);
       met[lane] = float(last - first), own.row[lane] = lane;
     }
-    if (at + kNext + kLanes <= end) fetch(reinterpret_cast<const float*>(splats), at + kNext, kSplatFloats);
+    if (at + kNext + kLanes <= g.count) fetch(reinterpret_cast<const float*>(splats), at + kNext, kSplatFloats);
     const Mask drawn = load(met) > 0;
     if (bits(drawn)) {
       gather(reinterpret_cast<const float*>(splats), rows, kSplatFloats, kSplatFloats, &s.u);
@@ -189,9 +197,9 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
     keep_all(drawn, to);
     if (out.motion && bits(drawn)) {
       for (F& x : to.motion) x = keep(drawn, x);
-      motion.add(to.motion, end - at < kLanes ? int(end - at) : kLanes);
+      motion.add(to.motion, count - at < kLanes ? int(count - at) : kLanes);
     }
-    write(to, rows, g.count >= kStreamed, out);
+    write(to, rows, out);
   }
   if (out.motion) motion.add_to(out.motion);
   streamed();
@@ -310,20 +318,25 @@ void gradient_row(const float* const by[3], const float* x, const float* y, cons
     for (int i = 0; i < count; ++i) out[i] = counts[i] ? out[i] : 0.0f;
 }
 
-void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict gradient, float* __restrict parameter,
+bool adam(const AdamStep& s, int64_t count, const float* __restrict gradient, float* __restrict parameter,
           float* __restrict exp_avg, float* __restrict exp_avg_sq) {
   const float rate = s.lr / s.correction1, root = 1 / sqrtf(s.correction2);
+  uint32_t carry = 0;  // of infinite and NaN all bits of the exponent are set, and one more is a carry
   const auto step = [&](int64_t i, float unit) {
     const float g = gradient[i];
+    uint32_t bits;
+    __builtin_memcpy(&bits, &g, sizeof bits);
+    carry |= (bits & 0x7f800000u) + 0x00800000u;
     exp_avg[i] = s.beta1 * exp_avg[i] + (1 - s.beta1) * g;
     exp_avg_sq[i] = s.beta2 * exp_avg_sq[i] + (1 - s.beta2) * g * g;
     parameter[i] -= unit * rate * exp_avg[i] / (sqrtf(exp_avg_sq[i]) * root + s.eps);
   };
-  const int64_t values = s.units ? s.values : end;
-  for (int64_t i = begin; i < end;) {
-    const int64_t row = i / values, next = (row + 1) * values, last = next < end ? next : end;
+  const int64_t values = s.units ? s.values : count;
+  for (int64_t i = 0; i < count;) {
+    const int64_t row = i / values, next = (row + 1) * values, last = next < count ? next : count;
     for (const float unit = s.units ? s.units[row] : 1; i < last; ++i) step(i, unit);
   }
+  return !(carry & 0x80000000u);
 }
 
 }  // namespace

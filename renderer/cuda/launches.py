@@ -11,8 +11,6 @@ from panolog.renderer.cuda.parts import (
     Exterior,
     Launch,
     Rays,
-    Update,
-    adam_step,
     camera_struct,
     composite,
     composite_backward,
@@ -100,10 +98,3 @@ def absolute_difference(
     """`ops.absolute_difference`: the mean over valid pixels, () float64, and its gradient (H, W)."""
     total, samples, gradient = absolute_sum(launch, rendered, target, valid)
     return total / samples, gradient
-
-
-def adam(launch: Launch, **given: Any) -> None:
-    """`ops.adam`: one step on the first `count` values, in place."""
-    tensors = given["gradient"].contiguous(), given["parameter"], given["exp_avg"], given["exp_avg_sq"]
-    update = Update(*tensors, given["count"], given["lr"], given.get("units"))
-    adam_step(launch, [update], *(given[name] for name in ("beta1", "beta2", "eps", "step")))

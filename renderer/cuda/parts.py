@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from panolog.renderer.adam import Moving
 from panolog.scene.errors import RunError
 
 TILE = 16  # kTile in csrc/cuda/common.cuh
@@ -328,43 +329,35 @@ def project_backward(
     return out
 
 
-class Update(NamedTuple):
-    """One parameter in a step of Adam: float32, contiguous; its first `moving` values move."""
-
-    gradient: Tensor
-    parameter: Tensor
-    exp_avg: Tensor
-    exp_avg_sq: Tensor
-    moving: int
-    lr: float
-    units: Tensor | None = None  # (N,) of lr, for each row of the parameter
-
-
 def adam_step(
     launch: Launch,
-    updates: Sequence[Update],
+    gradients: Mapping[str, Tensor],
+    moving: Mapping[str, Moving],
     beta1: float,
     beta2: float,
     eps: float,
     step: int,
     status: Tensor | None = None,
 ) -> None:
-    """One step of up to six parameters, in place, by one launch; none if `status` (1,) int32 is not 0."""
-    if len(updates) > MOST_SEGMENTS:
-        raise ValueError(f"{len(updates)} parameters are more than {MOST_SEGMENTS}")
+    """One step of up to six parameters, in place, by one launch; none if `status` (1,) int32 is not 0.
+
+    Args: gradients, contiguous, at least of what moves.
+    """
+    if len(moving) > MOST_SEGMENTS:
+        raise ValueError(f"{len(moving)} parameters are more than {MOST_SEGMENTS}")
     bias = 1 - beta1**step
     blocks, segments = 0, b""
-    for *tensors, moving, lr, units in updates:
-        pointers = (0 if tensor is None else tensor.data_ptr() for tensor in (*tensors, units))
+    for name, (*tensors, count, lr, units) in moving.items():
+        pointers = (0 if it is None else it.data_ptr() for it in (gradients[name], *tensors, units))
         values = 1 if units is None else tensors[0].numel() // max(1, units.numel())
-        segments += _SEGMENT.pack(*pointers, moving, blocks, lr / bias, values)
-        blocks += math.ceil(moving / THREADS)
-    segments += _SEGMENT.pack(0, 0, 0, 0, 0, 0, blocks, 0, 0) * (MOST_SEGMENTS - len(updates))
+        segments += _SEGMENT.pack(*pointers, count, blocks, lr / bias, values)
+        blocks += math.ceil(count / THREADS)
+    segments += _SEGMENT.pack(0, 0, 0, 0, 0, 0, blocks, 0, 0) * (MOST_SEGMENTS - len(moving))
     given = Struct(segments)
-    given.tensors = {
-        f"{name} of segment {row}": tensor
-        for row, update in enumerate(updates)
-        for name, tensor in update._asdict().items()
+    given.tensors = {f"gradient of {name}": gradients[name] for name in moving} | {
+        f"{what} of {name}": tensor
+        for name, it in moving.items()
+        for what, tensor in it._asdict().items()
         if isinstance(tensor, Tensor)
     }
     launch(

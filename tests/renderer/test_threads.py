@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from panolog.renderer import ops
-from panolog.renderer.adam import adam_
 from panolog.renderer.baked import Baked, bake
+from panolog.renderer.iteration import take
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
 from panolog.renderer.motion import MOTION_SUMS
 from panolog.renderer.render import render
 from tests.renderer.agreement import NEAR
 from tests.renderer.hard_scenes import as_leaves, camera, cloud
+from tests.renderer.test_adam import moving_of, problem_of
 
 
 def rendering(exact: bool, own: int | None = None) -> list[Tensor]:
@@ -55,11 +56,13 @@ def scattered(chance: Tensor) -> Tensor:
     return mask
 
 
-def adam() -> list[Tensor]:
-    """A step of six parts, the last of them a few values."""
-    parameter, gradient, *moments = torch.rand(4, 5 * 2**15 + 7, generator=torch.Generator().manual_seed(0))
-    adam_(parameter, gradient, *moments, lr=0.1, step=3)
-    return [parameter, *moments]
+def step() -> list[Tensor]:
+    """A training iteration of three spans of Gaussians, the last of them shorter."""
+    model = cloud(3000)
+    moving = moving_of(model)
+    seen, _, learnt = take(problem_of(model, moving=True), moving, 3, screen=True)
+    assert learnt.screen is not None and learnt.motion is not None
+    return [seen.color, learnt.screen, learnt.motion, *(each for it in moving.values() for each in it[:3])]
 
 
 AFFINE = torch.tensor([[0.6, 1.0, 1.4], [0.03, 0.0, -0.05]])
@@ -70,7 +73,7 @@ WORKS: dict[str, Callable[[], list[Tensor]]] = {
     "losses": lambda: losses(None, lambda chance: chance > 0.3),
     "losses of parts": lambda: losses(None, scattered),
     "exposed": lambda: losses(AFFINE, lambda chance: chance > 0.3),
-    "adam": adam,
+    "a step": step,
 }
 
 

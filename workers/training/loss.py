@@ -7,9 +7,7 @@ import torch
 from torch import Tensor
 
 from panolog.renderer.baked import Baked
-from panolog.renderer.cuda.iteration import Problem
-from panolog.renderer.losses import inverse_depth_loss, photometric_loss, sphere_rows
-from panolog.renderer.render import Render
+from panolog.renderer.losses import sphere_rows
 from panolog.scene.depth_alignment import Alignment, AlignmentError, align_depth, inverse_prior
 from panolog.scene.images import View
 from panolog.scene.model import Scene
@@ -77,25 +75,6 @@ class Targets(NamedTuple):
     share: Tensor | None
     depth: tuple[Tensor, Tensor] | None
     depth_share: Tensor | None
-
-
-class LossOf(NamedTuple):
-    """The loss of a view; on the CPU."""
-
-    loss: Tensor  # () differentiable, eq. 6
-    mse: Tensor  # () of the colours
-    exposure: Tensor | None  # (3, 5) `PhotometricLoss.exposure`
-
-
-def loss_of(rendered: Render, problem: Problem) -> LossOf:
-    """Eq. 6 of a rendered view."""
-    problem_of_colors = rendered.color, problem.image, problem.mask, problem.lambda_ssim, problem.rows
-    found = photometric_loss(*problem_of_colors, problem.exposure)
-    loss = found.loss if problem.share is None else found.loss * problem.share
-    if problem.depth is not None:
-        by_depth = problem.depth_weight * inverse_depth_loss(rendered.inverse_depth, *problem.depth)
-        loss = loss + (by_depth if problem.depth_share is None else by_depth * problem.depth_share)
-    return LossOf(loss, found.mse, found.exposure)
 
 
 class Loss:

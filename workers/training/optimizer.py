@@ -1,14 +1,12 @@
 """The state of a model in training: its parameters with their Adam moments, row by row."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from panolog.renderer.adam import adam_
-from panolog.renderer.cuda.parts import Update
+from panolog.renderer.adam import Moving
 from panolog.scene.gaussians import Gaussians
 
 MOMENT = "exp_avg."  # in `ModelState.tensors`, before the name of a parameter
@@ -60,39 +58,14 @@ class ModelState:
         moments |= {f"{UNITS}{name}": tensor for name, tensor in self.units.items()}
         return {**self.gaussians.tensors(), **moments}
 
-    def leaves(self, sh_degree: int) -> Gaussians:
-        """The Gaussians as leaves of autograd, sharing memory. At degree 0 `shN` gets no gradient."""
-        leaves = {
-            name: tensor.detach().requires_grad_(name != "shN" or sh_degree > 0)
-            for name, tensor in self.gaussians.tensors().items()
-        }
-        return self.gaussians.with_tensors(leaves)
+    def moving(self, rates: Mapping[str, float], rows: Mapping[str, int]) -> dict[str, Moving]:
+        """What a step of Adam moves: the parameters in `rows`, by name.
 
-    def step(
-        self, gradients: Mapping[str, Tensor], rates: Mapping[str, float], rows: Mapping[str, int], step: int
-    ) -> None:
-        """One Adam step in place, for the parameters that have a gradient.
-
-        Args: gradients shaped as the parameters; rates per iteration; `rows` how many rows of each parameter
-        move, from the first (the sky is last, so this freezes it); `step` from 1, for the bias correction.
-        Raises FloatingPointError with the name of a gradient that is not finite; the state is then invalid.
+        Args: rates per iteration; `rows` how many rows of each parameter move, from the first (the sky is
+        last, so this freezes it).
         """
-        parameters = self.gaussians.tensors()
-        for name, gradient in gradients.items():
-            moments = (self.exp_avg[name], self.exp_avg_sq[name])
-            lr, moving, units = rates[name], rows[name], self.units.get(name)
-            try:
-                adam_(parameters[name], gradient, *moments, lr=lr, step=step, rows=moving, units=units)
-            except FloatingPointError as error:
-                raise FloatingPointError(f"gradient of {name}") from error
-
-    def updates(
-        self, gradients: Mapping[str, Tensor], rates: Mapping[str, float], rows: Mapping[str, int]
-    ) -> list[Update]:
-        """The same step for `renderer.cuda.parts.adam_step`; gradients are contiguous."""
-        return [
-            Update(
-                gradient,
+        return {
+            name: Moving(
                 parameter,
                 self.exp_avg[name],
                 self.exp_avg_sq[name],
@@ -101,8 +74,8 @@ class ModelState:
                 self.units.get(name),
             )
             for name, parameter in self.gaussians.tensors().items()
-            if (gradient := gradients.get(name)) is not None
-        ]
+            if name in rows
+        }
 
     def widen(self, angle: float) -> None:
         """No axis of a scene Gaussian is less than `angle` radians for the nearest camera, as at its begin.
@@ -205,11 +178,3 @@ class Average:
             average._count = int(sums.pop(_COUNT))
         average._sums = {name.removeprefix(AVERAGE): tensor.clone() for name, tensor in sums.items()}
         return average
-
-
-def finite_loss(loss: Tensor) -> float:
-    """The loss as a number. Raises FloatingPointError if it is not finite; the step checks the gradients."""
-    value = float(loss.detach())
-    if not math.isfinite(value):
-        raise FloatingPointError("loss")
-    return value

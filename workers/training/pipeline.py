@@ -15,20 +15,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from panolog.renderer import ops
 from panolog.renderer.adam import BETAS, EPSILON
 from panolog.renderer.cuda import iteration, parts
 from panolog.renderer.cuda.iteration import Found, Problem
 from panolog.renderer.cuda.parts import Launch
+from panolog.renderer.iteration import take
 from panolog.renderer.motion import MOTION_SUMS
-from panolog.renderer.render import render
 from panolog.scene.errors import RunError
-from panolog.scene.gaussians import Gaussians
 from panolog.scene.tensors.transfer import sleeping_event
 from panolog.workers.capture.learning import Learning
 from panolog.workers.capture.movers import Visit
 from panolog.workers.training.densify import Statistics
-from panolog.workers.training.loss import loss_of
-from panolog.workers.training.optimizer import ModelState, finite_loss
+from panolog.workers.training.optimizer import ModelState
 
 AHEAD = 3  # iterations: the card stays busy while the host is late once
 MARGIN = 1.25  # of the room for pairs over what the view needed last
@@ -67,7 +66,7 @@ class Plan:
 
 
 class Direct:
-    """The iterations of one task on the CPU, through autograd: each is over when `run` returns."""
+    """The iterations of one task on the CPU: each is over when `run` returns."""
 
     def __init__(
         self, finished: Callable[[float, float], None], broken: Callable[[str, Plan], RunError]
@@ -78,38 +77,22 @@ class Direct:
 
     def run(self, plan: Plan) -> None:
         """One iteration. Raises RunError if its loss or a gradient is not finite."""
-        problem = plan.problem
-        leaves: Gaussians = plan.state.leaves(problem.sh_degree)
-        counts = plan.statistics is not None
-        columns = 4 if problem.absolute else 2
-        screen = torch.zeros(len(leaves), columns, requires_grad=True) if counts else None
-        motion = torch.zeros(MOTION_SUMS, dtype=torch.float64, requires_grad=True) if problem.moving else None
-        rendered = render(
-            leaves,
-            problem.camera,
-            sh_degree=problem.sh_degree,
-            near=problem.near,
-            screen=screen,
-            exterior=problem.exterior,
-            motion=motion,
-        )
-        found = loss_of(rendered, problem)
-        found.loss.backward()  # type: ignore[no-untyped-call]
-        gradients = {n: leaf.grad for n, leaf in leaves.tensors().items() if leaf.grad is not None}
+        problem, counts = plan.problem, plan.statistics is not None
+        moving = plan.state.moving(plan.rates, plan.rows)
         try:
-            value = finite_loss(found.loss)
-            plan.state.step(gradients, plan.rates, plan.rows, plan.iteration)
-            plan.state.widen(plan.least)
+            found = take(problem, moving, plan.iteration, screen=counts)
         except FloatingPointError as error:
             raise self._broken(str(error), plan) from error
-        if plan.statistics is not None and screen is not None and screen.grad is not None:
-            plan.statistics.add(screen.grad, rendered.visible, leaves.means.detach(), problem.camera)
+        plan.state.widen(plan.least)
+        seen, loss, learnt = found
+        if plan.statistics is not None and learnt.screen is not None:
+            visible = seen.state == ops.VISIBLE
+            plan.statistics.add(learnt.screen, visible, problem.model["means"], problem.camera)
         if plan.learning is not None:
-            images = rendered.color.detach(), rendered.inverse_depth.detach()
-            plan.learning.step(plan.visit(*images, found.exposure, None))
-            if motion is not None and motion.grad is not None:
-                plan.learning.learn_motion(plan.view, plan.iteration, motion.grad.numpy())
-        self._finished(value, float(found.mse))
+            plan.learning.step(plan.visit(seen.color, seen.inverse_depth, loss.exposure, None))
+            if learnt.motion is not None:
+                plan.learning.learn_motion(plan.view, plan.iteration, learnt.motion.numpy())
+        self._finished(loss.value, loss.squared)
 
     def settle(self) -> None:
         """As `Pipeline.settle`: nothing is in flight."""
@@ -181,9 +164,8 @@ class Pipeline:
     def _enqueue(self, plan: Plan, room: int | None) -> Found:
         """Launches all of an iteration."""
         found = iteration.gradients(self._launch, plan.problem, self._status, room)
-        moved = {n: g for n, g in found.gradients.items() if n in plan.rows}
-        updates = plan.state.updates(moved, plan.rates, plan.rows)
-        parts.adam_step(self._launch, updates, *BETAS, EPSILON, plan.iteration, self._status)
+        moving = plan.state.moving(plan.rates, plan.rows)
+        parts.adam_step(self._launch, found.gradients, moving, *BETAS, EPSILON, plan.iteration, self._status)
         plan.state.widen(plan.least)
         if plan.statistics is not None:
             into = plan.statistics

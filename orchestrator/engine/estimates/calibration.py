@@ -1,6 +1,6 @@
 """What an estimate builds on: a calibration where Stage I would run, or the measurements of other jobs.
 
-Each Gaussian has 59 floats of 4 bytes. Training keeps of each its value, gradient and two moments of Adam;
+Each Gaussian has 59 floats of 4 bytes. Training keeps of each its value and two moments of Adam;
 the rasterizer a splat of 64 bytes, as much for exact projection, and a few entries of tiles. On the CPU, a
 densification has the new values next to the old ones, and where those and the old moments were, the next
 ones, which are larger, find no room: 1.5 to 1.9 kB for each Gaussian were measured in all. On a GPU see
@@ -33,7 +33,7 @@ from panolog.workers.events import Calibration, IterationCost
 from panolog.workers.tasks import CALIBRATE
 
 SPLAT = 2 * 64 + 72  # of the rasterizer's: the splat, its rays, some tile entries, the screen gradient
-STEP = 4 * VALUES + 12 + SPLAT  # values, gradient, both moments, units of positions
+STEP = 3 * VALUES + 12 + SPLAT  # values, both moments, units of positions; gradients are never there at once
 REARRANGED = 3 * VALUES + 16  # after a densification: where the old values and moments were, the indices
 CHECKPOINT = 3 * VALUES + 28  # values, moments, units of positions, statistics
 AVERAGE = VALUES + 12  # at the end of a task, when nothing is rearranged any more

@@ -16,6 +16,7 @@ from unittest import mock
 import torch
 from torch import Tensor
 
+from panolog.renderer.adam import Moving
 from panolog.renderer.cuda import iteration, launches, nvrtc, parts
 from panolog.renderer.cuda.card import Kernels
 from panolog.renderer.cuda.iteration import Problem
@@ -118,9 +119,9 @@ def every_kernel(launch: Checked) -> None:
             found = iteration.gradients(launch, problem, status, room)
         into, more = [torch.zeros(30), torch.zeros(30)], torch.zeros(30) if absolute else None
         iteration.add_statistics(launch, found, status, problem, *into, absolute=more, angle=full)
-        gradient = found.gradients["means"]
-        updates = [parts.Update(gradient, scene.means, moments[0], moments[1], 30, 0.125)]
-        parts.adam_step(launch, updates * (1 + full), 0.9, 0.999, 1e-15, 3, status if full else None)
+        names = ("means", "scales")[: 1 + full]
+        moving = {name: Moving(scene.means, moments[0], moments[1], 30, 0.125) for name in names}
+        parts.adam_step(launch, found.gradients, moving, 0.9, 0.999, 1e-15, 3, status if full else None)
     launches.absolute_difference(launch, depth, depth, mask)
 
 

@@ -10,15 +10,17 @@ import torch
 from torch import Tensor
 
 from panolog.renderer import ops
+from panolog.renderer.adam import BETAS, EPSILON, Moving
 from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches
 from panolog.renderer.cuda.motion import motion_sums
-from panolog.renderer.cuda.parts import Launch
+from panolog.renderer.cuda.parts import Launch, adam_step
 from panolog.renderer.motion import MOTION, Motion
 from panolog.scene.gaussians import Gaussians
 from tests.renderer.agreement import IMAGES, NEAR, check_gradients, check_images, random_weights
 from tests.renderer.cuda.emulation import EmulatedLaunch
+from tests.renderer.test_adam import defined
 
 AFFINE = torch.tensor([[0.7, 1.0, 1.3], [0.02, 0.0, -0.03]])  # an exposure
 
@@ -149,11 +151,13 @@ def check_adam(machine: Machine, moving: int, *, apart: bool = False) -> None:
     at = None if units is None else units.to(machine.device)
     for step in range(1, 6):
         gradient = torch.randn(200, 3, generator=rng)
-        settings = {"count": moving, "lr": 0.01, "beta1": 0.9, "beta2": 0.999, "eps": 1e-15, "step": step}
-        names = ("parameter", "exp_avg", "exp_avg_sq")
-        mine, other = (dict(zip(names, state, strict=True)) | settings for state in (ours, theirs))
-        launches.adam(machine.launch, gradient=gradient.to(machine.device), units=at, **mine)
-        ops.adam(gradient=gradient, units=units, **other)
+        mine = {"some": Moving(ours[0], ours[1], ours[2], moving, 0.01, at)}
+        adam_step(machine.launch, {"some": gradient.to(machine.device)}, mine, *BETAS, EPSILON, step)
+        after = defined(
+            {"some": Moving(theirs[0], theirs[1], theirs[2], moving, 0.01, units)}, {"some": gradient}, step
+        )["some"]
+        for state, found in zip(theirs, after, strict=True):
+            state.view(-1)[:moving] = found.float().view(-1)[:moving]
     for one, two in zip(ours, theirs, strict=True):
         assert torch.allclose(one.cpu(), two, atol=1e-6)
         assert torch.equal(one.cpu().flatten()[moving:], two.flatten()[moving:])

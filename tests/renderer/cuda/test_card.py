@@ -1,18 +1,24 @@
 """What stands between the ops and a card: messages without one, training, streams and refusals on one."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
-from panolog.renderer.adam import adam_
+from panolog.renderer import ops
+from panolog.renderer.adam import BETAS, EPSILON
 from panolog.renderer.cuda import nvrtc
-from panolog.renderer.losses import inverse_depth_loss, photometric_loss
+from panolog.renderer.cuda.iteration import gradients
+from panolog.renderer.cuda.parts import adam_step
+from panolog.renderer.iteration import take
 from panolog.renderer.render import render
 from panolog.scene.errors import InputError
 from tests.on_device import needs_a_card
 from tests.renderer.agreement import NEAR
-from tests.renderer.hard_scenes import as_leaves, camera, cloud
+from tests.renderer.hard_scenes import camera, cloud
+from tests.renderer.test_adam import moving_of, problem_of
 
 pytest.importorskip("cuda.core", reason="CUDA: no cuda-core")
 from cuda.bindings import driver
@@ -35,33 +41,34 @@ def test_a_driver_that_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
         card.check_driver()
 
 
-def step(scene_on: str, exact: bool) -> list[torch.Tensor]:
-    """One training iteration on a device: render, loss, gradient, Adam."""
-    at = camera()
-    leaves = as_leaves(replace(cloud(200).to(scene_on), exact=exact), torch.float32)
-    rendered = render(leaves, at.to(scene_on), near=NEAR)
-    rng = torch.Generator().manual_seed(0)
-    target = torch.randint(0, 256, (32, 64, 3), generator=rng, dtype=torch.uint8).to(scene_on)
-    mask = (torch.rand(32, 64, generator=rng) > 0.2).to(scene_on)
-    depth = torch.rand(32, 64, generator=rng).to(scene_on)
-    loss = photometric_loss(rendered.color, target, mask).loss
-    loss = loss + inverse_depth_loss(rendered.inverse_depth, depth, mask)
-    loss.backward()  # type: ignore[no-untyped-call]
-    moved = []
-    for leaf in leaves.tensors().values():
-        assert leaf.grad is not None
-        parameter = leaf.detach().clone()
-        moments = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        adam_(parameter, leaf.grad, *moments, lr=0.01, step=1, eps=1e-4)
-        moved.append(parameter.cpu())
-    return moved
-
-
 @needs_a_card
 @pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
 def test_a_training_step_is_that_of_the_cpu(exact: bool) -> None:
-    for one, two in zip(step("cpu", exact), step("cuda", exact), strict=True):
-        assert torch.allclose(one, two, atol=1e-3)
+    """Render, loss, gradients, Adam."""
+    model = replace(cloud(200), exact=exact)
+    moments = {name: it.to("cuda") for name, it in model.tensors().items()}
+    one = moving_of(model)
+    two = {
+        name: it._replace(
+            parameter=moments[name], exp_avg=it.exp_avg.to("cuda"), exp_avg_sq=it.exp_avg_sq.to("cuda")
+        )
+        for name, it in one.items()
+    }
+    on_card = {"model": {name: it.parameter for name, it in two.items()}}
+    given = problem_of(model)
+    images: dict[str, Any] = {
+        name: value.to("cuda") for name, value in vars(given).items() if isinstance(value, Tensor)
+    }
+    assert given.depth is not None
+    images["depth"] = tuple(each.to("cuda") for each in given.depth)
+    take(given, one, 5, screen=False)
+    launch = ops.launcher(torch.device("cuda"))
+    assert launch is not None
+    status = torch.zeros(1, dtype=torch.int32, device="cuda")
+    found = gradients(launch, problem_of(model, **on_card, **images), status, None)
+    adam_step(launch, found.gradients, two, *BETAS, EPSILON, 5, status)
+    for name, it in one.items():
+        assert torch.allclose(it.parameter, two[name].parameter.cpu(), atol=1e-3), name
 
 
 @needs_a_card

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from panolog.renderer import ops
+from panolog.renderer.adam import Moving
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
@@ -103,8 +104,9 @@ def adam(launch: EmulatedLaunch) -> None:
         check_adam(emulated(launch), moving, apart=moving == 500)
     parameter, gradient, exp_avg, exp_avg_sq = torch.rand(4, 600, generator=torch.Generator().manual_seed(0))
     before = parameter.clone()
-    update = parts.Update(gradient, parameter, exp_avg, exp_avg_sq, 600, 0.01)
-    parts.adam_step(launch, [update], 0.9, 0.999, 1e-15, 4, torch.ones(1, dtype=torch.int32))
+    all_of_it = {"some": Moving(parameter, exp_avg, exp_avg_sq, 600, 0.01)}
+    broken = torch.ones(1, dtype=torch.int32)
+    parts.adam_step(launch, {"some": gradient}, all_of_it, 0.9, 0.999, 1e-15, 4, broken)
     assert torch.equal(parameter, before)  # no step after a fault
 
 

@@ -116,11 +116,12 @@ import sys
 
 import torch
 
-from panolog.renderer.adam import adam_
+from panolog.renderer.iteration import take
 from panolog.renderer.losses import photometric_loss
 from panolog.renderer.process import prepare
 from panolog.renderer.render import render
 from tests.renderer.hard_scenes import as_leaves, camera, cloud
+from tests.renderer.test_adam import moving_of, problem_of
 
 prepare(1)
 before = torch.cuda.is_initialized()
@@ -128,8 +129,7 @@ at = camera()
 model = as_leaves(cloud(20), torch.float32)
 target = torch.zeros(at.height, at.width, 3, dtype=torch.uint8)
 photometric_loss(render(model, at, near=0.01).color, target, None, 0.2).loss.backward()
-moments = torch.zeros_like(model.means), torch.zeros_like(model.means)
-adam_(model.means.detach(), model.means.grad, *moments, lr=0.1, step=1, rows=20)
+take(problem_of(cloud(20)), moving_of(cloud(20)), 1, screen=True)
 imported = [name for name in ("torch._dynamo", "torch._inductor", "sympy") if name in sys.modules]
 grow = None
 if torch.cuda.is_available():

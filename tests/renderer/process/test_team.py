@@ -11,22 +11,20 @@ import pytest
 from panolog.renderer import _core, ops
 from panolog.renderer.process import prepare
 
-COUNT = 5 * 2**15 + 7  # values of Adam: six parts
+COUNT = 5 * 2**12 + 7  # pixels: six parts
 
 
-def adam(threads: int) -> bytes:
-    """The bytes after one step."""
-    values = np.random.default_rng(0).standard_normal((4, COUNT)).astype(np.float32)
-    parameter, gradient, first, second = values
-    second **= 2
-    arrays = (parameter, gradient, first, second)
-    assert not _core.adam(*arrays, COUNT, lr=0.1, beta1=0.9, beta2=0.999, eps=1e-15, step=3, threads=threads)
-    return values.tobytes()
+def difference(threads: int) -> bytes:
+    """The bytes of a loss and its gradient."""
+    rendered, target = np.random.default_rng(0).standard_normal((2, COUNT)).astype(np.float32)
+    valid, gradient = (rendered < 1).astype(np.uint8), np.empty(COUNT, np.float32)
+    mean = _core.absolute_difference(rendered, target, valid, threads=threads, gradient=gradient)
+    return gradient.tobytes() + repr(mean).encode()
 
 
 def test_threads_that_compute_at_once_have_helpers_of_their_own() -> None:
-    alone, found = adam(1), []
-    callers = [threading.Thread(target=lambda: found.append(adam(2))) for _ in range(8)]
+    alone, found = difference(1), []
+    callers = [threading.Thread(target=lambda: found.append(difference(2))) for _ in range(8)]
     for caller in callers:
         caller.start()
     for caller in callers:
@@ -35,10 +33,10 @@ def test_threads_that_compute_at_once_have_helpers_of_their_own() -> None:
 
 
 def test_a_fork_has_helpers_of_its_own() -> None:
-    alone = adam(2)
+    alone = difference(2)
     child = os.fork()
     if not child:
-        os._exit(adam(2) != alone)
+        os._exit(difference(2) != alone)
     assert os.waitpid(child, 0)[1] == 0
 
 
@@ -46,7 +44,8 @@ def test_helpers_do_not_hold_up_the_end_of_a_process() -> None:
     script = f"""
 import numpy as np
 from panolog.renderer import _core
-_core.adam(*np.ones((4, {COUNT}), np.float32), {COUNT}, 0.1, 0.9, 0.999, 1e-15, 3, 4)
+ones = np.ones((3, {COUNT}), np.float32)
+_core.absolute_difference(ones[0], ones[1], ones[2].astype(np.uint8), 4, ones[2])
 """
     subprocess.run([sys.executable, "-c", script], check=True, timeout=300)
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda.iteration import Problem
+from panolog.renderer.iteration import loss_of
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
@@ -28,7 +29,7 @@ from panolog.workers.specs import Value
 from panolog.workers.training import pipeline
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.exterior import BAKED, Exterior, Rooms, exterior_last, inside
-from panolog.workers.training.loss import Loss, loss_of
+from panolog.workers.training.loss import Loss
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.task_config import CacheConfig
 from panolog.workers.training.trainer import TrainSpec, train
@@ -118,7 +119,7 @@ def test_a_block_that_ends_early_leaves_neither_its_thread_nor_its_file(
         events = train(task)
         while not readers():
             next(events)
-        monkeypatch.setattr(pipeline, "render", lambda *_, **__: 1 / 0)
+        monkeypatch.setattr(pipeline, "take", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             list(events)
         assert not readers() and [file.closed for file in files] == [True, True]
@@ -236,13 +237,9 @@ def gradients(
 ) -> tuple[float, Tensor, Tensor]:
     """The loss, and its gradients by colours and inverse depths."""
     image = render(model, camera(scene, view.row), near=0.01)
-    color, depth = (tensor.clone().requires_grad_() for tensor in (image.color, image.inverse_depth))
     loss = Loss(scene, config, 0, Schedule(config, 24, 1.0, refine=True))
-    rendered = image._replace(color=color, inverse_depth=depth)
-    value = loss_of(rendered, problem(scene, model, view, loss, around)).loss
-    value.backward()  # type: ignore[no-untyped-call]
-    assert color.grad is not None and depth.grad is not None
-    return value.item(), color.grad, depth.grad
+    found = loss_of(problem(scene, model, view, loss, around), image.color, image.inverse_depth)
+    return found.value, found.by_color, found.by_inverse_depth
 
 
 def test_the_loss_of_active_pixels_has_the_gradient_of_all(tmp_path: Path, initial: Gaussians) -> None:

@@ -9,7 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from panolog.renderer.render import render
+from panolog.renderer import iteration
+from panolog.renderer.cuda.iteration import Problem
+from panolog.renderer.iteration import Seen, forward
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians, logit
 from panolog.scene.images import PanoramaCache
@@ -17,7 +19,6 @@ from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event, Preview
 from panolog.workers.specs import Value
 from panolog.workers.tasks import TaskId
-from panolog.workers.training import pipeline
 from panolog.workers.training.exterior import inside
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.on_device import ToDevice
@@ -151,11 +152,11 @@ def test_each_densification_draws_other_numbers(coarse: TrainSpec, monkeypatch: 
 def test_what_is_not_finite_ends_the_run_with_a_name(
     coarse: TrainSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def poisoned(gaussians: Gaussians, *args: object, **options: object) -> object:
-        rendered = render(gaussians, *args, **options)  # type: ignore[arg-type]
-        return rendered._replace(color=rendered.color * float("nan"))
+    def poisoned(problem: Problem) -> Seen:
+        seen = forward(problem)
+        return seen._replace(color=seen.color * float("nan"))
 
-    monkeypatch.setattr(pipeline, "render", poisoned)
+    monkeypatch.setattr(iteration, "forward", poisoned)
     with pytest.raises(RunError, match=r"coarse: the loss is not finite at iteration 1, view pano_\d\.png"):
         list(train(coarse))
 
@@ -203,12 +204,15 @@ def test_what_is_no_task_is_refused(coarse: TrainSpec, events: list[Event]) -> N
             replace(task, views=())
 
 
-def test_a_preview_shows_a_view_that_is_on_a_device(coarse: TrainSpec) -> None:
+def test_a_preview_shows_a_view_that_is_on_a_device(
+    coarse: TrainSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene, shown = coarse.scene.load(), []
     on_device: tuple[dict[str, Any], ...] = ({"device": "cuda", "upload": ToDevice()}, {})
     for options in on_device:
         with PanoramaCache(scene, coarse.views, WIDTH, 1, **options) as cache:
             trainer = Trainer(replace(coarse, iterations=1), scene, cache)
             list(trainer.begin())
+            monkeypatch.setattr(trainer, "step", lambda *_: None)  # one of the CPU takes no such view
             shown += [event for event in trainer.run(lambda: False) if isinstance(event, Preview)]
     assert len(shown) == 2 and shown[0] == shown[1]
