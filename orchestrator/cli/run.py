@@ -89,7 +89,8 @@ def run(
                     from panolog.orchestrator.cli.session import session
 
                 with _display(root, output, dashboard=dashboard) as show:
-                    state = session.start(source, root, config, address, show, None, nice, options, budget)
+                    given = source if len(source) > 1 else source[0]
+                    state = session.start(given, root, config, address, show, None, nice, options, budget)
         _end(root, code, state)
 
 

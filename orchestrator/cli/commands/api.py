@@ -151,9 +151,8 @@ def run(
         RunError: the run failed. `resume` tries again.
         KeyboardInterrupt: it was interrupted. `resume` resumes it.
     """
-    one = scene.root if isinstance(scene, Scene) else scene
-    given = [one] if isinstance(one, (str, PathLike)) else one
-    source = [it if isinstance(it, str) else Path(it) for it in given]
+    given = scene.root if isinstance(scene, Scene) else scene
+    source = _plain(given) if isinstance(given, (str, PathLike)) else [_plain(it) for it in given]
     return session.start(source, Path(output), config or RunConfig(), address, on_change, pool)
 
 
@@ -171,6 +170,11 @@ def resume(
     the settings in run.json were changed since it was begun, unless `accept_changes`.
     """
     return session.resume(Path(run), address, on_change, pool, accept_changes=accept_changes)
+
+
+def _plain(path: StrPath) -> str | Path:
+    """A path, or what may be a URL."""
+    return path if isinstance(path, str) else Path(path)
 
 
 def _scene(scene: Scene | StrPath) -> Scene:

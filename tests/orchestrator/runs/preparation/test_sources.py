@@ -22,6 +22,7 @@ from panolog.scene.write import StageProgress
 from tests.orchestrator.cli.program import call, one_line, shown
 from tests.orchestrator.runs.preparation.fake_sfm import image, start
 from tests.prepare.video.videos import render, walk, write_video
+from tests.prepare.world.stills import crop, write_still
 from tests.scenes import write_scene
 
 WIDTH = 256
@@ -127,6 +128,19 @@ def test_doctor_looks_at_all_sources(tmp_path: Path) -> None:
     words = "2 sources: 6 panoramas and frames of videos, of which a part is used, 512x256"
     assert findings["source"] == words
     assert "the panoramas have 512 pixels" in one_line(call("doctor", video, photographs, "--width", 1024))
+
+
+def test_panoramas_that_become_whole_first_are_looked_at_as_they_will_be(tmp_path: Path) -> None:
+    """Cropped ones were refused by `run`, though `scene sfm` completes them."""
+    for number in range(2):
+        part = np.full((40, 96, 3), 90 + number, np.uint8)
+        write_still(tmp_path / "cropped" / f"{number}.png", part, panorama=crop((128, 64), 16, 8, (96, 40)))
+        image(tmp_path / "odd" / f"{number}.png", 256, 127)
+    for given, width in (("cropped", 128), ("odd", 256)):
+        settings = settings_of(tmp_path / given, Options())
+        assert settings is not None and (settings.width, settings.panoramas) == (width, 2)
+    settings = settings_of([tmp_path / "cropped", tmp_path / "odd"], Options())
+    assert settings is not None and settings.width == 256
 
 
 def test_a_scene_and_a_url_are_run_by_themselves(tmp_path: Path) -> None:
