@@ -17,7 +17,7 @@ from tests.orchestrator.whole_runs.test_supervised import WITHOUT_RAY
 from tests.prepare.sources.street import Street, make_street
 from tests.ray_head import environment, wait_until
 
-pytestmark = pytest.mark.nightly
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
 
 OPTIONS = ("--width", "128", "--iterations", "20", "--device", "cpu", "--set", "sky.count=50")
 MOMENTS = ("frames", "masks", "features", "matches", "poses", "training")
