@@ -12,7 +12,10 @@ _HEIC = "HEIC; convert it with `heif-convert NAME.heic NAME.jpg`, or export it a
 _PACKED = "an archive; unpack it, and give the folder"
 _LIGHT = "a picture of high dynamic range; save it tone-mapped, as TIFF or PNG of 8 or 16 bits"
 _LENSES = f"a video of two lenses; {STITCH}"
-_VIDEO = "a video; give it by itself, without the folder"
+_VIDEO = "a video; give it by itself, or next to the folder: `panolog run FOLDER VIDEO -o RUN`"
+VIDEOS = frozenset(
+    {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".insv", ".osv"}
+)  # that a folder may hold
 _KINDS = {
     ".insp": f"a photograph of two fisheye lenses (Insta360); {STITCH}",
     ".insv": _LENSES,
@@ -25,7 +28,7 @@ _KINDS = {
     **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".gz", ".tgz"), _PACKED),
     **dict.fromkeys((".exr", ".hdr"), _LIGHT),
     **dict.fromkeys((".psd", ".psb", ".xcf"), "a file of an editor; export it as TIFF or PNG"),
-    **dict.fromkeys((".mp4", ".mov", ".mkv", ".webm", ".avi"), _VIDEO),
+    **dict.fromkeys((".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"), _VIDEO),
 }
 
 

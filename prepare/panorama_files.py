@@ -1,7 +1,7 @@
 """The panoramas of an unfinished scene: files of images and layers, before it can be read as a scene."""
 
 import os
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Collection, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.file_kinds import describe_left_out
+from panolog.prepare.file_kinds import VIDEOS, describe_left_out
 from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
@@ -22,6 +22,7 @@ from panolog.scene.read import check_names, image_folder, model_folder
 
 _ADDED = ("@eaDir", "__MACOSX")  # folders of Synology's thumbnails and of macOS's archives
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
+LayerFiles = dict[str, list[Path | None]]  # by the name of the layer, for each panorama
 In = TypeVar("In")
 Out = TypeVar("Out")
 
@@ -33,6 +34,7 @@ class PanoramaFile:
     root: Path  # of its scene
     name: str  # relative to the image folder
     path: Path
+    source: str = ""  # the label of what it was taken from, where there are several
 
     def layer(self, folder: str) -> Path:
         """The file of a layer: SCENE/FOLDER/STEM.png."""
@@ -48,6 +50,7 @@ class FolderContent:
     """What is below a folder."""
 
     images: list[Path]  # in the natural order of their paths
+    videos: list[Path]  # the same
     left_out: list[str]  # what else of cameras is there, one line for each kind
 
 
@@ -61,11 +64,13 @@ def pictures_below(source: Path) -> Path:
     return next((source / name for name in ("images", "imgs") if (source / name).is_dir()), source)
 
 
-def look_into(folder: Path) -> FolderContent:
-    """The image files below a folder, also behind links to folders, and what is left out.
+def look_into(folder: Path, used: Collection[str] = ()) -> FolderContent:
+    """The image files and videos below a folder, also behind links to folders, and what is left out.
 
-    That are files of other kinds, and what systems add: hidden files, such as macOS's `._NAME.jpg`, hidden
-    folders, such as `.thumbnails`, and thumbnails of network disks.
+    That are files of other kinds than images, and what systems add: hidden files, such as macOS's
+    `._NAME.jpg`, hidden folders, such as `.thumbnails`, and thumbnails of network disks.
+
+    Args: used, suffixes in lower case of files that are read as well.
     """
     files, hidden, seen = list[Path](), list[str](), set[Path]()
     for place, folders, names in os.walk(folder, followlinks=True):
@@ -85,12 +90,15 @@ def look_into(folder: Path) -> FolderContent:
             elif path.suffix.lower() in SUFFIXES:
                 hidden.append(path.relative_to(folder).as_posix())
     images = [path for path in files if path.suffix.lower() in SUFFIXES and path.is_file()]
-    left_out = describe_left_out(sorted(files), folder)
+    videos = [path for path in files if path.suffix.lower() in VIDEOS and path.is_file()]
+    left_out = describe_left_out(sorted(it for it in files if it.suffix.lower() not in used), folder)
     if hidden:
         left_out.append(f"{some_of(sorted(hidden))}: left out, as hidden files and thumbnails are")
-    return FolderContent(
-        sorted(images, key=lambda path: natural_key(path.relative_to(folder).as_posix())), left_out
-    )
+
+    def in_order(paths: list[Path]) -> list[Path]:
+        return sorted(paths, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
+
+    return FolderContent(in_order(images), in_order(videos), left_out)
 
 
 def _is_added(name: str) -> bool:

@@ -69,7 +69,7 @@ class Scene:
     points: NDArray[np.float64]  # (P, 3) sparse cloud, world units
     colors: NDArray[np.uint8]  # (P, 3) RGB
     train: tuple[int, ...]  # rows of panoramas
-    test: tuple[int, ...]
+    test: tuple[int, ...]  # held out; empty if all are to train
     fingerprint: str  # sha256 over poses, points, split and the names, sizes of the files
     offset: Vector = NO_OFFSET  # to be added to coordinates for those of its COLMAP model: see `find_offset`
 
@@ -82,6 +82,10 @@ class Scene:
     def poses(self) -> NDArray[np.float64]:
         """(K, 3, 4) rotation and translation of all panoramas."""
         return np.stack([np.column_stack([each.rotation, each.translation]) for each in self.panoramas])
+
+    def without_holdout(self) -> "Scene":
+        """The same scene in which the held-out panoramas train too, so that none can be measured on."""
+        return replace(self, train=tuple(sorted({*self.train, *self.test})), test=())
 
     def without_points(self) -> "Scene":
         """The same panoramas without the sparse cloud: what all tasks of a scene share."""

@@ -30,6 +30,11 @@ def no_progress(*_: object) -> None:
     """The `Progress` that reports nothing."""
 
 
+def part_of(progress: Progress, turn: int, count: int) -> Progress:
+    """The `Progress` of one of several works of about equal length. Args: turn, from 0 on; count, of all."""
+    return lambda done, total: progress(turn * total + done, count * total)
+
+
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 

@@ -113,6 +113,8 @@ def test_run_and_resume_take_strings_and_the_defaults(
     panolog.run(panolog.read_scene(scene), output)
     panolog.resume(output, address="auto")
     assert calls[0][:4] == (scene, Path(output), panolog.RunConfig(), None)
+    panolog.run([str(scene), scene], output)
+    assert calls.pop()[0] == [str(scene), scene]
     assert calls[1][:2] == (Path(output), "auto")
 
 

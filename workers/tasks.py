@@ -7,6 +7,8 @@ from functools import lru_cache
 
 from panolog.scene.errors import InputError
 
+NOTHING_HELD_OUT = "no panorama is held out (holdout=none), so quality is not measured"
+
 
 class StrEnum(str, Enum):
     """An enumeration of words, each equal to its text: as `enum.StrEnum` of Python 3.11."""

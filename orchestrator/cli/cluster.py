@@ -54,7 +54,8 @@ _LOCAL = "http://127.0.0.1:8265"
 @with_preparation
 def submit(
     source: Annotated[
-        str, argument("SCENE|IMAGES|VIDEO", "The scene, a folder of panoramas or a video, on the head node.")
+        list[str],
+        argument("SCENE|SOURCE...", "The scene, or folders of panoramas and videos, on the head node."),
     ],
     output: Annotated[str, option("RUN", "Folder of the new run on the head node.", "--output", "-o")],
     config: "RunConfig",
@@ -77,7 +78,7 @@ def submit(
     from panolog.orchestrator.runs.preparation.settings import as_arguments
     from panolog.orchestrator.watch.follower.plan import words_elsewhere
 
-    source, run = on_head(source, "SCENE"), on_head(output, "--output")
+    sources, run = [on_head(it, "SCENE") for it in source], on_head(output, "--output")
     for what, path in {
         "--trajectory": options.sfm.get("trajectory"),
         "--depth-model": options.depth_model,
@@ -85,7 +86,7 @@ def submit(
         if path is not None:
             on_head(path, what)
     budget = wanted(prices, max_cost, deadline).options()
-    words = ["run", source, "-o", run, *as_settings(config), *as_arguments(options), *budget]
+    words = ["run", *sources, "-o", run, *as_settings(config), *as_arguments(options), *budget]
     words += words_elsewhere(notify or (), log or ())
     words += ["--at-end", at_end] if at_end else []
     _start(address, run, words, as_json=as_json)

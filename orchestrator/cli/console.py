@@ -153,6 +153,7 @@ def say_results(root: Path, state: Any) -> None:
     """Says what a run has made and where."""
     from panolog.orchestrator.runs.folder import RunFolder
     from panolog.orchestrator.watch.views.terminal import metrics_line
+    from panolog.workers.tasks import NOTHING_HELD_OUT
 
     folder = RunFolder(root)
     if state.money.reached is not None:
@@ -162,8 +163,9 @@ def say_results(root: Path, state: Any) -> None:
         say("there is no model: the limit has ended the run before its first checkpoint")
         return
     say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")
-    say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {})})")
-    say(f"pictures  {folder.images}")
+    say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {}) or NOTHING_HELD_OUT})")
+    if folder.images.is_dir():
+        say(f"pictures  {folder.images}")
     if folder.web.is_dir():
         say(f"web page  {folder.web} (for any web server)")
     if folder.plan_picture.exists():

@@ -22,6 +22,13 @@ _setting, _machine, _note, _limit, _making = (
     partial(option, panel=panel) for panel in (_SETTINGS, _MACHINES, _TOLD, BUDGET, _MADE)
 )
 
+SourcesArg = Annotated[
+    list[str],
+    argument(
+        "SCENE|SOURCE...",
+        "Scene (folder, s3://, gs://, az://); or folders of panoramas and 360° videos, one or several.",
+    ),
+]
 SceneArg = Annotated[Path, argument("SCENE", "Folder of a COLMAP or Pano360 scene.")]
 AnySceneArg = Annotated[str, argument("SCENE", "Folder or URL of a COLMAP or Pano360 scene.")]
 AnyRunArg = Annotated[str, argument("RUN", "Folder or URL of a run.")]
@@ -98,7 +105,7 @@ UpOption = Annotated[
     Literal["up", "right", "down", "left"] | None,
     _making("up|right|down|left", "Two lenses, not stitched: where up is in the first circle. Default: up."),
 ]
-FramesOption = Annotated[int | None, _making("N", "Video: take at most N frames.", min=2)]
+FramesOption = Annotated[int | None, _making("N", "Video: take at most N frames of each.", min=2)]
 DistanceOption = Annotated[
     tuple[str, str, float] | None,
     _making("NAME NAME METRES", "Distance between two of them; sets the scale."),
@@ -133,6 +140,10 @@ def run_config(
     blocks: BlocksOption = None,
     iterations: Annotated[int | None, option("N", "Of Stage I and of each block. Default: 30,000.")] = None,
     width: Annotated[int | None, option("W", "Of the panoramas in pixels. Default: as they are.")] = None,
+    holdout: Annotated[
+        str | None,
+        _setting("scene|none", "Panoramas to measure on. Default: the scene's split, or every 8th."),
+    ] = None,
     device: DeviceOption = None,
     memory: Annotated[
         str | None, _setting("GIB", "Memory that a task may take; Gaussians grow to what fits.")
@@ -144,8 +155,9 @@ def run_config(
     """The options that set up a run, as its settings."""
     from panolog.orchestrator.runs.config import load_config
 
-    flags = {"blocks": blocks, "iterations": iterations, "width": width, "device": device}
-    return load_config(config, settings or (), flags | {"memory": memory, "recipe": recipe})
+    flags: dict[str, Any] = {"blocks": blocks, "iterations": iterations, "width": width, "device": device}
+    flags |= {"holdout": holdout, "memory": memory, "recipe": recipe}
+    return load_config(config, settings or (), flags)
 
 
 def preparation(

@@ -200,12 +200,13 @@ def _folder(given: Path | None) -> Path:
     return default_folder() if given is None else given.absolute()
 
 
-def _absolute(given: dict[str, Any]) -> dict[str, str]:
+def _absolute(given: dict[str, Any]) -> dict[str, str | list[str]]:
     """Arguments that are paths: `run` takes URLs as well. Raises QueueError for `--local`."""
     if given["local"] is not None:
         raise QueueError("--local: is for runs with a URL, which a queue does not take; leave it out")
-    names = [name for name in ("source", "output", "prices") if given[name] is not None]
-    return {name: str(Path(given[name]).resolve()) for name in names}
+    names = [name for name in ("output", "prices") if given[name] is not None]
+    sources = [str(Path(source).resolve()) for source in given["source"]]
+    return {"source": sources} | {name: str(Path(given[name]).resolve()) for name in names}
 
 
 def _needs(device: str, address: str | None, given: dict[str, Any]) -> "Needs | None":

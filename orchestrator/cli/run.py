@@ -34,6 +34,7 @@ from panolog.orchestrator.cli.options import (
     NotifyOption,
     PricesOption,
     ResumesOption,
+    SourcesArg,
     SuperviseOption,
     wanted,
     with_preparation,
@@ -53,12 +54,7 @@ _RESUMES = 10  # of a supervisor in a row without progress
 @with_run_config
 @with_preparation
 def run(
-    source: Annotated[
-        str,
-        argument(
-            "SCENE|IMAGES|VIDEO", "Scene (folder, s3://, gs://, az://), folder of panoramas, or 360° video."
-        ),
-    ],
+    source: SourcesArg,
     output: Annotated[str, option("RUN", "Folder or URL of the new run.", "--output", "-o")],
     config: "RunConfig",
     options: "Options",
@@ -75,7 +71,7 @@ def run(
     deadline: DeadlineOption = None,
     at_end: AtEndOption = None,
 ) -> None:
-    """Reconstruct a scene, a folder of panoramas or a 360° video: one model of the place."""
+    """Reconstruct a scene, or panoramas and 360° videos, also several: one model of the place."""
     from panolog.orchestrator.cli.session.at_end import when_ended
     from panolog.orchestrator.runs.config import as_settings
     from panolog.orchestrator.runs.preparation.settings import as_arguments
@@ -86,14 +82,15 @@ def run(
         with mirrored(output, local) as root, _followed(root, notify, log):
             begun(root)
             if _supervised(max_resumes, supervise=supervise):
-                first = ["run", source, "-o", str(root), *as_settings(config), *as_arguments(options)]
+                first = ["run", *source, "-o", str(root), *as_settings(config), *as_arguments(options)]
                 code = _supervise(root, first, driver, budget.options(), address, max_resumes)
             else:
                 with progress_bar("starting"):
                     from panolog.orchestrator.cli.session import session
 
                 with _display(root, output, dashboard=dashboard) as show:
-                    state = session.start(source, root, config, address, show, None, nice, options, budget)
+                    given = source if len(source) > 1 else source[0]
+                    state = session.start(given, root, config, address, show, None, nice, options, budget)
         _end(root, code, state)
 
 
@@ -183,11 +180,11 @@ def demo(
 def doctor(
     config: "RunConfig",
     scene: Annotated[
-        str | None,
+        list[str] | None,
         argument(
-            "SCENE|IMAGES|VIDEO",
-            "Also estimate what a run of this scene (folder or URL) needs, or check the panoramas or the"
-            " video.",
+            "SCENE|SOURCE...",
+            "Also estimate what a run of this scene (folder or URL) needs, or check the panoramas and"
+            " videos.",
         ),
     ] = None,
     address: AddressOption = None,
@@ -196,9 +193,7 @@ def doctor(
 ) -> None:
     """Check this machine; with SCENE, also estimate what a run needs."""
     found = wanted(prices, None, None).prices
-    with progress_bar(
-        "checking this machine" if scene is None else "measuring on the machine that will train"
-    ):
+    with progress_bar("checking this machine" if not scene else "measuring on the machine that will train"):
         from panolog.orchestrator.cli.commands.doctor import diagnose
 
         diagnosis = diagnose(scene, config, address, found)

@@ -123,7 +123,9 @@ def stitch(
 
 @app.command(cls=Command)
 def sfm(
-    source: Annotated[Path, argument("IMAGES|VIDEO", "Folder of panoramas, or a 360° video.")],
+    source: Annotated[
+        list[Path], argument("SOURCE...", "Folders of panoramas and 360° videos, one or several.")
+    ],
     output: NewSceneOption,
     pairs: Annotated[
         Literal["auto", "exhaustive", "sequential"],
@@ -142,7 +144,7 @@ def sfm(
     link: LinkOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a scene from raw panoramas or a 360° video: find poses and points."""
+    """Make a scene from raw panoramas and 360° videos, also several: find poses and points."""
     from panolog.orchestrator.runs.machines.machine import memory
     from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
     from panolog.prepare.video.frames import PARALLAX
@@ -161,7 +163,8 @@ def sfm(
         trajectory=trajectory,
     )
     with progress_bar("reading the panoramas", resumable=True) as show:
-        report = make_scene(source, output, settings, show, memory=memory() * 3 // 4)
+        given = source if len(source) > 1 else source[0]
+        report = make_scene(given, output, settings, show, memory=memory() * 3 // 4)
     print_result({"scene": str(output), **report.as_json()}, report.lines(), as_json=as_json)
     _suggest_check(output, as_json=as_json, drawn=output / "sfm.png")
 

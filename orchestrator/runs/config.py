@@ -138,6 +138,9 @@ class RunConfig(TrainConfig):
         " a job that does not fit is refused",
     )
     seed: int = Field(default=0, ge=0, lt=2**63, description="of all randomness")
+    holdout: Literal["scene", "none"] = Field(
+        default="scene", description="scene = its split, or else every 8th; none = all panoramas train"
+    )
     device: Literal["auto", "cpu", "cuda"] = Field(
         default="auto", description="auto = CUDA if there is a GPU"
     )

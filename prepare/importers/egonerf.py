@@ -16,9 +16,8 @@ dataLoader/dataset_omniblender.py and get_ray_directions_360 in ray_utils.py.
 
 from dataclasses import replace
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, posed_image, read_head
+from panolog.prepare.importers.interface import FLIP_YZ, ImportedScene, ImportSource, posed_image, read_head
 from panolog.prepare.importers.json_xml import load_json
-from panolog.prepare.importers.poses import FLIP_YZ
 from panolog.prepare.importers.spheresfm import find_model, from_model
 from panolog.scene.errors import SceneError
 

@@ -16,6 +16,7 @@ from panolog.prepare.importers import (
     openmvg,
     opensfm,
     panorama_sfm,
+    pose_table,
     roam360,
     spheresfm,
 )
@@ -50,6 +51,7 @@ FORMATS: dict[str, ImportFormat] = {
     "panorama_sfm": ImportFormat(panorama_sfm.detect, panorama_sfm.read),
     "spheresfm": ImportFormat(spheresfm.detect, spheresfm.read),
     "metashape": ImportFormat(metashape.detect, metashape.read),
+    "poses": ImportFormat(pose_table.detect, pose_table.read),
 }
 
 

@@ -1,4 +1,4 @@
-"""What every importer takes and returns, and how it finds the files of its format.
+"""What every importer takes and returns, how it finds the files of its format, and converts poses.
 
 An importer has two functions. `detect(source)` reads file names and first bytes only. `read(source)` converts
 the whole scene to our convention; it raises SceneError, with file and field, if anything in the files is
@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 
 from panolog.prepare.importers.json_xml import MEMORY, JsonNode
 from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
-from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
 from panolog.scene.files import file_of, stem_of
 from panolog.scene.write import UNSEEN, Origin, PosedImage
 
+Array = NDArray[np.float64]
+FLIP_YZ = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera (x right, y up, z backward) to ours, and back
+_TOLERANCE = 1e-3  # how far from orthonormal a rotation that was written as text may be
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
 _HEAD = 65_536  # bytes that `detect` may read of a file
 _LARGEST_LIST = 2**26  # bytes of a file of image names
@@ -99,6 +101,35 @@ def read_head(path: Path) -> bytes:
     """The first bytes of a file, enough to recognize its format."""
     with path.open("rb") as file:
         return file.read(_HEAD)
+
+
+def nearest_rotation(where: str, matrix: Array) -> Array:
+    """(3, 3) the rotation nearest to `matrix` (3, 3).
+
+    Raises SceneError: it is none, even roughly, or it mirrors; `where` says which field it is.
+    """
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > _TOLERANCE:
+        raise SceneError(f"{where}: is not a rotation (its rows are not orthonormal); export it again")
+    left, _, right = np.linalg.svd(matrix)
+    nearest: Array = left @ right
+    if np.linalg.det(nearest) < 0:
+        raise SceneError(f"{where}: mirrors (its determinant is -1), so it is not a camera pose")
+    return nearest
+
+
+def pose_from_camera_to_world(where: str, matrix: Array, axes: Array) -> tuple[Array, Array]:
+    """(rotation, translation), world-to-camera, of a camera-to-world matrix (3 or 4, 4).
+
+    `axes` (3, 3) maps our camera axes to those of the format: `FLIP_YZ` or the identity. A uniform scale in
+    the matrix is taken out, as it has no meaning for a camera.
+
+    Raises SceneError: its left part is not a rotation.
+    """
+    scale = np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
+    if not 1e-9 < scale < 1e9:
+        raise SceneError(f"{where}: is not a pose (its determinant is {scale**3:.3g}); export it again")
+    turned = nearest_rotation(where, matrix[:3, :3] / scale) @ axes
+    return turned.T, -turned.T @ matrix[:3, 3]
 
 
 def posed_image(

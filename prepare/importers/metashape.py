@@ -19,10 +19,17 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, read_head
+from panolog.prepare.importers.interface import (
+    Array,
+    ImportedScene,
+    ImportSource,
+    find_panorama,
+    nearest_rotation,
+    pose_from_camera_to_world,
+    read_head,
+)
 from panolog.prepare.importers.json_xml import load_xml, xml_numbers
 from panolog.prepare.importers.point_cloud import read_point_cloud
-from panolog.prepare.importers.poses import Array, nearest_rotation, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
 from panolog.scene.files import some_of
 from panolog.scene.write import PosedImage

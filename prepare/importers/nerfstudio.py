@@ -14,10 +14,9 @@ from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, posed_image
+from panolog.prepare.importers.interface import FLIP_YZ, ImportedScene, ImportSource, posed_image
 from panolog.prepare.importers.json_xml import JsonNode, load_json
 from panolog.prepare.importers.point_cloud import read_point_cloud
-from panolog.prepare.importers.poses import FLIP_YZ
 from panolog.scene.files import stem_of
 
 FILES = ("transforms.json",)

@@ -14,9 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
+from panolog.prepare.importers.interface import (
+    ImportedScene,
+    ImportSource,
+    find_panorama,
+    pose_from_camera_to_world,
+)
 from panolog.prepare.importers.json_xml import JsonNode, load_json
-from panolog.prepare.importers.poses import pose_from_camera_to_world
 from panolog.scene.write import PosedImage
 
 FILES = ("cameras.json", "keyframes.json")

@@ -23,10 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
+from panolog.prepare.importers.interface import (
+    Array,
+    ImportedScene,
+    ImportSource,
+    find_panorama,
+    nearest_rotation,
+)
 from panolog.prepare.importers.json_xml import JsonNode, load_json_in_pieces
 from panolog.prepare.importers.point_cloud import PointCloud
-from panolog.prepare.importers.poses import Array, nearest_rotation
 from panolog.scene.colmap import LARGEST
 from panolog.scene.errors import SceneError
 from panolog.scene.projection import project_to_fractions

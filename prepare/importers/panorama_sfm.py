@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
-from panolog.prepare.importers.poses import Array
+from panolog.prepare.importers.interface import Array, ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.spheresfm import camera_models, find_model, require_model
 from panolog.scene.colmap import ColmapImage, read_colmap
 from panolog.scene.colmap_files import PINHOLE, SIMPLE_PINHOLE

@@ -1,8 +1,6 @@
-"""`panolog scene sfm`: from a folder of panoramas or a 360° video to a scene."""
+"""`panolog scene sfm`: from folders of panoramas and 360° videos to a scene."""
 
-import hashlib
 import shutil
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,25 +8,30 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.panorama_files import SUFFIXES, PanoramaFile, look_into, masks_among, pictures_below
+from panolog.prepare.panorama_files import LayerFiles, PanoramaFile, pictures_below
 from panolog.prepare.sfm.features import MEMORY
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
-from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
+from panolog.prepare.sfm.reconstruct import Reconstruction, reconstruct
 from panolog.prepare.sfm.report import SfmReport, write_report
-from panolog.prepare.sfm.trajectory import Trajectory, fit_world, places_of, read_trajectory
+from panolog.prepare.sfm.trajectory import (
+    Trajectory,
+    check_times,
+    fit_world,
+    places_of,
+    read_trajectory,
+)
+from panolog.prepare.sources.find import Sources, find_sources
+from panolog.prepare.sources.gather import Gathered, gather
 from panolog.prepare.stitching.lenses import Up
-from panolog.prepare.stitching.pictures import raw_pictures, stitch_pictures
-from panolog.prepare.video.frames import PARALLAX, extract_frames, frame_times
-from panolog.prepare.world.cropped import complete_panoramas
+from panolog.prepare.video.frames import PARALLAX, frame_times
 from panolog.prepare.world.exif import read_exif
 from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
 from panolog.scene.errors import SceneError
-from panolog.scene.read import DEPTHS, MASKS, MIN_CAMERAS, SKY_MASKS, check_names, find_layer
+from panolog.scene.files import natural_key
 from panolog.scene.write import NewScene, Offset, PosedImage, StageProgress, require_new, write_scene
 
 _APART = 0.1  # of the spread of a trajectory: poses that differ more are wrong, or belong to another
-_LAYERS = (MASKS, SKY_MASKS, DEPTHS)
 WithMasks = Callable[[Sequence[PanoramaFile], LayerFiles], LayerFiles]
 
 
@@ -43,7 +46,7 @@ class SfmSettings:
     gps: bool = True  # take metres and north from EXIF
     distance: tuple[str, str, float] | None = None  # names of two panoramas, and metres between them
     parallax: float = PARALLAX  # degrees between two frames of a video
-    frames: int | None = None  # of a video at most
+    frames: int | None = None  # of each video at most
     up: Up | None = None  # of pictures or a video that are to be stitched: where up is in the first circle
     link: bool = False  # instead of copying
     trajectory: Path | None = None  # where the camera was, as TUM or CSV
@@ -55,30 +58,35 @@ def workspace_folder(output: Path) -> Path:
 
 
 def make_scene(
-    source: Path,
+    source: Path | Sequence[Path],
     output: Path,
     settings: SfmSettings,
     progress: StageProgress,
     with_masks: WithMasks = lambda _, layers: layers,
     memory: int = MEMORY,
 ) -> SfmReport:
-    """Makes a scene of `source`, a folder or a video, in the new folder `output`, with its report.
+    """Makes a scene of `source` in the new folder `output`, with its report.
 
-    Args: with_masks, gets the panoramas and their layers, and returns the layers with masks that it has made;
-        those of an interrupted job must stay as they are; memory, bytes that may be used.
+    Args: source, a folder or a video, or several; with_masks, gets the panoramas and their layers, and
+        returns the layers with masks that it has made; those of an interrupted job must stay as they are;
+        memory, bytes that may be used.
 
     Raises SceneError if the source is wrong or its panoramas share too little: there is no `output` then, and
     what was done is kept for the next call. RunError if a process is killed, OSError if a file fails.
     """
     require_new(output)
     known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
-    folder, notes = workspace_folder(output.resolve()), list[str]()
-    if pictures_below(source).resolve() in output.resolve().parents:
-        raise SceneError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
-    source = _stitched(source, folder, settings, notes.append, progress)
-    panoramas, layers, copies = _panoramas_of(source, folder, settings, notes.append, progress)
-    layers = with_masks(panoramas, layers)
-    places = None if known is None else _places(known, source, folder, panoramas)
+    given = [source] if isinstance(source, Path) else source
+    for path in given:
+        if pictures_below(path).resolve() in output.resolve().parents:
+            raise SceneError(f"{output}: is inside {path}, whose pictures are read; give a folder elsewhere")
+    sources, folder = find_sources(given), workspace_folder(output.resolve())
+    if known is not None:
+        check_times(known, [it.is_video for it in sources.all])
+    gathered = gather(sources, folder, settings, progress)
+    panoramas = gathered.panoramas
+    layers = with_masks(panoramas, gathered.layers)
+    places = None if known is None else _places(known, sources, folder, panoramas)
     found = reconstruct(
         panoramas,
         layers,
@@ -90,9 +98,8 @@ def make_scene(
         memory=memory,
         places=places,
     )
-    left_out = (*copies, *look_into(pictures_below(source)).left_out)  # a file has nothing below it
     reports = [
-        _report(part, number, settings, places, notes, left_out)
+        _report(part, number, settings, places, gathered, sources)
         for number, part in enumerate(found if settings.parts else found[:1], start=1)
     ]
     made = any(panorama.path.is_relative_to(folder) for panorama in panoramas)
@@ -103,70 +110,21 @@ def make_scene(
     return reports[0]
 
 
-def _stitched(
-    source: Path,
-    folder: Path,
-    settings: SfmSettings,
-    note: Callable[[str], None],
-    progress: StageProgress,
-) -> Path:
-    """The folder with the panoramas of pictures that are not stitched; any other source as it is."""
-    pictures = raw_pictures(pictures_below(source)) if source.is_dir() else []
-    if not pictures:
-        return source
-    stitch_pictures(
-        pictures,
-        pictures_below(source),
-        folder / "stitched",
-        up=settings.up,
-        progress=lambda done, total: progress("stitching", done, total),
-        note=note,
-    )
-    return folder / "stitched"
-
-
-def _panoramas_of(
-    source: Path,
-    folder: Path,
-    settings: SfmSettings,
-    note: Callable[[str], None],
-    progress: StageProgress,
-) -> tuple[tuple[PanoramaFile, ...], LayerFiles, list[str]]:
-    """The panoramas of a source, their layers, and a line for each copy among them.
-
-    Args: folder, for what is made of the source; note, called with a line about what a video lacks.
-    """
-    if not source.is_file():
-        given, layers, copies = without_copies(*panoramas_in_folder(source))
-        whole = complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n))
-        return whole, layers, copies
-    files = extract_frames(
-        source,
-        folder / "frames",
-        parallax=settings.parallax,
-        most=settings.frames,
-        up=settings.up,
-        progress=lambda done, total: progress("frames", done, total),
-        note=note,
-    )
-    panoramas = tuple(PanoramaFile(folder / "frames", file.name, file) for file in files)
-    return panoramas, {MASKS: find_layer(folder / "frames", MASKS, [file.name for file in files])}, []
-
-
 def _report(
     part: Reconstruction,
     number: int,
     settings: SfmSettings,
     places: NDArray[np.float64] | None,
-    notes: Sequence[str],
-    left_out: tuple[str, ...],
+    gathered: Gathered,
+    sources: Sources,
 ) -> SfmReport:
     """A part in its world; places, (K, 3) where a trajectory has the panoramas."""
     world = _georeference(part, settings, number == 1)
     if places is not None and settings.trajectory is not None:
         world = _along(world, part, places[list(part.model.rows)], settings.trajectory)
     moved = replace(part, model=part.model.moved(world.similarity))
-    return SfmReport(moved, world, (*notes, *world.notes), left_out, number)
+    notes, several = (*gathered.notes, *world.notes), sources.all if len(sources.all) > 1 else ()
+    return SfmReport(moved, world, notes, gathered.left_out, number, several)
 
 
 def _write(output: Path, report: SfmReport, link: bool, progress: StageProgress) -> None:
@@ -175,57 +133,6 @@ def _write(output: Path, report: SfmReport, link: bool, progress: StageProgress)
     new = _scene(report.found, report.world)
     write_scene(scene, new, link=link, progress=lambda d, n: progress("scene", d, n))
     write_report(scene, report)
-
-
-def panoramas_in_folder(source: Path) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
-    """The panoramas in a folder, or in its folder images or imgs, and the layers next to or among them.
-
-    A picture NAME_mask.png next to NAME.jpg is its mask.
-
-    Raises SceneError: there is no such folder, there are fewer than two panoramas, or their names collide.
-    """
-    if not source.is_dir():
-        raise SceneError(f"{source}: there is no such folder or video")
-    inner = pictures_below(source)
-    content = look_into(inner)
-    images = [path for path in content.images if path.relative_to(inner).parts[0] not in _LAYERS]
-    among = masks_among(images)
-    files = [path for path in images if path not in among.values()]
-    if len(files) < MIN_CAMERAS:
-        reason = "; ".join([f"at least {MIN_CAMERAS} are needed", *content.left_out])
-        raise SceneError(f"{inner}: {len(files)} panoramas ({', '.join(sorted(SUFFIXES))}); {reason}")
-    names = tuple(path.relative_to(inner).as_posix() for path in files)
-    check_names(inner, names)
-    is_root = inner != source or any((source / layer).is_dir() for layer in _LAYERS)
-    root = source if is_root else source.parent
-    layers = {layer: find_layer(root, layer, names) for layer in _LAYERS}
-    layers[MASKS] = [mask or among.get(file) for mask, file in zip(layers[MASKS], files, strict=True)]
-    return tuple(PanoramaFile(root, name, file) for name, file in zip(names, files, strict=True)), layers
-
-
-def without_copies(
-    panoramas: Sequence[PanoramaFile], layers: LayerFiles
-) -> tuple[tuple[PanoramaFile, ...], LayerFiles, list[str]]:
-    """The panoramas whose files differ, their layers, and a line for each other one: it shows nothing more.
-
-    Raises: SceneError, fewer than two differ.
-    """
-    sizes = Counter(panorama.path.stat().st_size for panorama in panoramas)
-    first, kept, lines = dict[bytes, str](), list[int](), list[str]()
-    for row, panorama in enumerate(panoramas):
-        if sizes[panorama.path.stat().st_size] > 1:
-            digest = hashlib.sha256(panorama.path.read_bytes()).digest()
-            if digest in first:
-                lines.append(f"{panorama.name}: is a copy of {first[digest]}, left out")
-                continue
-            first[digest] = panorama.name
-        kept.append(row)
-    if len(kept) < MIN_CAMERAS:
-        raise SceneError(
-            f"{panoramas[0].root}: all panoramas are copies of {panoramas[0].name}; give different ones"
-        )
-    chosen = {layer: [files[row] for row in kept] for layer, files in layers.items()}
-    return tuple(panoramas[row] for row in kept), chosen, lines
 
 
 def _georeference(found: Reconstruction, settings: SfmSettings, first: bool) -> Georeference:
@@ -266,32 +173,40 @@ def _along(
 
 
 def _places(
-    known: Trajectory, source: Path, folder: Path, panoramas: Sequence[PanoramaFile]
+    known: Trajectory, sources: Sources, folder: Path, panoramas: Sequence[PanoramaFile]
 ) -> NDArray[np.float64]:
     """(K, 3) where the trajectory has the panoramas. Args: folder, the workspace."""
-    times = frame_times(source, folder / "frames") if source.is_file() else None
+    first, *others = sources.all
+    times = frame_times(first.path, folder / "frames") if first.is_video and not others else None
     return places_of(known, [panorama.name for panorama in panoramas], times)
 
 
 def _scene(found: Reconstruction, world: Georeference) -> NewScene:
-    """The scene to be written."""
+    """The scene to be written, in the natural order of names: that of `found` is that of capture."""
     model = found.model
+    names = [found.panoramas[row].name for row in model.rows]
+    order = sorted(range(len(names)), key=lambda place: natural_key(names[place]))
+    rows = [model.rows[place] for place in order]
     offset = None
     if world.metric:
         offset = Offset(offset=(0.0, 0.0, 0.0), metres=1.0)
     if world.gps is not None:
         offset = Offset(offset=(0.0, 0.0, 0.0), frame="ENU", origin=world.gps.fixes.origin)
     images = [
-        PosedImage(found.panoramas[row].name, found.panoramas[row].path, rotation, translation, sightings)
-        for row, rotation, translation, sightings in zip(
-            model.rows, model.rotations, model.translations, model.sightings, strict=True
+        PosedImage(
+            names[place],
+            found.panoramas[model.rows[place]].path,
+            model.rotations[place],
+            model.translations[place],
+            model.sightings[place],
         )
+        for place in order
     ]
     return NewScene(
         images,
         found.size,
         model.points,
         colors=None,
-        layers={layer: [files[row] for row in model.rows] for layer, files in found.layers.items()},
+        layers={layer: [files[row] for row in rows] for layer, files in found.layers.items()},
         offset=offset,
     )

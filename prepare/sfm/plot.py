@@ -12,6 +12,8 @@ from panolog.prepare.sfm.reconstruct import Reconstruction
 from panolog.scene.files import atomic
 
 _INK, _GREY, _BLUE, _RED = "#22272e", "#6b7280", "#1d6fb8", "#c2410c"
+_SOURCES = (_BLUE, "#309c9c", "#b400c0", "#849048", "#6c3cfc", "#786c60")  # the colour of each, in turn
+_NAMED = 12  # sources in the legend
 _POINTS = 60_000  # drawn at most
 _MARGINS = (0.15, 1.2)  # of the trajectory's extent that is shown around it, at least and at most
 
@@ -61,12 +63,27 @@ def _window(
 
 
 def _draw_cameras(axes: Axes, places: NDArray[np.float64], found: Reconstruction) -> None:
-    """The trajectory in the order of names, with the first and the last name."""
-    axes.plot(places[:, 0], places[:, 1], color=_BLUE, lw=0.8, alpha=0.6, zorder=3)
-    axes.scatter(places[:, 0], places[:, 1], s=14, c=_BLUE, linewidths=0, zorder=4)
+    """The trajectory of each source in the order of capture; of a sole one with the first and last name."""
+    colors, labels = _colors(found), [found.panoramas[row].source for row in found.model.rows]
+    for label, color in colors.items():
+        own = places[[place for place, it in enumerate(labels) if it == label]]
+        axes.plot(own[:, 0], own[:, 1], color=color, lw=0.8, alpha=0.6, zorder=3)
+        axes.scatter(own[:, 0], own[:, 1], s=14, c=color, linewidths=0, zorder=4, label=label)
+    if len(colors) > 1:
+        handles, names = axes.get_legend_handles_labels()
+        more = f", and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        names = [*names[: _NAMED - 1], names[_NAMED - 1] + more] if more else names
+        axes.legend(handles[:_NAMED], names, frameon=False, fontsize=8, labelcolor=_INK, loc="best")
+        return
     for row in dict.fromkeys((0, len(places) - 1)):
         name = found.panoramas[found.model.rows[row]].name
         axes.annotate(name, places[row], xytext=(5, 5), textcoords="offset points", color=_BLUE, fontsize=8)
+
+
+def _colors(found: Reconstruction) -> dict[str, str]:
+    """The colour of each source by its label, in the order of capture."""
+    labels = dict.fromkeys(panorama.source for panorama in found.panoramas)
+    return {label: _SOURCES[row % len(_SOURCES)] for row, label in enumerate(labels)}
 
 
 def _draw_links(axes: Axes, places: NDArray[np.float64], found: Reconstruction, weak: float) -> None:
@@ -94,10 +111,12 @@ def _draw_bars(axes: Axes, found: Reconstruction) -> None:
     """How many points each panorama sees; those without a pose are marked."""
     seen = np.zeros(len(found.panoramas))
     seen[list(found.model.rows)] = [len(rows) for rows, _ in found.model.sightings]
-    axes.bar(np.arange(len(seen)), seen, width=0.8, color=_BLUE, alpha=0.7)
+    colors = _colors(found)
+    shades = [colors[panorama.source] for panorama in found.panoramas] if len(colors) > 1 else _BLUE
+    axes.bar(np.arange(len(seen)), seen, width=0.8, color=shades, alpha=0.7)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_ylabel("points seen", color=_GREY)
-    axes.set_xlabel("panoramas by name", color=_GREY)
+    axes.set_xlabel(f"panoramas by {'name' if len(colors) == 1 else 'source and time'}", color=_GREY)
     axes.margins(x=0.01)
     if found.missing:
         lost = list(found.missing)

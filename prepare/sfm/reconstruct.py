@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.panorama_files import PanoramaFile
+from panolog.prepare.panorama_files import LayerFiles, PanoramaFile
 from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.consistency.solve import Solver
 from panolog.prepare.sfm.features import MEMORY, find_features
@@ -26,8 +26,6 @@ _VERSION = 2  # of features and matches: those of another version are not used
 _NEAREST = 12  # panoramas that each is matched with where a trajectory says how far they are
 _LEAST = 8  # panoramas of a part, or most of them: fewer agree by chance where all is alike
 FIRM = 20  # points seen by three panoramas: two also see points from false matches
-
-LayerFiles = dict[str, list[Path | None]]  # by the name of the layer, for each picture
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import numpy as np
 from panolog.prepare.sfm.links import Link
 from panolog.prepare.sfm.plot import write_sfm_plot
 from panolog.prepare.sfm.reconstruct import Reconstruction
+from panolog.prepare.sources.find import Source
 from panolog.prepare.world.georeference import Georeference
 from panolog.scene.files import write_bytes
 
@@ -26,6 +27,7 @@ class SfmReport:
     notes: tuple[str, ...]  # of the source and of the world, one line each
     left_out: tuple[str, ...] = ()  # what of the source was not read, one line for each kind
     number: int = 1  # of the part
+    sources: tuple[Source, ...] = ()  # in the order of capture, where there are several
 
     def as_json(self) -> dict[str, Any]:
         """As `--json` prints it. Errors are in pixels of the panoramas, scale errors relative."""
@@ -66,6 +68,7 @@ class SfmReport:
             "world": self._world(),
             "notes": list(self.notes),
             "left_out": list(self.left_out),
+            **({"sources": [self._source(it) for it in self.sources]} if self.sources else {}),
         }
 
     def lines(self) -> Iterator[str]:
@@ -76,6 +79,11 @@ class SfmReport:
             f"{content['points']:,} points, seen by {content['track_length']:.1f} panoramas, "
             f"{content['error']:.2f} pixels off"
         )
+        for source in content.get("sources", ()):
+            yield (
+                f"{source['name']}, of {source['path']}: {source['registered']} of {source['panoramas']} "
+                "panoramas have a pose"
+            )
         for part in content["parts"]:
             yield (
                 f"another part: {part[0]} to {part[-1]}, {len(part)} panoramas that agree, but are not "
@@ -105,6 +113,16 @@ class SfmReport:
         yield self._frame()
         yield from self.notes
         yield from self.left_out
+
+    def _source(self, source: Source) -> dict[str, Any]:
+        """How many of the panoramas of a source have a pose in this part."""
+        of_it = [row for row, it in enumerate(self.found.panoramas) if it.source == source.label]
+        return {
+            "name": source.label,
+            "path": str(source.path),
+            "panoramas": len(of_it),
+            "registered": len(set(of_it).intersection(self.found.model.rows)),
+        }
 
     def _world(self) -> dict[str, Any]:
         content: dict[str, Any] = {

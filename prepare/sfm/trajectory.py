@@ -6,6 +6,7 @@ was turned against the camera is unknown.
 """
 
 import csv
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,6 +54,19 @@ def read_trajectory(path: Path) -> Trajectory:
     return _timed(path, np.array([_numbers(path, number, line.split(), 8)[:4] for number, line in rows]))
 
 
+def check_times(trajectory: Trajectory, videos: Sequence[bool]) -> None:
+    """Refuses times that may be those of one of several sources.
+
+    Args: videos, for each source whether it is a video.
+    Raises: SceneError.
+    """
+    if trajectory.names is None and len(videos) > 1 and any(videos):
+        raise SceneError(
+            f"{trajectory.path}: has times and no names, and a video by itself can be placed by them; give "
+            "it alone, or name the panoramas in a column `name`"
+        )
+
+
 def places_of(trajectory: Trajectory, names: Sequence[str], times: Sequence[float] | None) -> Array:
     """(K, 3) where panoramas were taken, NaN for those that the trajectory does not know.
 
@@ -63,10 +77,15 @@ def places_of(trajectory: Trajectory, names: Sequence[str], times: Sequence[floa
     stems = [Path(name).stem for name in names]
     found = np.full((len(names), 3), np.nan)
     if trajectory.names is not None:
+        whole = {name: row for row, name in enumerate(trajectory.names)}
         of_name = {Path(name).name: row for row, name in enumerate(trajectory.names)}
         of_stem = {Path(name).stem: row for row, name in enumerate(trajectory.names)}
-        for row, (name, stem) in enumerate(zip(names, stems, strict=True)):
-            place = of_name.get(Path(name).name, of_stem.get(stem))
+        files = [Path(name).name for name in names]
+        often = Counter([*files, *stems])  # those of folders may have equal names
+        for row, (name, file, stem) in enumerate(zip(names, files, stems, strict=True)):
+            place = whole.get(name, of_name.get(file) if often[file] == 1 else None)
+            if place is None and often[stem] == 1:
+                place = of_stem.get(stem)
             if place is not None:
                 found[row] = trajectory.places[place]
     elif trajectory.times is not None:

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from datetime import datetime, timezone
+from datetime import datetime
 from pathlib import Path
 
 import av
@@ -29,6 +29,7 @@ from panolog.prepare.video.spherical import read_spherical, spherical_of
 from panolog.prepare.video.streams import (
     WIDEST,
     Effort,
+    begun,
     decoded,
     largest_streams,
     often,
@@ -42,7 +43,6 @@ MAX_FRAMES = 1_000_000  # nine hours at 30 frames per second
 _NARROWEST = 256  # pixels: enough to track anything
 _SAMPLED = 2**20  # bytes at the beginning, the middle and the end that identify a video
 _ENDS_EARLY = 0.95  # of the frames in the header, which is an estimate where there is no index
-_NO_CLOCK = 2000  # years up to this one are those of a clock that was never set
 
 
 class Video:
@@ -116,12 +116,7 @@ class Video:
     @property
     def started(self) -> datetime | None:
         """When recording began by the camera's clock, which should be UTC; None if that is not known."""
-        text = self._container.metadata.get("creation_time", "")
-        try:
-            found = datetime.fromisoformat(text.replace("Z", "+00:00"))
-        except ValueError:
-            return None
-        return found.astimezone(timezone.utc) if found.tzinfo and found.year > _NO_CLOCK else None
+        return begun(self._container)
 
     def frames(self) -> Iterator[int]:
         """The numbers of its frames from 0 on, up to MAX_FRAMES; once for each open video.
@@ -228,7 +223,8 @@ class Video:
             for it in map(first.side_data.get, ("DISPLAYMATRIX", "SPHERICAL", "STEREO3D"))
         )
         self.spherical = read_spherical(self.path) or spherical_of(mapping, stereo)
-        return layout_of(first.width, first.height, matrix, self.spherical, WIDEST)
+        aspect = float(self._stream.sample_aspect_ratio or 1)
+        return layout_of(first.width, first.height, matrix, self.spherical, WIDEST, aspect)
 
     def _show(self, frame: av.VideoFrame) -> None:
         """`frame` is the last one now."""

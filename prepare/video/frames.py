@@ -16,6 +16,7 @@ from panolog.prepare.video.stamp import stamped
 from panolog.prepare.video.streams import Effort
 from panolog.prepare.video.telemetry import Telemetry, read_telemetry
 from panolog.prepare.world.exif import Attitude
+from panolog.prepare.world.tracks import track_digest
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import SUFFIX, write_bytes
 from panolog.scene.pictures.kinds import describe_picture
@@ -81,9 +82,10 @@ def extract_frames(
             "be reconstructed; walk with it, or give a smaller parallax"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    frames.clear(set(found.chosen).difference(numbers))
-    if found.chosen != numbers:
-        found.chosen = numbers
+    track = track_digest(video)
+    frames.clear(set(found.chosen).difference(numbers if found.track == track else ()))
+    if found.chosen != numbers or found.track != track:
+        found.chosen, found.track = numbers, track
         found.save(frames.motion)
     _write(video, frames, found, telemetry, progress, up)
     return [frames.path(number) for number in numbers]

@@ -16,6 +16,7 @@ Turn = tuple[int, int, int, int]  # (a, b, c, d): x' = a x + c y, y' = b x + d y
 Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 _UPRIGHT = (1, 0, 0, 1)
+_NEARLY = 0.01  # of its width: how far a whole panorama may be from 2:1
 _LEFT_EYE: dict[Stereo, tuple[float, float, float, float]] = {  # of the picture: left, top, right, bottom
     "mono": (0.0, 0.0, 1.0, 1.0),
     "top-bottom": (0.0, 0.0, 1.0, 0.5),
@@ -88,8 +89,23 @@ class Layout:
         return covered
 
 
+def whole_width(width: float, height: float, *, columns: int = 0) -> int | None:
+    """The width, in pixels, of the panorama that a whole picture of nearly 2:1 is stretched to; else None.
+
+    Programs that scale or encode pictures leave out rows, so that of 2048 x 1024 there are 2048 x 1023.
+
+    Args: width, height, as it is shown; columns, that it has at least, if its pixels are not square.
+    """
+    return 2 * round(max(width, columns) / 2) if abs(width - 2 * height) <= _NEARLY * width else None
+
+
 def layout_of(
-    width: int, height: int, matrix: bytes | None, spherical: Spherical | None, widest: int
+    width: int,
+    height: int,
+    matrix: bytes | None,
+    spherical: Spherical | None,
+    widest: int,
+    aspect: float = 1.0,
 ) -> Layout:
     """The layout of a video's pictures.
 
@@ -97,17 +113,18 @@ def layout_of(
         width, height: of the decoded pictures, in pixels.
         matrix: the display matrix, as FFmpeg gives it: nine native integers, row by row, 16.16.
         widest: the maximum width of a panorama, in pixels.
+        aspect: the width of a pixel by its height, as players show it; it counts if pictures are not 2:1.
 
     Raises LayoutError: the pictures are no panoramas, or too large.
     """
     turn = _turn(matrix, width, height)
     if turn[0] == 0:
-        width, height = height, width
+        width, height, aspect = height, width, 1 / aspect
     if spherical is None:
-        if width != 2 * height:
+        panorama = whole_width(width, height) or whole_width(aspect * width, height, columns=width)
+        if panorama is None:
             raise LayoutError(f"its frames of {width} x {height} pixels are not 2:1; {STITCH}")
-        whole = Span(0, height, 0, width)
-        return Layout(turn, whole, whole, width)
+        return Layout(turn, Span(0, height, 0, width), Span(0, panorama // 2, 0, panorama), panorama)
     if spherical.projection != "equirectangular":
         raise LayoutError(f"its projection is {spherical.projection}, not equirectangular; {EXPORT}")
     if spherical.stereo not in _LEFT_EYE:

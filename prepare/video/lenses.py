@@ -222,11 +222,22 @@ def _second_of(path: Path, streams: list[av.VideoStream]) -> Second | None:
         return None
     if len(streams) == 2:
         return (path, 1)
-    for mine, of_other in ((_FIRST, _SECOND), (_SECOND, _FIRST)):
-        head, found, tail = path.name.rpartition(mine)
-        if found and (other := path.with_name(head + of_other + tail)).is_file():
+    for names in ((_FIRST, _SECOND), (_SECOND, _FIRST)):
+        other = _other_file(path, *names)
+        if other is not None and other.is_file():
             return (other, 0)
     return None
+
+
+def first_lens(path: Path) -> Path | None:
+    """The file of the first lens, by the name that Insta360 gives that of the second; None of any other."""
+    return _other_file(path, _SECOND, _FIRST) if path.suffix.lower() == ".insv" else None
+
+
+def _other_file(path: Path, mine: str, of_other: str) -> Path | None:
+    """The file next to one whose name has another part in the place of the last of its own."""
+    head, found, tail = path.name.rpartition(mine)
+    return path.with_name(head + of_other + tail) if found else None
 
 
 def _samples(

@@ -57,6 +57,7 @@ class VideoMotion:
     pieces: list[Piece] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     chosen: list[FrameNumber] = field(default_factory=list)  # frames that are, or will be, files
+    track: str = ""  # a digest of the recorder's file next to the video, whose places these carry
 
     def times(self) -> dict[FrameNumber, float]:
         """Seconds when the frames are shown."""

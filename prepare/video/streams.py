@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Literal
 
@@ -19,12 +20,23 @@ _DECODING = {
     "max_pixels": str(WIDEST**2),  # two eyes above each other
     "err_detect": "explode",  # rather than to patch frames up
 }
+_NO_CLOCK = 2000  # years up to this one are those of a clock that was never set
 _OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file", **_DECODING}
 
 
 def open_container(path: Path) -> av.container.InputContainer:
     """Opens a file. Raises av.FFmpegError and UnicodeError if it is no video."""
     return av.open(str(path.resolve()), options=_OPTIONS, metadata_errors="replace")
+
+
+def begun(container: av.container.InputContainer) -> datetime | None:
+    """When recording began by the camera's clock, which should be UTC; None if that is not known."""
+    text = container.metadata.get("creation_time", "")
+    try:
+        found = datetime.fromisoformat(text.replace("Z", "+00:00"))
+    except ValueError:
+        return None
+    return found.astimezone(timezone.utc) if found.tzinfo and found.year > _NO_CLOCK else None
 
 
 def largest_streams(container: av.container.InputContainer) -> list[av.VideoStream]:

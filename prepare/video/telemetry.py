@@ -3,7 +3,8 @@
 import math
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from pathlib import Path
 
 import av
@@ -13,14 +14,17 @@ from av.stream import Discard
 from numpy.typing import NDArray
 
 from panolog.prepare.video import camm, gpmf
-from panolog.prepare.video.streams import FORMATS
+from panolog.prepare.video.streams import FORMATS, begun
 from panolog.prepare.world.exif import Attitude, GpsFix
+from panolog.prepare.world.tracks import find_track, read_track
 from panolog.scene.errors import SceneError
 
 Array = NDArray[np.float64]
 
 _MOST = 10_000_000  # packets and samples: an accelerometer's of some hours
 _APART = 5.0  # seconds between samples, at most, to interpolate between them
+_RECORDED = 15.0  # the same, of a recorder, which may leave out places on a straight way
+_ALIKE = 0.05  # of the length of a video: as long as a recorder's track, if nothing says when it begins
 _NEAR = 1.0  # seconds from a sample, at most, where there is none on the other side
 _STEPS = 1.0  # seconds before and after over which an accelerometer is averaged: some steps of a walker
 _HIGHEST = 1e5  # metres, and metres per square second: more is damage
@@ -34,11 +38,14 @@ class Series:
     times: Array  # (N,) ascending
     values: Array  # (N, columns)
 
-    def at(self, time: float) -> Array | None:
-        """(columns,) at a time, interpolated; at the ends and in gaps those near it, or None."""
+    def at(self, time: float, apart: float = _APART) -> Array | None:
+        """(columns,) at a time, interpolated; at the ends and in gaps those near it, or None.
+
+        Args: apart, seconds between samples, at most, to interpolate between them.
+        """
         after = int(np.searchsorted(self.times, time))
         around = [row for row in (after - 1, after) if 0 <= row < len(self.times)]
-        if len(around) == 2 and self.times[after] - self.times[after - 1] <= _APART:
+        if len(around) == 2 and self.times[after] - self.times[after - 1] <= apart:
             part = (time - self.times[after - 1]) / (self.times[after] - self.times[after - 1])
             return np.asarray((1 - part) * self.values[after - 1] + part * self.values[after])
         near = min(around, key=lambda row: abs(self.times[row] - time), default=None)
@@ -63,10 +70,11 @@ class Telemetry:
     window: float  # seconds before and after over which `ups` are averaged
     shutter: Series  # seconds of exposure
     sensitivity: Series  # ISO
+    apart: float = _APART  # seconds between two places, at most, to interpolate between them
 
     def fix(self, time: float) -> GpsFix | None:
         """GPS at a time, interpolated; None where there is none around it."""
-        place = self.places.at(time)
+        place = self.places.at(time, self.apart)
         if place is None:
             return None
         latitude, longitude, altitude = (float(value) for value in place)
@@ -92,15 +100,16 @@ class Telemetry:
 def read_telemetry(path: Path) -> tuple[Telemetry | None, list[str]]:
     """The telemetry of a video, GPMF or CAMM, None if there is none; and notes on what was left out of it.
 
-    Reads the packets of those tracks alone.
+    Reads the packets of those tracks alone. Places are those of a recorder, if its file is next to the video.
 
-    Raises SceneError: the file cannot be opened as a video.
+    Raises SceneError: the file cannot be opened as a video; OSError: that of the recorder cannot be read.
     """
     found = _Collected()
     notes = []
     try:
         options = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
         with av.open(str(path.resolve()), options=options, metadata_errors="replace") as container:
+            started, lasts = begun(container), max(0, container.duration or 0) / av.time_base
             for start, duration, packet in _packets(container):
                 found.add(start, duration, packet)
                 if found.count > _MOST:
@@ -119,8 +128,41 @@ def read_telemetry(path: Path) -> tuple[Telemetry | None, list[str]]:
             )
             ups = ups.only(np.zeros(0, np.intp))
     telemetry = Telemetry(found.places(), ups, found.window, found.above_0("shutter"), found.above_0("iso"))
+    if (file := find_track(path)) is not None:
+        begin = None if started is None else started.timestamp()
+        recorded, line = _recorded(file, begin, lasts)
+        notes.append(line)
+        if recorded is not None:
+            telemetry = replace(telemetry, places=recorded, apart=_RECORDED)
     series = (telemetry.places, telemetry.ups, telemetry.shutter)
     return (telemetry if any(len(it.times) for it in series) else None), notes
+
+
+def _recorded(path: Path, begin: float | None, lasts: float) -> tuple[Series | None, str]:
+    """The places of a recorder by the time of a video, None if none are of it; and a note on that.
+
+    Args: path, of the recorder's file; begin, of the video in seconds since 1970; lasts, for so many seconds.
+    """
+    track = read_track(path)
+    if track is None:
+        return None, f"{path}: has no positions with times: not used"
+    times, length = track.times, float(np.ptp(track.times))
+    if not track.relative:
+        if begin is None and abs(length - lasts) > max(_NEAR, _ALIKE * lasts):
+            return None, (
+                f"{path}: not used, as the video does not say when it begins, and the positions cover "
+                f"{length:.0f} s, not its {lasts:.0f} s; write creation_time into the video"
+            )
+        times = times - (times[0] if begin is None else begin)
+    inside = int(((times >= -_NEAR) & (times <= lasts + _NEAR)).sum())
+    if inside == 0:
+        spans = [datetime.fromtimestamp(it, timezone.utc) for it in (begin or 0.0, *track.times[[0, -1]])]
+        shown = [f"{it:%Y-%m-%d %H:%M:%S}" for it in spans]
+        return None, (
+            f"{path}: not used, as the video begins at {shown[0]} UTC, and the positions are those of "
+            f"{shown[1]} to {shown[2]}; correct the clock of one, such as creation_time of the video"
+        )
+    return _on_earth(times, track.places), f"{path}: GPS is taken from it, {inside:,} positions"
 
 
 class _Collected:
@@ -156,11 +198,7 @@ class _Collected:
     def places(self) -> Series:
         """Those with their quality, or else the others; without what cannot be."""
         found = self._series("places" if self._times["places"] else "simple", 3)
-        on_earth = (np.abs(found.values[:, :2]) <= (90, 180)).all(axis=1)
-        found = found.only(np.flatnonzero(on_earth & found.values[:, :2].any(axis=1)))
-        north, east, height = found.values.T
-        high = np.where(np.abs(height) < _HIGHEST, height, np.nan)
-        return Series(found.times, np.stack([north, np.unwrap(east, period=360), high], axis=1))
+        return _on_earth(found.times, found.values)
 
     def ups(self) -> Series:
         """Directions of up: of gravity, or else of an accelerometer."""
@@ -186,6 +224,15 @@ class _Collected:
         values = np.concatenate([np.zeros((0, columns)), *self._values[name]])
         times, rows = np.unique(times, return_index=True)
         return Series(times, values[rows])
+
+
+def _on_earth(times: Array, places: Array) -> Series:
+    """Places (N, 3) without what cannot be; degrees east go on beyond 180."""
+    on_earth = (np.abs(places[:, :2]) <= (90, 180)).all(axis=1)
+    found = Series(times, places).only(np.flatnonzero(on_earth & places[:, :2].any(axis=1)))
+    north, east, height = found.values.T
+    high = np.where(np.abs(height) < _HIGHEST, height, np.nan)
+    return Series(found.times, np.stack([north, np.unwrap(east, period=360), high], axis=1))
 
 
 def _packets(container: av.container.InputContainer) -> Iterator[tuple[float, float, bytes]]:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.provenance import MAX_BYTES
-from panolog.prepare.world.exif import Crop, Exif, essential_exif, read_exif
+from panolog.prepare.world.exif import Attitude, Crop, Exif, essential_exif, read_exif
+from panolog.prepare.world.image_blocks import with_segments
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, stem_of
 from panolog.scene.image_files import decode_colors, decode_used, read_info
@@ -26,6 +27,8 @@ from panolog.scene.write import Progress, no_progress
 
 _THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama
 _HEADER = 33  # bytes of a PNG before its second chunk
+_QUALITY = 95  # of a JPEG
+_EXIF_HEAD, _XMP_HEAD = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"  # of segments of a JPEG
 _POSE = {"Heading": "heading", "Pitch": "pitch", "Roll": "roll"}
 _XMP = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
@@ -68,6 +71,15 @@ def complete_panoramas(
     return tuple(found)
 
 
+def whole_size(path: Path) -> tuple[int, int]:
+    """(width, height) in pixels of what `complete_panoramas` makes of a picture. Raises SceneError."""
+    info, crop = read_info(path), read_exif(path).crop
+    if crop is None or crop.is_whole or not _is_cropped(path, crop):
+        return info.width, info.height
+    height = _full_height(info, crop)
+    return 2 * height, height
+
+
 def _is_cropped(path: Path, crop: Crop) -> bool:
     """Whether a picture is what its crop says; False if a program has completed it and left the entry.
 
@@ -101,12 +113,34 @@ def _completed(path: Path, exif: Exif, crop: Crop, output: Path) -> Path:
     changed = path.stat().st_mtime_ns
     if output.is_file() and output.stat().st_mtime_ns == changed:
         return output
-    output.parent.mkdir(parents=True, exist_ok=True)
-    encoded = bytes(cv2.imencode(".png", _placed(path, crop), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
-    with atomic(output) as temporary:
-        temporary.write_bytes(encoded[:_HEADER] + _metadata(path, exif) + encoded[_HEADER:])
-        os.utime(temporary, ns=(changed, changed))
+    write_derived(path, exif, _placed(path, crop), output)
     return output
+
+
+def write_derived(path: Path, exif: Exif, pixels: NDArray[np.uint8], output: Path) -> None:
+    """Writes what was made of a picture, as PNG or JPEG by its suffix.
+
+    With the picture's place, time, exposure and attitude, and the time of its file.
+
+    Args: path, of the picture; exif, its own; pixels (H, W, 3) BGR, or (H, W, 4) with opacity.
+    Raises: OSError, it cannot be written.
+    """
+    changed, block = path.stat().st_mtime_ns, essential_exif(path)
+    if output.suffix == ".png":
+        encoded = bytes(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
+        chunks = b"" if block is None else _chunk(b"eXIf", block)
+        if exif.attitude is not None:
+            chunks += _chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + _packet(exif.attitude))
+        encoded = encoded[:_HEADER] + chunks + encoded[_HEADER:]
+    else:
+        segments = [] if block is None else [_EXIF_HEAD + block]
+        segments += [] if exif.attitude is None else [_XMP_HEAD + _packet(exif.attitude)]
+        encoded = bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
+        encoded = with_segments(encoded, *segments)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with atomic(output) as temporary:
+        temporary.write_bytes(encoded)
+        os.utime(temporary, ns=(changed, changed))
 
 
 def _placed(path: Path, crop: Crop) -> NDArray[np.uint8]:
@@ -128,16 +162,11 @@ def _placed(path: Path, crop: Crop) -> NDArray[np.uint8]:
     return full
 
 
-def _metadata(path: Path, exif: Exif) -> bytes:
-    """Chunks of a PNG with what a picture says of its place, time, exposure and attitude."""
-    chunks = b""
-    if (block := essential_exif(path)) is not None:
-        chunks += _chunk(b"eXIf", block)
-    if exif.attitude is not None:
-        angles = {name: getattr(exif.attitude, field) for name, field in _POSE.items()}
-        written = "".join(f' GPano:Pose{k}Degrees="{v!r}"' for k, v in angles.items() if v is not None)
-        chunks += _chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + _XMP.format(written).encode())
-    return chunks
+def _packet(attitude: Attitude) -> bytes:
+    """The XMP with GPano's angles."""
+    angles = {name: getattr(attitude, field) for name, field in _POSE.items()}
+    written = "".join(f' GPano:Pose{k}Degrees="{v!r}"' for k, v in angles.items() if v is not None)
+    return _XMP.format(written).encode()
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

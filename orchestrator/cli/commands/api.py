@@ -4,12 +4,14 @@ Paths may be strings. All raise `panolog.InputError` or one of its subclasses fo
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.engine.scheduling.pool import Pool
 from panolog.orchestrator.engine.stages.evaluation import means
+from panolog.orchestrator.engine.stages.scenes import divided
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore
 from panolog.renderer.process import choose_device
@@ -40,7 +42,7 @@ def train(
     Checkpoint. The last one is a Trained, whose `gaussians` is the model.
 
     Args:
-        scene: the scene or its folder; training uses its training views.
+        scene: the scene or its folder; training uses its training views, or all with `holdout="none"`.
         config: `iterations`, `width`, `seed`, `device` and all settings of training; the defaults if None.
         checkpoint: an earlier Checkpoint event of the same training to resume from.
         stop: checked after each iteration; once it is true, the last event is a Checkpoint.
@@ -53,7 +55,8 @@ def train(
     >>> isinstance(trained, panolog.Trained), len(trained.gaussians)
     (True, 50)
     """
-    scene, config = _scene(scene), config or RunConfig()
+    config = config or RunConfig()
+    scene = divided(_scene(scene), config)
     spec = trainer.TrainSpec(
         task=COARSE,
         scene=Value(scene),
@@ -121,7 +124,7 @@ def evaluate(
 
 
 def run(
-    scene: Scene | StrPath,
+    scene: Scene | StrPath | Sequence[StrPath],
     output: StrPath,
     config: RunConfig | None = None,
     *,
@@ -132,8 +135,8 @@ def run(
     """Reconstructs a scene into the new run folder `output`, to the end: what `panolog run` does.
 
     Args:
-        scene: the scene or its folder; or panoramas in a folder, or a 360° video, which becomes one first, as
-            `panolog run` does it without options.
+        scene: the scene or its folder; or a folder of panoramas, a 360° video, or several of these, which
+            become one first, as `panolog run` does it without options.
         output: the run folder, new or empty.
         config: the settings of the run; the defaults if None.
         address: a Ray cluster as "auto" or "HOST:PORT"; this machine if None.
@@ -148,7 +151,8 @@ def run(
         RunError: the run failed. `resume` tries again.
         KeyboardInterrupt: it was interrupted. `resume` resumes it.
     """
-    source = scene.root if isinstance(scene, Scene) else scene if isinstance(scene, str) else Path(scene)
+    given = scene.root if isinstance(scene, Scene) else scene
+    source = _plain(given) if isinstance(given, (str, PathLike)) else [_plain(it) for it in given]
     return session.start(source, Path(output), config or RunConfig(), address, on_change, pool)
 
 
@@ -166,6 +170,11 @@ def resume(
     the settings in run.json were changed since it was begun, unless `accept_changes`.
     """
     return session.resume(Path(run), address, on_change, pool, accept_changes=accept_changes)
+
+
+def _plain(path: StrPath) -> str | Path:
+    """A path, or what may be a URL."""
+    return path if isinstance(path, str) else Path(path)
 
 
 def _scene(scene: Scene | StrPath) -> Scene:

@@ -3,7 +3,7 @@
 import importlib.util
 import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -67,13 +67,16 @@ class Diagnosis:
 
 
 def diagnose(
-    source: str | None, config: RunConfig, address: str | None, prices: "PriceList | None" = None
+    source: Sequence[str] | None,
+    config: RunConfig,
+    address: str | None,
+    prices: "PriceList | None" = None,
 ) -> Diagnosis:
     """Checks this machine and, if it is ready, what a run of `source` needs here or on a cluster.
 
     Of panoramas or a video the scene is made first, so only what can be known before is said.
 
-    Args: source, of a scene a folder or a URL; prices of machines, if they are known.
+    Args: source, a folder or URL of a scene, or panoramas and videos; prices of machines, if known.
     Raises InputError if the scene, the settings or the address are wrong; StoreLostError.
     """
     packages = (_package(module) for module in PACKAGES)
@@ -87,7 +90,7 @@ def diagnose(
         *packages,
     ]
     machine = Diagnosis(findings)
-    if source is None or not machine.ready:
+    if not source or not machine.ready:
         return machine
     # these need the compiled core
     from panolog.orchestrator.cli.session import preparing, session
@@ -144,7 +147,10 @@ def _source(settings: "Settings") -> Iterator[Finding]:
     from panolog.orchestrator.watch.views.preparation import STEPS
 
     kind = "frames of a video, of which a part is used" if settings.video else "panoramas"
-    yield Finding("source", f"{settings.panoramas:,} {kind}, {settings.width}x{settings.width // 2}")
+    if settings.others and settings.video:
+        kind = "panoramas and frames of videos, of which a part is used"
+    of = f"{len(settings.sources)} sources: " if settings.others else ""
+    yield Finding("source", f"{of}{settings.panoramas:,} {kind}, {settings.width}x{settings.width // 2}")
     yield Finding("preparation", ", ".join(STEPS[step] for step in settings.steps()))
     later = "is known once there are poses: the run says it before it trains, and refuses what does not fit"
     yield Finding("the job", later)

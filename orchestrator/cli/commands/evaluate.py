@@ -20,6 +20,7 @@ from panolog.scene.ply import ply_exact, ply_header
 from panolog.scene.write import StageProgress
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Progress
+from panolog.workers.tasks import NOTHING_HELD_OUT
 
 Report = dict[str, Any]
 _FITTED = 0.3  # dB: from here on a fit of colours is worth a line
@@ -79,7 +80,7 @@ def lines(report: Report) -> Iterator[str]:
     for name, metrics in report["views"].items():
         yield f"{name}: {metrics_line(metrics)}"
     yield from report.get("left_out", {}).values()
-    yield f"mean: {metrics_line(report['mean'])}"
+    yield f"mean: {metrics_line(report['mean'])}" if report["views"] else NOTHING_HELD_OUT
     plain, fitted = (report["mean"].get(key) for key in ("psnr", "cc_psnr"))
     if plain is not None and fitted is not None and fitted > plain + _FITTED:
         ws = report["mean"]["cc_ws_psnr"]

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.cli.session import preparing
+from panolog.orchestrator.cli.session import making, preparing
 from panolog.orchestrator.cli.session.delivery import deliver
 from panolog.orchestrator.engine.driver.driver import Driver, Hooks
 from panolog.orchestrator.engine.driver.ending import end_recorded
@@ -60,13 +60,14 @@ from panolog.renderer.process import choose_device
 from panolog.scene.errors import ClusterError, MissingPackageError, RunFolderError, RunLockedError, installed
 from panolog.scene.files import remove_partial
 from panolog.scene.model import Scene
+from panolog.workers.tasks import NOTHING_HELD_OUT
 
 _LOG = logging.getLogger(__name__)
 
 
 @interruptible()
 def start(
-    source: Path | str,
+    source: preparing.Given,
     root: Path,
     config: RunConfig,
     address: str | None,
@@ -96,7 +97,7 @@ def start(
     made = run_folder.make(root)
     with lock.hold(folder.lock), ExitStack() as undo:
         new.check_output(root)  # another driver may have been quicker
-        undo.callback(preparing.discard, folder, made)
+        undo.callback(making.discard, folder, made)
         info = run_info.make_info(new.reference(folder), new.config, config)
         if new.settings is not None:  # first, so that this can be resumed from now on
             write_settings(folder, new.settings)
@@ -208,7 +209,7 @@ class _Beginning:
     def prepare(self, info: RunInfo, settings: Settings | None) -> RunInfo:
         """Makes the scene of a run that was given none, and returns run.json with it. Raises as `make`."""
         if settings is not None:
-            self.made = preparing.Preparation(self.folder, settings, self.journal).make()
+            self.made = making.Preparation(self.folder, settings, info.config, self.journal).make()
             config = preparing.with_width(self.made.width, info.config)
             info = info.model_copy(update={"scene": preparing.reference(self.made), "config": config})
             self.journal.until_done(lambda: run_info.write_info(self.folder, info))
@@ -271,7 +272,8 @@ class _Beginning:
         done = PreflightSaved(folder.relative(folder.preflight), seconds, settings)
         if budget := self.journal.state.money.budget:
             require_enough(seconds, budget, workers.nodes())
-        layers = [Noticed(None, line) for line in look_at_layers(self.scene).lines]
+        lines = [*look_at_layers(self.scene).lines, *([] if self.scene.test else [NOTHING_HELD_OUT])]
+        layers = [Noticed(None, line) for line in lines]
         self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), *layers, done])
         return found.config
 
@@ -308,7 +310,7 @@ class _Beginning:
         return _retained(folder, self.journal, config)
 
 
-def check(source: Path, root: Path, config: RunConfig, options: Options) -> None:
+def check(source: preparing.Given, root: Path, config: RunConfig, options: Options) -> None:
     """All that `start` checks before it makes anything. Raises InputError as it does."""
     preparing.found(source, config, options).check_output(root)
 

@@ -23,7 +23,7 @@ from panolog.scene.model import Scene
 from panolog.scene.ply import ply_header
 from panolog.workers.events import Evaluated, Event, LeftOut, LpipsMissing, SeamMeasured
 from panolog.workers.seams.schema import Seam, SeamsFile
-from panolog.workers.tasks import TaskId
+from panolog.workers.tasks import NOTHING_HELD_OUT, TaskId
 
 _QUALITY = 92  # of the JPEGs
 _RULE = 4  # white rows between render and ground truth
@@ -115,6 +115,7 @@ class Evaluation:
             "lpips_reason": self.lpips_reason,
             "left_out": self.left_out,
             "views": self.views,
+            **({} if self.scene.test else {"unmeasured": NOTHING_HELD_OUT}),
             **({"pose_fit": fitted} if self.pose_fit else {}),
         }
 

@@ -12,6 +12,7 @@ from typing import Any
 from panolog.orchestrator.engine.stages.measuring import Measured
 from panolog.orchestrator.engine.stages.movers import write_movers
 from panolog.orchestrator.engine.stages.poses import save_poses
+from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.orchestrator.runs.info import RunInfo
 from panolog.scene.errors import SceneError
@@ -36,7 +37,12 @@ def scene_of(info: RunInfo, folder: RunFolder) -> Scene:
             f"{path}: the scene has changed since the run began{_newest(scene, info)}; put back what it"
             " was and resume, or start a new run"
         )
-    return scene
+    return divided(scene, info.config)
+
+
+def divided(scene: Scene, config: RunConfig) -> Scene:
+    """The scene of a run with these settings, which may hold nothing out."""
+    return scene.without_holdout() if config.holdout == "none" else scene
 
 
 def _newest(scene: Scene, info: RunInfo) -> str:

@@ -26,6 +26,14 @@ class Step(StrEnum):
     CHECK = "check"
 
 
+LABELS = {
+    Step.SFM: "finding poses and points",
+    Step.MASKS: "masking",
+    Step.DEPTH: "estimating depth",
+    Step.CHECK: "checking the scene",
+}
+
+
 class Options(BaseModel):
     """What a user may set of the preparation; None where a default depends on the source."""
 
@@ -55,11 +63,17 @@ class Settings(Options):
 
     format: Literal[1] = 1
     source: str  # folder or video
-    video: bool
-    panoramas: int  # in the folder, or frames in the video by its header
+    others: tuple[str, ...] = ()  # besides it, as they were given
+    video: bool  # or one of them at least
+    panoramas: int  # in the folders, and frames in the videos by their headers
     width: int  # of each in pixels
     nadir: float = Field(ge=0, le=90, description="degrees around straight down; 0 = none")
     static: bool = Field(description="mask what is the same in all panoramas")
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """All that the scene is made of."""
+        return (self.source, *self.others)
 
     def steps(self) -> tuple[Step, ...]:
         """Those that there are, in order."""
@@ -70,7 +84,7 @@ class Settings(Options):
         """What the result of a step depends on, besides that of the steps before."""
         match step:
             case Step.SFM:
-                return {"source": self.source, **self.sfm}
+                return {"source": self.source, **({"others": self.others} if self.others else {}), **self.sfm}
             case Step.MASKS:
                 return {"nadir": self.nadir, "static": self.static}
             case Step.DEPTH:

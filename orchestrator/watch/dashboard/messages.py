@@ -92,12 +92,13 @@ class RunRow(ViewModel):
         source = made.source if made else str(scene.get("path", "")) if isinstance(scene, dict) else ""
         model, config = summary.model, page.info.get("config")
         settings = config if isinstance(config, dict) else {}
+        more = f" and {len(made.others)} more" if made and made.others else ""
         return RunRow(
             id=page.id,
             name=page.name,
             status=summary.status,
             label=summary.label,
-            scene=Path(source).name,
+            scene=Path(source).name + more,
             stage=summary.stage,
             stage_label=STAGES.get(summary.stage, ""),
             progress=page.progress,

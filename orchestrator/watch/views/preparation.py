@@ -16,7 +16,7 @@ from panolog.scene.errors import InputError
 Read = Callable[[Path], bytes]  # the bytes of a file; raises OSError or InputError if there is none to read
 STEPS = {Step.MASKS: "masks", Step.SFM: "poses and points", Step.DEPTH: "depth", Step.CHECK: "check"}
 _LINES = 12  # of a step that are shown
-_BEFORE_MASKS = ("frames", "metadata")  # parts of finding poses
+_BEFORE_MASKS = ("frames", "stitching", "metadata", "sizes")  # parts of finding poses
 _PARTS: dict[str, tuple[str, ...]] = {  # of steps, in order, as they name them in their progress
     Step.MASKS: ("static regions", "masks"),
     Step.SFM: (
@@ -52,8 +52,9 @@ class PreparationView(ViewModel):
     """The preparation of a run; the counts are None before there are poses."""
 
     source: Text
-    video: bool
-    frames: int  # in the video by its header, or panoramas in the folder
+    others: tuple[Text, ...] = ()  # besides it
+    video: bool  # or one of them at least
+    frames: int  # in the videos by their headers, and panoramas in the folders
     panoramas: int | None  # chosen
     registered: int | None  # that have a pose
     points: int | None
@@ -104,6 +105,7 @@ def view_preparation(
     counts = made.counts if made else None
     return PreparationView(
         source=settings.source,
+        others=settings.others,
         video=settings.video,
         frames=settings.panoramas,
         **{name: getattr(counts, name, None) for name in Counts.model_fields},

@@ -52,7 +52,7 @@ from panolog.orchestrator.watch.views.summary import (
     task_label,
 )
 from panolog.orchestrator.watch.views.timing import eta_of, seconds_of, tasks_of
-from panolog.workers.tasks import Stage, TaskId
+from panolog.workers.tasks import NOTHING_HELD_OUT, Stage, TaskId
 
 WIDE = 120  # columns from which on a table has all its columns
 _MOST = 60  # blocks that are shown one by one; of more, those of _NOTABLE, at most so many
@@ -339,7 +339,7 @@ def _milestone(record: Record) -> str:
         case Merged():
             return f"{task}: {record.gaussians:,} Gaussians, {record.sky:,} of them sky"
         case EvaluationSaved():
-            return f"{task}: {metrics_line(record.metrics)}"
+            return f"{task}: {metrics_line(record.metrics) or NOTHING_HELD_OUT}"
         case Delivered() if record.path:
             return f"{task}: {record.path}, {record.size / 1e6:,.1f} MB of files for viewers"
     return ""

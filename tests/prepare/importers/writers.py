@@ -192,6 +192,22 @@ def roam360_prepared(folder: Path) -> tuple[Known, ImportSource]:
     return known, ImportSource(folder)
 
 
+def pose_table(folder: Path, *, angles: bool = False) -> tuple[Known, ImportSource]:
+    """A table with quaternions in CSV, or with angles between blanks, and a cloud next to it."""
+    known = make_known(folder)
+    head, separator = ("# Label X Y Z Omega Phi Kappa", " ") if angles else ("name,x,y,z,qx,qy,qz,qw", ",")
+    lines = [head]
+    for index, name in enumerate(known.names):
+        pose = known.camera_to_world(index, OPENGL if angles else np.eye(3))
+        turn = Rotation.from_matrix(pose[:3, :3])
+        attitude = turn.as_euler("XYZ", degrees=True) if angles else turn.as_quat()
+        lines.append(separator.join([name, *map(repr, [*pose[:3, 3].tolist(), *attitude.tolist()])]))
+    path = folder / ("poses.txt" if angles else "poses.csv")
+    path.write_text("\n".join(lines) + "\n")
+    write_ply(folder / "points.ply", known.points, known.colors)
+    return known, ImportSource(path)
+
+
 WRITERS: dict[str, tuple[str, Writer]] = {
     "openmvg": ("openmvg", openmvg),
     "openmvg, old": ("openmvg", partial(openmvg, mirrored=True)),
@@ -206,6 +222,8 @@ WRITERS: dict[str, tuple[str, Writer]] = {
     "360roam": ("360roam", roam360),
     "360roam, prepared": ("360roam", roam360_prepared),
     "panorama_sfm": ("panorama_sfm", panorama_sfm),
+    "poses": ("poses", pose_table),
+    "poses, angles": ("poses", partial(pose_table, angles=True)),
     "panorama_sfm, one ring": ("panorama_sfm", partial(panorama_sfm, pitches=(0.0,))),
 }
 WITH_TRACKS = {"openmvg", "openmvg, old", "opensfm", "spheresfm", "egonerf"}

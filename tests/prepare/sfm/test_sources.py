@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from panolog.prepare.sfm.pipeline import SfmSettings, make_scene, panoramas_in_folder, without_copies
+from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
+from panolog.prepare.sources.gather import panoramas_in_folder, without_copies
 from panolog.scene.errors import InputError
 from panolog.scene.write import no_progress
 
@@ -22,7 +23,7 @@ def _pictures(folder: Path, *shapes: tuple[int, int]) -> None:
     [
         ("nothing", "there is no such folder or video"),
         ("one", "1 panoramas"),
-        ("sizes", "all panoramas must have one size"),
+        ("sizes", r"1\.png: is 16 pixels wide, and 0\.png 128, more than 4 times as many; leave it out"),
         ("another format", r"1\.png: COLMAP cannot read this image; save it as"),
         ("taken", "already exists"),
         ("inside", "give a folder elsewhere"),
@@ -31,7 +32,7 @@ def _pictures(folder: Path, *shapes: tuple[int, int]) -> None:
 def test_refusals(what: str, message: str, tmp_path: Path) -> None:
     folder = tmp_path / "images"
     output = (folder if what == "inside" else tmp_path) / "scene"
-    shapes = {"one": [(64, 128)], "sizes": [(64, 128), (32, 64)]}
+    shapes = {"one": [(64, 128)], "sizes": [(64, 128), (8, 16)]}
     if what != "nothing":
         _pictures(folder, *shapes.get(what, []))
     if what == "another format":

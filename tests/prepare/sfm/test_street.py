@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from panolog.prepare.panorama_files import LayerFiles
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene, workspace_folder
-from panolog.prepare.sfm.reconstruct import LayerFiles
 from panolog.prepare.sfm.report import SfmReport
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene

@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from panolog.orchestrator.cli.session.preparing import settings_of
 from panolog.orchestrator.runs.preparation.settings import Options
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
+from panolog.prepare.sources.find import find_sources
+from panolog.prepare.sources.gather import gather
 from panolog.prepare.stitching.circles import halves
 from panolog.prepare.stitching.lenses import APPROXIMATE
 from panolog.prepare.video.decode import open_video
 from panolog.prepare.video.frames import extract_frames
 from panolog.scene.errors import InputError
+from panolog.scene.image_files import read_info
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
 from tests.orchestrator.cli.program import call, one_line, shown
@@ -152,3 +155,26 @@ def test_raw_files_become_a_scene_in_one_command(
     steps = np.diff(along)
     assert (np.sign(steps) == np.sign(steps[0])).all()  # in order along a line, as the camera has walked
     assert json.loads((tmp_path / "scene" / "sfm.json").read_bytes())["left_out"] == []
+
+
+def test_raw_files_go_with_panoramas_and_with_each_other(
+    walked: list[tuple[Image, Image]], tmp_path: Path
+) -> None:
+    card, photographs, stitched = (tmp_path / name for name in ("card", "photographs", "stitched"))
+    for folder in (card, photographs, stitched):
+        folder.mkdir()
+    raw("two files", card, [picture for _, picture in walked])
+    for number, (panorama, picture) in enumerate(walked[::4]):
+        cv2.imwrite(str(photographs / f"{number}.jpg"), picture)
+        (photographs / f"{number}.jpg").rename(photographs / f"{number}.insp")
+        cv2.imwrite(str(stitched / f"{number}.png"), panorama)
+    sources = find_sources([card, photographs, stitched])
+    found = gather(sources, tmp_path / "work", SfmSettings(), no_progress)
+    labels = [panorama.source for panorama in found.panoramas]
+    several = len(walked[::4])
+    assert labels.count("photographs") == labels.count("stitched") == several
+    assert labels.count("VID_20260101_000000_00_001") == len(labels) - 2 * several >= 3
+    sizes = {(info.width, info.height) for info in (read_info(it.path) for it in found.panoramas)}
+    assert sizes == {(walked[0][0].shape[1], walked[0][0].shape[0])}  # that of the widest
+    assert sum(note.endswith(APPROXIMATE) for note in found.notes) == 2
+    assert found.left_out == ()

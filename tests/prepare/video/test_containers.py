@@ -1,5 +1,6 @@
 """Videos as cameras write them: known frames in, the same frames out, in each codec and container."""
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from tests.prepare.video.containers import (
     box,
     equirectangular,
     full,
+    insert,
     known_frames,
     turn,
     write_clip,
@@ -194,6 +196,34 @@ def test_the_layout_of_the_pictures(
         assert list(video.frames()) == [0]
         assert (video.width, video.height) == (512, 256)
         assert same(video.picture(), shown(expected(frames[0])))
+
+
+@pytest.mark.parametrize(
+    ("size", "pixel", "width"),
+    [
+        ((512, 254), None, 512),  # scaled by a program that has lost two rows
+        ((384, 256), (4, 3), 512),  # narrower than shown
+        ((512, 192), (3, 4), 512),  # wider than shown
+        ((512, 256), (4, 3), 512),  # what is 2:1 is so, whatever its header says
+    ],
+)
+def test_pictures_that_are_shown_as_2_1_are_stretched_to_it(
+    size: tuple[int, int], pixel: tuple[int, int] | None, width: int, tmp_path: Path
+) -> None:
+    y, blue, red = known_frames(1, size=(size[0], -(-size[1] // BLOCK) * BLOCK))[0]
+    planes = y[: size[1]], blue[: size[1] // 2], red[: size[1] // 2]
+    path = write_clip(tmp_path / "clip.mp4", [planes])
+    if pixel is not None:
+        insert(path, "moov/trak/mdia/minf/stbl/stsd/*", box(b"pasp", struct.pack(">II", *pixel)))
+    with open_video(path) as video:
+        assert list(video.frames()) == [0]
+        assert (video.width, video.height) == (width, width // 2)
+        picture = video.picture()
+        assert picture is not None and picture.shape == (width // 2, width, 3)
+        rows, columns = size[1] // BLOCK, size[0] // BLOCK
+        at = [((np.arange(it) + 0.5) * BLOCK).astype(int) for it in (rows, columns)]
+        shown = picture[np.ix_(at[0] * (width // 2) // size[1], at[1] * width // size[0])]
+        assert np.abs(shown - expected(planes)[:rows, :columns]).max() < 1.1
 
 
 @pytest.mark.parametrize("version", [1, 2])

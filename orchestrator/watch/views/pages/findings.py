@@ -29,12 +29,16 @@ class PoseFit(ViewModel):
 
 
 class HeldOutMetrics(ViewModel):
-    """The metrics of held-out panoramas, and their means; `lpips_reason`, why there is no LPIPS."""
+    """The metrics of held-out panoramas, and their means; `lpips_reason`, why there is no LPIPS.
+
+    Or `unmeasured`, why there are none.
+    """
 
     mean: Metrics = Field(default_factory=dict)
     views: dict[str, Metrics] = Field(default_factory=dict)
     pose_fit: PoseFit | None = None
     lpips_reason: Text | None = None
+    unmeasured: Text | None = None
 
 
 class MovedCamera(ViewModel):

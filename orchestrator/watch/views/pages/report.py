@@ -89,7 +89,7 @@ def _own_paths(folder: RunFolder, info: dict[str, Any], prepared: PreparationVie
     found = [
         str(folder.root.absolute()),
         str(info["scene"]["path"]),
-        *([prepared.source] if prepared else []),
+        *([prepared.source, *prepared.others] if prepared else []),
     ]
     return sorted((path for path in found if Path(path).is_absolute()), key=len, reverse=True)
 

@@ -1,7 +1,7 @@
 """Runs of panoramas whose poses a fake finds."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from shutil import copy, copytree
@@ -14,7 +14,8 @@ from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.runs.config import load_config
 from panolog.orchestrator.runs.preparation.settings import Options
 from panolog.orchestrator.runs.state import ignore
-from panolog.prepare.sfm.pipeline import SfmSettings, WithMasks, panoramas_in_folder, workspace_folder
+from panolog.prepare.sfm.pipeline import SfmSettings, WithMasks, workspace_folder
+from panolog.prepare.sources.gather import panoramas_in_folder
 from panolog.scene.files import write_bytes
 from panolog.scene.write import StageProgress
 from tests.orchestrator.cli.session.test_session import calibrating
@@ -83,7 +84,9 @@ class FakeSfm:
         return Report()
 
 
-def start(source: Path, root: Path, *, action: Callable[[], object] = ignore, **options: Any) -> None:
+def start(
+    source: Path | Sequence[Path], root: Path, *, action: Callable[[], object] = ignore, **options: Any
+) -> None:
     session.start(source, root, CONFIG, None, ignore, calibrating(action), None, Options(**options))
 
 

@@ -124,7 +124,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     image(tmp_path / "flat" / "a.jpg", 64, 40)
     image(tmp_path / "flat" / "b.jpg", 64, 40)
     image(tmp_path / "sizes" / "a.jpg", 64, 32)
-    image(tmp_path / "sizes" / "b.jpg", 128, 64)
+    image(tmp_path / "sizes" / "b.jpg", 512, 256)
     (tmp_path / "none").mkdir()
     (tmp_path / "text.mp4").write_text("no video")
     writer = cv2.VideoWriter(str(tmp_path / "flat.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (320, 240))
@@ -139,7 +139,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
         "fisheye": "a.png: its two fisheye circles cannot be stitched: .*; or stitch it in",
         "one": "1 panoramas .*; at least 2 are needed",
         "flat": "64 x 40 pixels are not 2:1",
-        "sizes": "all panoramas must have one size",
+        "sizes": "a.jpg: is 64 pixels wide, and b.jpg 512, more than 4 times as many",
         "none": "the folder is empty",
         "missing": "there is no such file or folder",
         "text.mp4": "cannot be opened as a video|no video",

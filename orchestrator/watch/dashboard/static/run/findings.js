@@ -4,7 +4,7 @@
 /** @import { Choose } from "./run.js" */
 import { get, snapshot, urlOf } from "panolog/shared/api.js";
 import { byId, childrenOf, el, table } from "panolog/shared/dom.js";
-import { count, fixed, METRICS } from "panolog/shared/format.js";
+import { count, fixed, METRICS, sentence } from "panolog/shared/format.js";
 
 const MEANING =
   "PSNR is how far colours are off, in decibels: six more are half the error. " +
@@ -35,7 +35,8 @@ const metricsText = (values, prefix = "") =>
   }).join(", ");
 
 /** @param {HeldOutMetrics} metrics @param {Set<string>} pictured @param {Choose} choose */
-function quality({ mean, views, lpips_reason: reason }, pictured, choose) {
+function quality({ mean, views, lpips_reason: reason, unmeasured }, pictured, choose) {
+  if (unmeasured) return [note(sentence(unmeasured))];
   const rows = Object.entries(views);
   const [all, fitted] = [metricsText(mean), metricsText(mean, "cc_")];
   /** @param {[string, Record<string, number | null>]} row */

@@ -41,7 +41,11 @@ const TYPES = {
   SeamEvaluated: ["Seam", (e) => `blocks ${e.face}: ${fixed(e.seam)}`],
   Delivered: ["Delivered", (e) => (e.path ? `${e.path}, ${bytes(e.size)}, after ${duration(e.seconds)}` : "")],
   MeasuresSaved: ["Measures", (e) => `${count(e.views)} panoramas, ${count(e.faces)} seams`],
-  EvaluationSaved: ["Metrics", (e) => `PSNR ${decibel(e.metrics.psnr)}, SSIM ${fixed(e.metrics.ssim, 4)}`],
+  EvaluationSaved: [
+    "Metrics",
+    ({ metrics: { psnr, ssim } }) =>
+      psnr === undefined ? "nothing is held out" : `PSNR ${decibel(psnr)}, SSIM ${fixed(ssim, 4)}`,
+  ],
   Transferred: ["Moved", (e) => `${bytes(e.received)} received, ${bytes(e.sent)} sent`],
   StopRequested: [
     "Stop",

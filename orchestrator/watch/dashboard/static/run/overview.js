@@ -43,13 +43,13 @@ const MOST = 12; // tasks listed for one machine
  * @param {number} since seconds for which it has run since the message
  * @returns {[string, string][]}
  */
-function facts({ summary, progress, eta, latest, store }, live, since) {
+function facts({ info, summary, progress, eta, latest, store }, live, since) {
   const { model, seconds } = summary;
   return [
     ["Progress", percent(progress)],
     live ? ["ETA", duration(eta)] : ["Last update", ago(latest)],
     ["Elapsed", duration(seconds === null ? null : seconds + since)],
-    ["PSNR, held out", decibel(summary.metrics?.psnr)],
+    ["PSNR, held out", info.config?.holdout === "none" ? "not measured" : decibel(summary.metrics?.psnr)],
     live || !model ? ["Gaussians in training", short(summary.training_gaussians)] : ["Size", bytes(model.bytes)],
     ["Gaussians kept", short(summary.kept_gaussians)],
     ...costs(summary.money),

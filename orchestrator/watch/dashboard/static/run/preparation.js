@@ -16,11 +16,11 @@ import {
 import { count, duration } from "panolog/shared/format.js";
 
 /** What is known of the panoramas. @param {PreparationView} view @returns {[string, string][]} */
-function numbers({ video, frames, panoramas, registered, points, weak_links, contradictions }) {
+function numbers({ others, video, frames, panoramas, registered, points, weak_links, contradictions }) {
   /** @type {[string, number | null][]} */
   const all = [
-    [video ? "Frames in the video" : "Panoramas", frames],
-    ["Frames chosen", video ? panoramas : null],
+    [others.length && video ? "Panoramas and frames" : video ? "Frames in the video" : "Panoramas", frames],
+    [others.length ? "Chosen" : "Frames chosen", video ? panoramas : null],
     ["With a pose", registered],
     ["Without a pose", panoramas === null || registered === null ? null : panoramas - registered],
     ["Points", points],
@@ -76,7 +76,7 @@ export function preparation(path) {
       const now = summary.stage === "prepare";
       if (now !== making) details.open = now; // later the rest of the page matters more
       making = now;
-      setMessage(byId("preparation-source"), `of ${view.source}`);
+      setMessage(byId("preparation-source"), `of ${[view.source, ...view.others].join(", ")}`);
       reconcile(
         byId("steps"),
         view.steps,

@@ -3,7 +3,7 @@
 /** @import { Findings, RunPage } from "../shared/messages.js" */
 import { get } from "panolog/shared/api.js";
 import { byId, el, first, setMessage } from "panolog/shared/dom.js";
-import { count, decibel, fixed } from "panolog/shared/format.js";
+import { count, decibel, fixed, sentence } from "panolog/shared/format.js";
 
 const MADE =
   "Stage I trains the whole place at once. Scoring finds which panoramas matter to which block, " +
@@ -63,10 +63,11 @@ export async function report(path, { summary, result }) {
   for (const card of document.querySelectorAll("section.card")) {
     if (card instanceof HTMLElement && !OPEN.includes(card.id)) fold(card);
   }
-  const psnr = summary.metrics?.psnr ?? null;
-  if (psnr === null) return;
   /** @type {Findings} */
   const { metrics } = await get(`${path}/findings`);
+  if (metrics?.unmeasured) setMessage(byId("verdict"), sentence(metrics.unmeasured));
+  const psnr = summary.metrics?.psnr ?? null;
+  if (psnr === null) return;
   const seen = Object.keys(metrics?.views ?? {}).length;
   const off = `${fixed(100 * 10 ** (-psnr / 20), 1)} % of full brightness on average`;
   setMessage(

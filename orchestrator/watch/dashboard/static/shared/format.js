@@ -50,6 +50,9 @@ export function clock(time, other = Date.now() / 1000) {
   return day + date.toLocaleTimeString("en-GB");
 }
 
+/** Words as a sentence. @param {string} text */
+export const sentence = (text) => `${text.charAt(0).toUpperCase()}${text.slice(1)}.`;
+
 /** A path or another text as a word of a shell command. @param {string} text */
 export const shellWord = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 

@@ -156,6 +156,7 @@ export interface HeldOutMetrics {
   views: Record<string, Record<string, number | null>>;
   pose_fit: PoseFit | null;
   lpips_reason: string | null;
+  unmeasured: string | null;
 }
 
 /** A held-out panorama with its metrics. */
@@ -293,6 +294,7 @@ export interface PoseFit {
 /** The preparation of a run; the counts are None before there are poses. */
 export interface PreparationView {
   source: string;
+  others: Array<string>;
   video: boolean;
   frames: number;
   panoramas: number | null;

@@ -1,0 +1,231 @@
+"""The panoramas of the sources of a scene: chosen frames of videos, and photographs, stitched if need be.
+
+Each source is looked at by itself. What is made of it is kept in the workspace, and used by a later call.
+"""
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+from panolog.prepare.panorama_files import (
+    SUFFIXES,
+    LayerFiles,
+    PanoramaFile,
+    look_into,
+    masks_among,
+    pictures_below,
+)
+from panolog.prepare.sources.find import Source, Sources
+from panolog.prepare.sources.sizes import to_one_size
+from panolog.prepare.stitching.lenses import Up
+from panolog.prepare.stitching.pictures import INSP, raw_pictures, stitch_pictures
+from panolog.prepare.video.frames import extract_frames
+from panolog.prepare.world.cropped import complete_panoramas
+from panolog.prepare.world.exif import read_exif
+from panolog.scene.errors import SceneError
+from panolog.scene.read import DEPTHS, MASKS, MIN_CAMERAS, SKY_MASKS, check_names, find_layer
+from panolog.scene.write import Progress, StageProgress, part_of
+
+_LAYERS = (MASKS, SKY_MASKS, DEPTHS)
+Note = Callable[[str], None]
+
+
+class Choice(Protocol):
+    """What is chosen of videos, and how raw files are stitched."""
+
+    @property
+    def parallax(self) -> float:
+        """Degrees between two frames of a video."""
+
+    @property
+    def frames(self) -> int | None:
+        """How many of each video at most."""
+
+    @property
+    def up(self) -> Up | None:
+        """Where up is in the first circle of what is to be stitched."""
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """The panoramas of a scene."""
+
+    panoramas: tuple[PanoramaFile, ...]  # of one size, in the order of capture
+    layers: LayerFiles
+    left_out: tuple[str, ...]  # what of the sources was not read, one line for each kind
+    notes: tuple[str, ...]  # what videos and raw files lack, and what was scaled
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A panorama with its layers."""
+
+    panorama: PanoramaFile
+    layers: dict[str, Path | None]
+
+
+def gather(sources: Sources, work: Path, choice: Choice, progress: StageProgress) -> Gathered:
+    """The panoramas of all sources. Args: work, the workspace.
+
+    Raises InputError if a source is wrong, or there is nothing else than copies of one panorama; OSError if a
+    file cannot be read or written.
+    """
+    notes, left_out = list[str](), list(sources.left_out)
+    videos = [it for it in sources.all if it.is_video]
+    folders = [it for it in sources.all if not it.is_video]
+    rows = dict[Source, list[_Row]]()
+    for turn, source in enumerate(videos):
+        show = part_of(partial(progress, "frames"), turn, len(videos))
+        rows[source] = _frames(source, _place(work, source), choice, show, notes.append)
+    for turn, source in enumerate(folders):
+        show = part_of(partial(progress, "stitching"), turn, len(folders))
+        folder, others = _stitched(source.path, _place(work, source), choice.up, show, notes.append)
+        rows[source] = _photographs(source, folder, MIN_CAMERAS if len(sources.all) == 1 else 1)
+        left_out += others
+    if folders:
+        taken = [row for source in folders for row in rows[source]]
+        least = 1 if videos else MIN_CAMERAS
+        whole, copies = _completed(taken, least, work / "whole", partial(progress, "metadata"))
+        left_out[:0] = copies
+        rows |= {source: [it for it in whole if it.panorama.source == source.label] for source in folders}
+    if len(sources.all) > 1:
+        rows |= {source: _in_order(rows[source]) for source in folders}
+    found = [row for source in sources.all for row in rows[source]]
+    panoramas = [row.panorama for row in found]
+    check_names(work, [panorama.name for panorama in panoramas])
+    sized = to_one_size(panoramas, work / "sized", partial(progress, "sizes"), notes.append)
+    layers = {layer: [row.layers.get(layer) for row in found] for layer in _LAYERS}
+    return Gathered(sized, layers, tuple(left_out), tuple(notes))
+
+
+def _place(work: Path, source: Source) -> Path:
+    """The folder for what is made of a source."""
+    return work / "sources" / source.label if source.label else work
+
+
+def _labelled(source: Source, panorama: PanoramaFile) -> PanoramaFile:
+    """A panorama with the label of its source in its name."""
+    name = f"{source.label}/{panorama.name}" if source.label else panorama.name
+    return replace(panorama, name=name, source=source.label)
+
+
+def _frames(source: Source, place: Path, choice: Choice, progress: Progress, note: Note) -> list[_Row]:
+    """The chosen frames of a video."""
+    folder = place / "frames"
+    files = extract_frames(
+        source.path,
+        folder,
+        parallax=choice.parallax,
+        most=choice.frames,
+        up=choice.up,
+        progress=progress,
+        note=note,
+    )
+    masks = find_layer(folder, MASKS, [file.name for file in files])
+    return [
+        _Row(_labelled(source, PanoramaFile(folder, file.name, file)), {MASKS: mask})
+        for file, mask in zip(files, masks, strict=True)
+    ]
+
+
+def _stitched(
+    folder: Path, place: Path, up: Up | None, progress: Progress, note: Note
+) -> tuple[Path, list[str]]:
+    """The folder with the panoramas of one whose pictures are not stitched; any other as it is.
+
+    And a line for each kind of files in it that are left out.
+    """
+    given = pictures_below(folder)
+    pictures = raw_pictures(given) if folder.is_dir() else []
+    if not pictures:
+        return folder, look_into(given).left_out
+    stitch_pictures(pictures, given, place / "stitched", up=up, progress=progress, note=note)
+    return place / "stitched", look_into(given, {INSP}).left_out
+
+
+def _photographs(source: Source, folder: Path, least: int) -> list[_Row]:
+    """The panoramas of a source that is a folder. Args: folder, where they are."""
+    panoramas, layers = panoramas_in_folder(folder, least)
+    of_each = zip(*layers.values(), strict=True)
+    return [
+        _Row(_labelled(source, panorama), dict(zip(layers, files, strict=True)))
+        for panorama, files in zip(panoramas, of_each, strict=True)
+    ]
+
+
+def _completed(
+    rows: Sequence[_Row], least: int, folder: Path, progress: Progress
+) -> tuple[list[_Row], list[str]]:
+    """Photographs without copies, whole where they are cropped; and a line for each copy."""
+    panoramas = [row.panorama for row in rows]
+    layers = {layer: [row.layers.get(layer) for row in rows] for layer in _LAYERS}
+    kept, layers, lines = without_copies(panoramas, layers, least)
+    whole = complete_panoramas(kept, folder, progress)
+    of_each = zip(*layers.values(), strict=True)
+    return [
+        _Row(it, dict(zip(layers, files, strict=True))) for it, files in zip(whole, of_each, strict=True)
+    ], lines
+
+
+def _in_order(rows: Sequence[_Row]) -> list[_Row]:
+    """Photographs in the order in which they were taken, if all say when; else of their names."""
+    times = [read_exif(row.panorama.path).time for row in rows]
+    known = [(time, place) for place, time in enumerate(times) if time is not None]
+    return [rows[place] for _, place in sorted(known)] if len(known) == len(rows) else list(rows)
+
+
+def panoramas_in_folder(
+    source: Path, least: int = MIN_CAMERAS
+) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
+    """The panoramas in a folder, or in its folder images or imgs, and the layers next to or among them.
+
+    A picture NAME_mask.png next to NAME.jpg is its mask.
+
+    Raises SceneError: there is no such folder, it has fewer than `least` panoramas, or their names collide.
+    """
+    if not source.is_dir():
+        raise SceneError(f"{source}: there is no such folder or video")
+    inner = pictures_below(source)
+    content = look_into(inner)
+    images = [path for path in content.images if path.relative_to(inner).parts[0] not in _LAYERS]
+    among = masks_among(images)
+    files = [path for path in images if path not in among.values()]
+    if len(files) < least:
+        reason = "; ".join([f"at least {least} are needed", *content.left_out])
+        raise SceneError(f"{inner}: {len(files)} panoramas ({', '.join(sorted(SUFFIXES))}); {reason}")
+    names = tuple(path.relative_to(inner).as_posix() for path in files)
+    check_names(inner, names)
+    is_root = inner != source or any((source / layer).is_dir() for layer in _LAYERS)
+    root = source if is_root else source.parent
+    layers = {layer: find_layer(root, layer, names) for layer in _LAYERS}
+    layers[MASKS] = [mask or among.get(file) for mask, file in zip(layers[MASKS], files, strict=True)]
+    return tuple(PanoramaFile(root, name, file) for name, file in zip(names, files, strict=True)), layers
+
+
+def without_copies(
+    panoramas: Sequence[PanoramaFile], layers: LayerFiles, least: int = MIN_CAMERAS
+) -> tuple[tuple[PanoramaFile, ...], LayerFiles, list[str]]:
+    """The panoramas whose files differ, their layers, and a line for each other one: it shows nothing more.
+
+    Raises: SceneError, fewer than `least` differ.
+    """
+    sizes = Counter(panorama.path.stat().st_size for panorama in panoramas)
+    first, kept, lines = dict[bytes, str](), list[int](), list[str]()
+    for row, panorama in enumerate(panoramas):
+        if sizes[panorama.path.stat().st_size] > 1:
+            digest = hashlib.sha256(panorama.path.read_bytes()).digest()
+            if digest in first:
+                lines.append(f"{panorama.name}: is a copy of {first[digest]}, left out")
+                continue
+            first[digest] = panorama.name
+        kept.append(row)
+    if len(kept) < least:
+        raise SceneError(
+            f"{panoramas[0].root}: all panoramas are copies of {panoramas[0].name}; give different ones"
+        )
+    chosen = {layer: [files[row] for row in kept] for layer, files in layers.items()}
+    return tuple(panoramas[row] for row in kept), chosen, lines
