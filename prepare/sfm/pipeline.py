@@ -16,6 +16,7 @@ from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
 from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
 from panolog.prepare.sfm.report import SfmReport, write_report
+from panolog.prepare.sfm.sketch import Sketch, Sketcher
 from panolog.prepare.sfm.trajectory import Trajectory, fit_world, places_of, read_trajectory
 from panolog.prepare.stitching.lenses import Up
 from panolog.prepare.stitching.pictures import raw_pictures, stitch_pictures
@@ -61,11 +62,13 @@ def make_scene(
     progress: StageProgress,
     with_masks: WithMasks = lambda _, layers: layers,
     memory: int = MEMORY,
+    show: Callable[[Sketch], None] | None = None,
 ) -> SfmReport:
     """Makes a scene of `source`, a folder or a video, in the new folder `output`, with its report.
 
     Args: with_masks, gets the panoramas and their layers, and returns the layers with masks that it has made;
-        those of an interrupted job must stay as they are; memory, bytes that may be used.
+        those of an interrupted job must stay as they are; memory, bytes that may be used; show, called with
+        what is known of the place as poses are found.
 
     Raises SceneError if the source is wrong or its panoramas share too little: there is no `output` then, and
     what was done is kept for the next call. RunError if a process is killed, OSError if a file fails.
@@ -79,6 +82,9 @@ def make_scene(
     panoramas, layers, copies = _panoramas_of(source, folder, settings, notes.append, progress)
     layers = with_masks(panoramas, layers)
     places = None if known is None else _places(known, source, folder, panoramas)
+    sketcher = None if show is None else Sketcher(panoramas, show, gps=settings.gps)
+    if sketcher is not None:
+        sketcher.begin()
     found = reconstruct(
         panoramas,
         layers,
@@ -89,6 +95,7 @@ def make_scene(
         progress=progress,
         memory=memory,
         places=places,
+        sketcher=sketcher,
     )
     left_out = (*copies, *look_into(pictures_below(source)).left_out)  # a file has nothing below it
     reports = [
