@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 
 from panolog.orchestrator.engine.driver.journal import Journal
 from panolog.orchestrator.engine.driver.requests import interrupt
-from panolog.orchestrator.engine.stages.outline import write_outline
+from panolog.orchestrator.engine.stages.outline import write_outline, write_sketch
 from panolog.orchestrator.runs import control
 from panolog.orchestrator.runs import info as run_info
 from panolog.orchestrator.runs.config import RunConfig
@@ -288,10 +288,8 @@ class Preparation:
             shutil.rmtree(scene)  # its driver was killed before the report: the workspace has all for both
         if not scene.exists():
             options = TypeAdapter(SfmSettings).validate_python(settings.sfm)
-            show = self.progress(Step.SFM)
-            made = make_scene(
-                Path(settings.source), scene, options, show, self._with_masks, memory() * 3 // 4
-            )
+            given = options, self.progress(Step.SFM), self._with_masks, memory() * 3 // 4
+            made = make_scene(Path(settings.source), scene, *given, self._sketched)
             self._lines += made.lines()
         shutil.rmtree(workspace_folder(scene.resolve()), ignore_errors=True)
         for masks in (MASKS, GIVEN):  # the scene has copies
@@ -301,7 +299,12 @@ class Preparation:
         self._lines = self._lines or [f"{counts.registered} of {counts.panoramas} panoramas have a pose"]
         lines = [*self._notices(counts), *content.get("left_out", ())]
         self.journal.record([Noticed(PREPARE, line) for line in lines])
-        self.journal.until_done(lambda: write_outline(self.folder, read_scene(scene), RunConfig()))
+        self.journal.until_done(lambda: write_outline(self.folder, read_scene(scene), RunConfig(), anew=True))
+
+    def _sketched(self, sketch: Any) -> None:
+        """Shows what is known of the place; a disk that takes nothing does not matter."""
+        with suppress(OSError):
+            write_sketch(self.folder, **vars(sketch))
 
     def _notices(self, counts: Counts) -> Iterator[str]:
         """What the user should read of the reconstruction."""
