@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")  # of `Gaussians`, in their order
+EXACT = "exact"  # in tensors by name, where `Gaussians.exact`
 SH_REST = 15  # coefficients of degrees 1 to 3
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 

@@ -29,14 +29,25 @@ class Progress:
     rates: dict[str, float] = field(default_factory=dict)  # learning rates by parameter
 
 
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """All that a task needs to continue as if it had not been interrupted."""
+
+    task: TaskId
+    iteration: int
+    tensors: dict[str, Tensor]
+
+
 @dataclass(frozen=True)
 class Preview:
-    """A rendered training panorama above its ground truth."""
+    """A rendered panorama above its ground truth, and in Stage I what a 3D view shows of the model then."""
 
     task: TaskId
     iteration: int
     view: str  # name of the panorama
     jpeg: bytes  # render above ground truth
+    held_out: bool = False  # whether no task trains on it
+    snapshot: Checkpoint | None = None  # of `training.snapshot`: nothing continues from it
 
 
 @dataclass(frozen=True)
@@ -57,15 +68,6 @@ class LeftOut(Notice):
     """A panorama that a task leaves out, because it cannot be decoded."""
 
     view: str  # name of the panorama
-
-
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """All that a task needs to continue as if it had not been interrupted."""
-
-    task: TaskId
-    iteration: int
-    tensors: dict[str, Tensor]
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,7 @@
 import math
 import resource
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,12 +12,8 @@ import torch
 
 from panolog.workers.events import Progress
 from panolog.workers.tasks import TaskId
-from panolog.workers.training.task_config import PreviewConfig
 
 INTERVAL = 1.0  # seconds between two reports
-EARLY = (10, 30, 100, 300)  # iterations with a preview: in minutes one sees whether poses and pictures fit
-SHARE = 0.01  # of the time of a task that its previews by time may take
-_GROWTH = 0.05  # of a task's time until the next one: days of training have a few dozen more than a minute
 _CLEAR_REFS, _RESET_PEAK = Path("/proc/self/clear_refs"), "5"  # proc(5): sets the peak to the current size
 _STATUS = Path("/proc/self/status")
 
@@ -66,28 +61,6 @@ class Meter:
         )
         self._since, self._count, self._losses, self._psnrs = now, 0, [], []
         return report
-
-
-class PreviewClock:
-    """When a picture of a task in training is due: early at first, later also by time."""
-
-    def __init__(self, config: PreviewConfig) -> None:
-        self._config = config
-        self._began = time.monotonic()
-        self._next = self._began + config.seconds
-
-    def due(self, iteration: int) -> bool:
-        """Whether there should be one after an iteration."""
-        regular = iteration in EARLY or iteration % self._config.every == 0
-        return regular or time.monotonic() >= self._next
-
-    @contextmanager
-    def timed(self) -> Iterator[None]:
-        """The time in which one is made, after which the next one waits."""
-        began = time.monotonic()
-        yield
-        now = time.monotonic()
-        self._next = now + max(self._config.seconds, (now - began) / SHARE, (now - self._began) * _GROWTH)
 
 
 def _mean(values: list[float]) -> float | None:

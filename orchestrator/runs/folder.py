@@ -9,6 +9,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
+from panolog.orchestrator.runs import lock
 from panolog.scene.errors import InputError, RunFolderError
 from panolog.scene.files import stem_of, write_bytes
 from panolog.workers.tasks import COARSE, Stage, TaskId
@@ -48,6 +49,7 @@ class RunFolder:
     plan = _At("partition/plan.json")  # the partition
     outline = _At("outline/plan.json")  # the place before it is partitioned, as a plan of one block
     outline_points = _At("outline/points.ply")  # some of the sparse points, PLY
+    outline_fixes = _At("outline/gps.ply")  # where GPS has the panoramas, PLY: perhaps nothing
     plan_picture = _At("partition/plan.png")  # the partition from above
     scores = _At("partition/scores.npz")  # all gradient scores (eq. 10), sparse: see `partition.scores`
     point_cloud = _At("point_cloud.ply")  # the merged model
@@ -90,12 +92,16 @@ class RunFolder:
         return self.of(task) / "previews"
 
     def preview(self, task: TaskId, iteration: int) -> Path:
-        """A training view as it was rendered at an iteration, above its photograph."""
+        """A panorama as it was rendered at an iteration, above its photograph."""
         return self.previews(task) / f"{iteration:06d}.jpg"
 
     def checkpoint(self, task: TaskId) -> Path:
         """The last checkpoint of a training task."""
         return self.of(task) / "checkpoint.safetensors"
+
+    def snapshot(self, task: TaskId) -> Path:
+        """What a 3D view shows of the model of Stage I in training: see `shown_model`."""
+        return self.of(task) / "snapshot.safetensors"
 
     def earlier_checkpoint(self, task: TaskId, iteration: int) -> Path:
         """One before the last, where the settings keep more than one."""
@@ -219,6 +225,23 @@ def model_of(folder: RunFolder, task: TaskId | None = None) -> Path:
     raise RunFolderError(
         f"{folder.root}: {task or 'the run'} has no model yet; its first checkpoint makes one"
     )
+
+
+def shown_model(folder: RunFolder, task: TaskId | None = None) -> Path:
+    """The file of the model that a 3D view shows: `model_of`, or of Stage I in training its latest snapshot.
+
+    A checkpoint counts in its place only once no driver is at work: in between it would have other details.
+    Raises InputError as `model_of` does.
+    """
+    snapshot, last = folder.snapshot(COARSE), folder.checkpoint(COARSE)
+    if task not in (None, COARSE) or not snapshot.is_file():
+        return model_of(folder, task)
+    try:
+        file = model_of(folder, task)
+    except RunFolderError:
+        return snapshot
+    superseded = last.is_file() and last.stat().st_mtime_ns > snapshot.stat().st_mtime_ns
+    return snapshot if file == last and (lock.held(folder.lock) or not superseded) else file
 
 
 def removed_models(folder: RunFolder) -> frozenset[str]:

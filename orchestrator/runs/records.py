@@ -108,12 +108,13 @@ class Progressed:
 
 @dataclass(frozen=True)
 class PreviewSaved:
-    """A training view was rendered with its photograph."""
+    """A panorama was rendered in training, with its photograph."""
 
     task: TaskId
     iteration: int
     view: str
     path: str
+    held_out: bool = False  # whether no task trains on it
 
 
 @dataclass(frozen=True)

@@ -46,19 +46,23 @@ def _incremental(work: Workspace, max_error: float, progress: StageProgress) -> 
     options.mapper.init_max_forward_motion = 1.0
     options.mapper.init_min_tri_angle = _FIRST_ANGLE
     options.mapper.abs_pose_min_num_inliers = _LEAST
-    done = 2
+    models, done = pycolmap.ReconstructionManager(), 2
 
     def another() -> None:
         nonlocal done
         done = min(done + 1, len(work.numbers))
         progress("poses", done, len(work.numbers))
+        if work.sketcher is not None:
+            work.sketcher.add(models.get(models.size() - 1), work.numbers)
 
     progress("poses", 0, len(work.numbers))
-    found = pycolmap.incremental_mapping(
-        work.database, work.images, work.models, options, next_image_callback=another
-    )
+    options.image_path = work.images
+    with pycolmap.Database.open(work.database) as database:
+        pipeline = pycolmap.IncrementalPipeline(options, database, models)
+    pipeline.add_callback(pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK, another)
+    pipeline.run()
     progress("poses", len(work.numbers), len(work.numbers))
-    return list(found.values())
+    return [models.get(number) for number in range(models.size())]
 
 
 def _global(work: Workspace, progress: StageProgress) -> list[pycolmap.Reconstruction]:

@@ -14,6 +14,7 @@ from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
 from panolog.prepare.sfm.reconstruct import Reconstruction, reconstruct
 from panolog.prepare.sfm.report import SfmReport, write_report
+from panolog.prepare.sfm.sketch import Sketch, Sketcher
 from panolog.prepare.sfm.trajectory import (
     Trajectory,
     check_times,
@@ -64,12 +65,13 @@ def make_scene(
     progress: StageProgress,
     with_masks: WithMasks = lambda _, layers: layers,
     memory: int = MEMORY,
+    show: Callable[[Sketch], None] | None = None,
 ) -> SfmReport:
     """Makes a scene of `source` in the new folder `output`, with its report.
 
     Args: source, a folder or a video, or several; with_masks, gets the panoramas and their layers, and
         returns the layers with masks that it has made; those of an interrupted job must stay as they are;
-        memory, bytes that may be used.
+        memory, bytes that may be used; show, called with what is known of the place as poses are found.
 
     Raises SceneError if the source is wrong or its panoramas share too little: there is no `output` then, and
     what was done is kept for the next call. RunError if a process is killed, OSError if a file fails.
@@ -87,6 +89,9 @@ def make_scene(
     panoramas = gathered.panoramas
     layers = with_masks(panoramas, gathered.layers)
     places = None if known is None else _places(known, sources, folder, panoramas)
+    sketcher = None if show is None else Sketcher(panoramas, show, gps=settings.gps)
+    if sketcher is not None:
+        sketcher.begin()
     found = reconstruct(
         panoramas,
         layers,
@@ -97,6 +102,7 @@ def make_scene(
         progress=progress,
         memory=memory,
         places=places,
+        sketcher=sketcher,
     )
     reports = [
         _report(part, number, settings, places, gathered, sources)

@@ -14,6 +14,7 @@ from panolog.prepare.sfm.features import MEMORY, find_features
 from panolog.prepare.sfm.links import Link, find_links
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing, best_matches, choose_pairs, match_pairs
+from panolog.prepare.sfm.sketch import Sketcher
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.trajectory import near_pairs
 from panolog.prepare.sfm.workspace import Workspace, file_state, silence_colmap
@@ -60,17 +61,18 @@ def reconstruct(
     progress: StageProgress,
     places: NDArray[np.float64] | None = None,
     memory: int = MEMORY,
+    sketcher: Sketcher | None = None,
 ) -> list[Reconstruction]:
     """Features, matches, poses and points of `panoramas`. Results are kept in `folder`, for the next call.
 
     Args: partial, accept parts of which none has more than half of them; memory, bytes that may be used;
-        places, (K, 3) where they were taken, by a known trajectory, NaN where it is not.
+        places, (K, 3) where they were taken, by a known trajectory, NaN where it is not; sketcher of poses.
     Returns: the parts that are each without a contradiction, the largest first.
     Raises: SceneError, a file is damaged or of another size, or the panoramas share too little.
     """
     size = check_images([panorama.path for panorama in panoramas])
     names = [panorama.name for panorama in panoramas]
-    work = Workspace(folder, tuple(panoramas))
+    work = Workspace(folder, tuple(panoramas), sketcher=sketcher)
     masks = [
         [path for layer in (MASKS, SKY_MASKS) if (path := layers.get(layer, [None] * len(names))[row])]
         for row in range(len(names))
@@ -82,8 +84,7 @@ def reconstruct(
         if features == 0:
             where = panoramas[0].path.parent
             raise SceneError(f"{where}: no features in any panorama; are they masked, or empty?")
-        near = near_pairs(places, _NEAREST) if places is not None else []
-        pairs = choose_pairs(work, pairing, progress, near)
+        pairs = choose_pairs(work, pairing, progress, [] if places is None else near_pairs(places, _NEAREST))
         match_pairs(work, pairs, allowed, progress)
         solver = Solver(work, size, mapper, allowed, progress, places)
         least = min(len(panoramas), max(3, min(_LEAST, len(panoramas) // 2 + 1)))

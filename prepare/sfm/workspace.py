@@ -16,6 +16,7 @@ import numpy as np
 import pycolmap
 
 from panolog.prepare.panorama_files import PanoramaFile
+from panolog.prepare.sfm.sketch import Sketcher
 from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.image_files import read_info
@@ -49,6 +50,7 @@ class Workspace:
     folder: Path
     panoramas: tuple[PanoramaFile, ...]
     name: str = "database.db"
+    sketcher: Sketcher | None = None  # shows the poses as they are found
 
     @property
     def database(self) -> Path:

@@ -98,6 +98,17 @@ def collect_fixes(fixes: Sequence[GpsFix | None]) -> GpsFixes | None:
     return GpsFixes(origin, tuple(np.array(members, np.int64) for members in rows.values()), enu)
 
 
+def east_north_up(fixes: Sequence[GpsFix], origin: Origin) -> Array:
+    """(F, 3) metres east, north and up of an origin; a fix without an altitude is level with it."""
+    places = [
+        (fix.latitude, fix.longitude, origin.altitude if fix.altitude is None else fix.altitude)
+        for fix in fixes
+    ]
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    where = origin.latitude, origin.longitude, origin.altitude
+    return np.array(transform.ellipsoid_to_enu(np.array(places).reshape(-1, 3), *where))
+
+
 def _altitude(fixes: Sequence[GpsFix | None]) -> float:
     """The median altitude of fixes at one place, in metres; NaN if none has one."""
     known = [fix.altitude for fix in fixes if fix is not None and fix.altitude is not None]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from panolog.orchestrator.engine.stages.outline import write_sketch
 from panolog.orchestrator.engine.stages.partitioning import plan_records, write_plan
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.config import RunConfig
@@ -174,9 +175,9 @@ def _train(
             number, checkpoint = round(share * LENGTH), run.folder.relative(run.folder.checkpoint(task))
             path = run.folder.of(task) / "previews" / f"{number:06d}.jpg"
             town.write_picture(path, 2 * (task.index or 0) + quarter, share)
-            name = f"street_{3 * (task.index or 0) + quarter:03d}.jpg"
+            name = f"street_{3 * (task.index or 0):03d}.jpg"
             run.add(
-                PreviewSaved(task, number, name, run.folder.relative(path)),
+                PreviewSaved(task, number, name, run.folder.relative(path), held_out=task == COARSE),
                 CheckpointSaved(task, number, checkpoint, 240 * gaussians),
                 after=0,
             )
@@ -334,6 +335,9 @@ def preparing(root: Path, clock: Clock) -> RunFolder:
         masked = ("2.3% of the sphere: 10° around straight down, what is the same in all panoramas",)
         masks = StepResult(step=Step.MASKS, settings={}, seconds=312, lines=masked)
         write_note(result_path(folder, Step.MASKS), masks)
+        places, names = town.cameras(_CAMERAS), [f"arcade_{30 * row:06d}.jpg" for row in range(_CAMERAS)]
+        drift = np.random.default_rng(4).normal(0, [1.5, 1.5, 3], places.shape)
+        write_sketch(folder, names, places, town.points(), places + drift)
         town.write_path(sfm_picture(folder))
         town.write_picture(masks_picture(folder), 3, 0.9)
         run.add(Preparing("estimating depth", PREPARE), after=1_412)

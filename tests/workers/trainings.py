@@ -14,7 +14,7 @@ from panolog.renderer import ops
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import Checkpoint, Event, Notice, Progress, Scored, Trained
+from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Scored, Trained
 from panolog.workers.scoring import ScoreSpec, score
 from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
@@ -143,6 +143,8 @@ def content(event: Event) -> object:
             arrays = {} if event.captured is None else vars(event.captured)
             captured = {name: array.tobytes() for name, array in arrays.items() if array is not None}
             return event.gaussians.sky, bytes_of(event.gaussians), captured
+        case Preview(snapshot=Checkpoint() as saved):
+            return replace(event, snapshot=None), content(saved)
         case _:
             return event
 

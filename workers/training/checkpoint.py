@@ -15,11 +15,11 @@ from torch import Tensor
 
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.files import Locate, atomic, here
-from panolog.scene.gaussians import Gaussians
+from panolog.scene.gaussians import EXACT, Gaussians
 from panolog.workers.events import Checkpoint, Notice
 from panolog.workers.specs import Source
 from panolog.workers.tasks import TaskId
-from panolog.workers.training.optimizer import AVERAGE, EXACT, MOMENT
+from panolog.workers.training.optimizer import AVERAGE, MOMENT
 
 _SUM = "crc32"  # in the metadata
 _ROWS = 2**16  # of a model in memory at a time

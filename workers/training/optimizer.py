@@ -7,12 +7,11 @@ import torch
 from torch import Tensor
 
 from panolog.renderer.adam import Moving
-from panolog.scene.gaussians import Gaussians
+from panolog.scene.gaussians import EXACT, PARAMETERS, SH_REST, Gaussians
 
 MOMENT = "exp_avg."  # in `ModelState.tensors`, before the name of a parameter
 AVERAGE = "average."  # before the names of what `Average.tensors` has
 _COUNT = f"{AVERAGE}count"
-EXACT = "exact"  # in them where `Gaussians.exact`
 UNITS = "units."  # before the names of parameters whose rate has units
 
 
@@ -36,9 +35,8 @@ class ModelState:
     def from_tensors(tensors: Mapping[str, Tensor]) -> "ModelState":
         """The inverse of `tensors`, sharing memory: steps change the tensors in place."""
         names = [name.removeprefix(MOMENT) for name in tensors if name.startswith(MOMENT)]
-        exact = EXACT in tensors
         return ModelState(
-            Gaussians(**{name: tensors[name] for name in names}, sky=int(tensors["sky"]), exact=exact),
+            gaussians_of(tensors),
             {name: tensors[f"{MOMENT}{name}"] for name in names},
             {name: tensors[f"exp_avg_sq.{name}"] for name in names},
             {
@@ -114,6 +112,14 @@ class ModelState:
             source = valid.nonzero()[:, 0]
             self.rearrange(source, torch.zeros_like(source, dtype=torch.bool), sky)
         return invalid
+
+
+def gaussians_of(tensors: Mapping[str, Tensor]) -> Gaussians:
+    """The model in a checkpoint, sharing memory; coefficients that a snapshot lacks are zero."""
+    model = {name: tensors[name] for name in PARAMETERS}
+    if missing := SH_REST - model["shN"].shape[1]:
+        model["shN"] = torch.nn.functional.pad(model["shN"], (0, 0, 0, missing))
+    return Gaussians(**model, sky=int(tensors["sky"]), exact=EXACT in tensors)
 
 
 def trained_rows(gaussians: Gaussians, degree: int, *, refine: bool, sky_scales: bool) -> dict[str, int]:

@@ -36,7 +36,7 @@ class PreviewConfig(Group):
 
     every: int = Field(default=500, ge=1, description="iterations as they are between two, a render each")
     seconds: float = Field(
-        default=10.0,
+        default=5.0,
         gt=0,
         description="seconds between two at first, besides those of iterations 10, 30, 100, 300; more later,"
         " or where they would take over 1 % of the time",

@@ -11,7 +11,6 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,7 +19,7 @@ from panolog.renderer import ops
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda.iteration import Problem
-from panolog.renderer.render import encode_jpeg, hatched, render, to_bytes
+from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache, View
@@ -30,9 +29,11 @@ from panolog.workers.capture.learning import Learning
 from panolog.workers.comparison import better_block, with_block
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Trained
 from panolog.workers.merge import retained
-from panolog.workers.meter import Meter, PreviewClock
+from panolog.workers.meter import Meter
+from panolog.workers.showing.previews import HeldOut, PreviewClock, picture, snapshot
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
+from panolog.workers.tasks import COARSE
 from panolog.workers.training.checkpoint import loaded
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, rate_units
@@ -55,7 +56,6 @@ from panolog.workers.training.surfaces import Surfaces
 _LOG = logging.getLogger(__name__)
 
 PREFETCH = 4  # views that decode in the background ahead of the one in training
-PREVIEW_WIDTH = 1024  # pixels, at most
 _START = "growth.start"  # in checkpoints: `Trainer.start`, absent in older ones
 
 
@@ -71,6 +71,7 @@ class TrainSpec(TaskSpec):
     cell: Volume | None = None  # Stage II: the cell of the block (eq. 12)
     district: Volume | None = None  # Stage I of a part of the place: what lies outside begins coarser
     compared: tuple[int, ...] = ()  # Stage II: rows on which a block must not be worse than `initial`
+    shown: int | None = None  # row of a held-out panorama that previews show; None = the first of `views`
     checkpoint: Source[Checkpoint] | None = None  # to continue from
     outbox: Outbox | None = None  # where the worker leaves checkpoints itself, if it can
 
@@ -140,7 +141,8 @@ class Trainer:
         self.schedule = Schedule(spec.config, spec.iterations, extent, spec.cell is not None)
         self.loss = Loss(scene, spec.config, spec.seed, self.schedule)
         self.meter = Meter(spec.task, spec.iterations, spec.device)
-        self.previews = PreviewClock(spec.config.preview)
+        self.previews = PreviewClock(spec.config.preview.every, spec.config.preview.seconds)
+        self.shown = HeldOut(scene, spec.shown, spec.width, spec.locate)
         self.saver = Saver(spec.config.checkpoint, spec.outbox, spec.device)
         device = self.device = torch.device(spec.device)
         launch, count, broken = ops.launcher(device), self.meter.count, self._not_finite
@@ -195,7 +197,7 @@ class Trainer:
         """Bake the exterior of a block for its cameras; after a stop the rest is baked when it is needed."""
         if (exterior := self.exterior) is None:
             return
-        for row in self.spec.views:
+        for row in (*self.spec.views, *self.shown.rows):
             if stop():
                 return
             exterior.of(row, self._camera(row))
@@ -251,7 +253,8 @@ class Trainer:
                 count, rates = len(self.state.gaussians), self.schedule.rates(iteration)
                 yield self.meter.progress(iteration, count, rates)
             if self.previews.due(iteration) or last:
-                yield self._preview()
+                with self.previews.timed():  # with the time that it takes to be sent
+                    yield self._preview()
             stopped = stop() and not last
             if stopped or (self.saver.due(iteration) and not last):
                 yield from self.saver.save(self.checkpoint, last=stopped)
@@ -294,6 +297,8 @@ class Trainer:
         return order(self.spec.seed, str(self.spec.task), self.spec.views, iteration)
 
     def _camera(self, row: int) -> Camera:
+        if row == self.spec.shown:  # nothing is learnt of it
+            return Camera.at(self.scene.panoramas[row], self.spec.width)
         return self.learning.camera(row, self.spec.width)
 
     def _cameras(self) -> dict[int, Camera]:
@@ -380,15 +385,15 @@ class Trainer:
         self.average.clear()
 
     def _preview(self) -> Preview:
-        """The first training view as rendered now; hatched where a block draws nothing."""
+        """A held-out panorama or the first training view as rendered now; of Stage I with a snapshot."""
         self.settle()
-        view, degree = self.views.first(self.spec.views), self.schedule.sh_degree(self.iteration)
-        model, camera, around = self.state.gaussians, self._camera(view.row), self._around(view.row)
-        with torch.no_grad(), self.previews.timed():
-            rendered = render(model, camera, sh_degree=degree, near=self.near, exterior=around)
-            photograph, picture = view.image.cpu().numpy(), to_bytes(rendered.color)
-            if around is not None:
-                left_out = ~around.active(self.spec.width, self.spec.width // 2).cpu().numpy()
-                picture[left_out] = hatched(photograph)[left_out]
-            jpeg = encode_jpeg(np.concatenate([picture, photograph]), PREVIEW_WIDTH)
-        return Preview(self.spec.task, self.iteration, self.scene.panoramas[view.row].name, jpeg)
+        spec, model, saved = self.spec, self.state.gaussians, None
+        row, photograph = self.shown.photograph(lambda: self.views.first(spec.views))
+        degree, around = self.schedule.sh_degree(self.iteration), self._around(row)
+        with torch.no_grad():
+            rendered = render(model, self._camera(row), sh_degree=degree, near=self.near, exterior=around)
+            jpeg = picture(rendered.color, photograph, around)
+            if spec.task == COARSE and self.iteration < spec.iterations:  # the model follows
+                saved = Checkpoint(spec.task, self.iteration, snapshot(model, self.centers.mean(axis=0)))
+        shown = self.scene.panoramas[row].name, jpeg, row == spec.shown
+        return Preview(spec.task, self.iteration, *shown, saved)

@@ -14,7 +14,7 @@ from urllib.parse import quote, unquote, urlsplit
 
 from panolog.export.site.page import Page, described, photograph_number
 from panolog.export.site.write import DESCRIPTION, MOST_IN_ONE, media_type, site_files, write_site
-from panolog.orchestrator.runs.folder import RunFolder, model_of, read_head
+from panolog.orchestrator.runs.folder import RunFolder, read_head, shown_model
 from panolog.orchestrator.watch.views.site.build import (
     Shown,
     Wanted,
@@ -99,7 +99,7 @@ def _current(source: Path, wanted: Wanted) -> Site | None:
         return None
     folder = RunFolder(source)
     description = folder.web / DESCRIPTION
-    if not description.is_file() or description.stat().st_mtime < model_of(folder).stat().st_mtime:
+    if not description.is_file() or description.stat().st_mtime < shown_model(folder).stat().st_mtime:
         return None
     _, names = described(description.read_bytes())
     if wanted.camera is not None and wanted.camera not in names:

@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 
 from panolog.orchestrator.engine.driver.journal import Journal
 from panolog.orchestrator.engine.driver.requests import interrupt
-from panolog.orchestrator.engine.stages.outline import write_outline
+from panolog.orchestrator.engine.stages.outline import write_outline, write_sketch
 from panolog.orchestrator.engine.stages.scenes import divided
 from panolog.orchestrator.runs import control
 from panolog.orchestrator.runs import info as run_info
@@ -136,10 +136,10 @@ class Preparation:
             shutil.rmtree(scene)  # its driver was killed before the report: the workspace has all for both
         if not scene.exists():
             options = TypeAdapter(SfmSettings).validate_python(settings.sfm)
-            show = self.progress(Step.SFM)
             paths = [Path(source) for source in settings.sources]
             source = paths if len(paths) > 1 else paths[0]
-            made = make_scene(source, scene, options, show, self._with_masks, memory() * 3 // 4)
+            given = options, self.progress(Step.SFM), self._with_masks, memory() * 3 // 4
+            made = make_scene(source, scene, *given, self._sketched)
             self._lines += made.lines()
         shutil.rmtree(workspace_folder(scene.resolve()), ignore_errors=True)
         for masks in (MASKS, GIVEN):  # the scene has copies
@@ -150,8 +150,15 @@ class Preparation:
         lines = [*self._notices(counts), *content.get("left_out", ())]
         self.journal.record([Noticed(PREPARE, line) for line in lines])
         self.journal.until_done(
-            lambda: write_outline(self.folder, divided(read_scene(scene), self.config), self.config)
+            lambda: write_outline(
+                self.folder, divided(read_scene(scene), self.config), self.config, anew=True
+            )
         )
+
+    def _sketched(self, sketch: Any) -> None:
+        """Shows what is known of the place; a disk that takes nothing does not matter."""
+        with suppress(OSError):
+            write_sketch(self.folder, **vars(sketch))
 
     def _notices(self, counts: Counts) -> Iterator[str]:
         """What the user should read of the reconstruction."""

@@ -130,7 +130,7 @@ class Specs:
         """
         match task.stage:
             case Stage.DISTRICT | Stage.COARSE:
-                return replace(self._train(task, self._job.views(task)), district=self._job.district(task))
+                return self._train(task, self._job.views(task), district=self._job.district(task))
             case Stage.SCORE:
                 views, reduces = self._job.shards[task.number], self._job.config.stage2.reduces
                 return self._reduced(task, views) if reduces else self.score(task, views)
@@ -348,11 +348,12 @@ class Specs:
         cell: Volume | None = None,
         *,
         compared: tuple[int, ...] = (),
+        district: Volume | None = None,
     ) -> TrainSpec:
         job, path = self._job, self._job.folder.checkpoint(task)
         config = job.config.later(task.stage) if task.stage in job.config.passes.stages else job.config
-        saved = path if path.exists() else None
-        locate = self._locate((*views, *compared), *filter(None, (initial, saved)))
+        saved, shown = path if path.exists() else None, self._shown(cell or district)
+        locate = self._locate((*views, *compared), *filter(None, (initial, saved)), shown=shown)
         return TrainSpec(
             task=task,
             scene=self._part((*views, *compared)),
@@ -364,14 +365,28 @@ class Specs:
             device=config.device,
             initial=ModelFile(initial, locate) if initial else None,
             cell=cell,
+            district=district,
             compared=compared,
+            shown=shown,
             checkpoint=CheckpointFile(saved, locate) if saved else None,
             locate=locate,
         )
 
-    def _locate(self, views: Iterable[int], *made: Path) -> Locate:
-        files = (file for row in views for file in self._job.scene.panoramas[row].files)
-        return self._sharing.share_files(files, made)
+    def _shown(self, part: Volume | None) -> int | None:
+        """The row of the most central held-out panorama in a part of the place; None if it has none."""
+        scene, rows = self._job.scene, np.array(self._job.scene.test, np.int64)
+        rows = rows if part is None else rows[part.contains(scene.centers[rows])]
+        if not len(rows):
+            return None
+        centers = scene.centers[rows]
+        row = int(rows[np.linalg.norm(centers - np.median(centers, axis=0), axis=1).argmin()])
+        return row if scene.panoramas[row].image.is_file() else None  # training does without it
+
+    def _locate(self, views: Iterable[int], *made: Path, shown: int | None = None) -> Locate:
+        panoramas = self._job.scene.panoramas
+        picture = [] if shown is None else [panoramas[shown].image]
+        files = (file for row in views for file in panoramas[row].files)
+        return self._sharing.share_files((*files, *picture), made)
 
 
 def new_evaluation(

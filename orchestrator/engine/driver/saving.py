@@ -135,7 +135,8 @@ def _aside(last: Path) -> Path:
 def remove_checkpoints(folder: RunFolder, task: TaskId) -> None:
     """Removes what a task needed until it was done, and what its attempts have left. Raises OSError."""
     path = folder.checkpoint(task)
-    for file in (path, _aside(path), *folder.earlier_checkpoints(task), folder.early(task)):
+    made = path, _aside(path), folder.early(task), folder.snapshot(task)
+    for file in (*made, *folder.earlier_checkpoints(task)):
         file.unlink(missing_ok=True)
     if task.stage.refines:
         folder.initial(task).unlink(missing_ok=True)
@@ -171,7 +172,9 @@ def _save_preview(folder: RunFolder, event: Preview) -> PreviewSaved:
     kept = sorted(int(file.stem) for file in path.parent.glob("*.jpg") if file.stem.isdecimal())
     if (gone := thinning.surplus(kept, event.iteration)) is not None:
         folder.preview(event.task, gone).unlink(missing_ok=True)
-    return PreviewSaved(event.task, event.iteration, event.view, folder.relative(path))
+    if event.snapshot is not None:
+        checkpoint.save(folder.snapshot(event.task), event.snapshot)
+    return PreviewSaved(event.task, event.iteration, event.view, folder.relative(path), event.held_out)
 
 
 def _save_checkpoint(folder: RunFolder, event: Checkpoint, keep: int) -> CheckpointSaved:

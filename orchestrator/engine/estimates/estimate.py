@@ -29,11 +29,11 @@ from panolog.workers import device_memory
 from panolog.workers.device_memory import VALUES
 from panolog.workers.growth import Period, additions, population
 from panolog.workers.metrics import LPIPS_BYTES
+from panolog.workers.showing.previews import PREVIEW_WIDTH
 from panolog.workers.tasks import Stage
 from panolog.workers.training.exterior import BAKED, PASSING, READING
 from panolog.workers.training.initialise import camera_extent
 from panolog.workers.training.schedule import Schedule
-from panolog.workers.training.trainer import PREVIEW_WIDTH
 
 _PLY = 62 * 4
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields

@@ -26,7 +26,7 @@ def payload(message: object) -> int:
         case Scored():
             return message.scores.nbytes
         case Preview():
-            return len(message.jpeg)
+            return len(message.jpeg) + (0 if message.snapshot is None else payload(message.snapshot))
         case Evaluated():
             return len(message.png)
     return 0

@@ -124,7 +124,8 @@ def _checkpoints(folder: RunFolder, state: RunState, keep: int) -> Iterator[Remo
 def _superseded(folder: RunFolder, task: TaskState, keep: int) -> list[Path]:
     last, earlier = folder.checkpoint(task.id), folder.earlier_checkpoints(task.id)
     if task.status == Status.DONE:
-        return [*earlier, last, *([folder.initial(task.id)] if task.id.stage.refines else [])]
+        made = [folder.snapshot(task.id), *([folder.initial(task.id)] if task.id.stage.refines else [])]
+        return [*earlier, last, *made]
     kept = keep - 1 if last.is_file() else keep  # never all that there is
     return earlier[: max(0, len(earlier) - kept)]
 

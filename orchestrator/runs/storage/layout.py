@@ -34,7 +34,7 @@ _MOST = 2**30  # bytes of a manifest, uncompressed
 _PIECE = 2**22  # bytes hashed at a time
 # What is not copied out: it is of this machine, or a resumed driver makes it anew.
 _LOCAL = ("store", "control", "lock", "supervisor", "driver", "tensorboard", DATABASE, f"{DATABASE}-journal")
-_REMADE = ("initial.ply",)
+_REMADE = ("initial.ply", "snapshot.safetensors")
 _MADE = ("blocks", "coarse", "district", "round", "repair", "union", "scene")  # folders
 _WORK = (*_MADE, "prepare", "follower", DATABASE)  # what a run needs only to be resumed: no result
 

@@ -222,7 +222,7 @@ async def get_events(
 
 @router.get("/api/runs/{id}/previews")
 async def get_previews(request: Request, run: Run, task: str | None = None) -> Response:
-    """Which previews of training views there are."""
+    """Which previews of tasks there are."""
     return await respond_json(request, pictures.previews, run.entry, task)
 
 

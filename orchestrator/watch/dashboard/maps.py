@@ -3,6 +3,7 @@
 import json
 from collections import OrderedDict
 from contextlib import suppress
+from pathlib import Path
 from threading import Lock
 from typing import Any
 
@@ -63,22 +64,24 @@ def _figure(entry: RunEntry) -> Figure:
     if folder.seams.exists():
         seams = dict(by_blocks(parse_seams(read_below(folder.seams, folder.root, _MOST))))
     planned = folder.plan.exists()
-    return map_figure(_read_plan(entry), _points(entry), seams=seams, planned=planned)
+    points = _points(entry, folder.model(COARSE), folder.outline_points)
+    fixes = _points(entry, folder.outline_fixes)
+    return map_figure(_read_plan(entry), points, seams=seams, planned=planned, fixes=fixes)
 
 
 def _stamp(entry: RunEntry) -> tuple[int, ...]:
     """A value that changes when the plan, the points or the seams do."""
     folder = entry.folder
-    files = (folder.known_plan, folder.model(COARSE), folder.seams)
+    outlined = (folder.outline_points, folder.outline_fixes)
+    files = (folder.known_plan, folder.model(COARSE), *outlined, folder.seams)
     stats = [path.stat() for path in files if path.exists()]
     return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
 
 
-def _points(entry: RunEntry) -> NDArray[np.floating[Any]]:
-    """(P, 3) of the scene: the Gaussians of Stage I, else sparse points; none if both files are gone."""
-    folder = entry.folder
-    for path in (folder.model(COARSE), folder.outline_points):
-        with suppress(InputError), opened(path, folder.root) as file:
+def _points(entry: RunEntry, *files: Path) -> NDArray[np.floating[Any]]:
+    """(P, 3) of the first of some PLYs that can be read, such as the Gaussians of Stage I; else none."""
+    for path in files:
+        with suppress(InputError), opened(path, entry.folder.root) as file:
             return read_points(by_handle(file.fileno()))
     return np.empty((0, 3), np.float32)
 

@@ -27,13 +27,17 @@ class Actions(ViewModel):
 class Results(ViewModel):
     """Which results of a run can be downloaded.
 
-    `exposure` changes with the exposures, if there are any, `findings` with what was measured.
+    `in_3d` says whether a 3D view has something to show, as from the first picture of Stage I on. `outline`
+    changes with what is known of the place before there is a plan, `exposure` with the exposures, if there
+    are any, `findings` with what was measured.
     """
 
     model: bool
     report: bool
     view: bool = False  # a page in 3D of the model as one file
+    in_3d: bool = False
     map: bool = False  # whether cameras and points can be shown from above, also before there is a plan
+    outline: str | None = None
     exposure: str | None = None
     findings: str = ""
 
@@ -193,13 +197,14 @@ class EventList(ViewModel):
 
 
 class SavedPreview(ViewModel):
-    """A render of a training view, above the photograph."""
+    """A render of a panorama, above the photograph."""
 
     event: int
     task: Text
     iteration: int
     view: Text
     time: float
+    held_out: bool = False
 
 
 class PreviewList(ViewModel):

@@ -1,4 +1,4 @@
-"""Pictures: what records name, previews of training views and held-out panoramas; and the scene's panoramas.
+"""Pictures: what records name, previews of tasks and held-out panoramas; and the scene's panoramas.
 
 A run names its scene by a path or a URL, and a run from elsewhere may name any. So a panorama is a plain file
 really below a folder that is a scene, an image of at most so many pixels, and a small copy of it is sent. Of
@@ -40,11 +40,11 @@ _VIEWS = 2_000  # held-out panoramas in the list at most
 
 def previews(entry: RunEntry, task: str | None) -> dict[str, Any]:
     """The latest preview of each task, or those of one task which are kept."""
-    names = ("task", "iteration", "view", "time")
+    names = ("task", "iteration", "view", "time", "held_out")
     folder = entry.folder
     events = queries.previews(folder.database, task)
     events = [event for event in events if not _removed(folder, event)]
-    return {"previews": [{"event": e["id"]} | {name: e.get(name) for name in names} for e in events]}
+    return {"previews": [{"event": e["id"]} | {name: e[name] for name in names if name in e} for e in events]}
 
 
 def _removed(folder: RunFolder, event: dict[str, Any]) -> bool:

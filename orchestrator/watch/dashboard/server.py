@@ -55,8 +55,8 @@ def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
         yield
         await compression
         registry.close()
-        pages.close()
-        downloads.close()
+        await pages.close()
+        await downloads.close()
         registry.end()
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.runs import lock, presence, reading
+from panolog.orchestrator.runs.folder import RunFolder, shown_model
 from panolog.orchestrator.runs.preparation.settings import MOST_BYTES
 from panolog.orchestrator.runs.records import Progressed, RunBegan, RunEnded, Stored
 from panolog.orchestrator.runs.storage.state import read_state
@@ -187,7 +188,9 @@ class Watch:
             model=folder.point_cloud.is_file(),
             report=folder.report.is_file(),
             view=folder.page.is_file(),
+            in_3d=_in_3d(folder),
             map=folder.known_plan.is_file(),
+            outline=None if folder.plan.is_file() else version_of(folder.outline),
             exposure=version_of(folder.exposure),
             findings=findings_version(folder),
         )
@@ -281,6 +284,15 @@ class Watch:
         self._forget()
         row = RunRow.unread(self.entry).model_copy(update={"status": "unreadable", "error": line})
         self.snapshot = Snapshot(row, version)
+
+
+def _in_3d(folder: RunFolder) -> bool:
+    """Whether a 3D view has a model to show."""
+    try:
+        shown_model(folder)
+    except InputError:
+        return False
+    return True
 
 
 def _extends(new: Summary, old: Summary) -> bool:

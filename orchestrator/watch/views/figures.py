@@ -27,15 +27,16 @@ def map_figure(
     seams: Mapping[tuple[int, int], float] | None = None,
     *,
     planned: bool = True,
+    fixes: NDArray[np.floating] = np.empty((0, 3)),  # noqa: B008  # never changed
 ) -> Figure:
-    """A plan from above in world space: cells, faces, AABB, points and cameras.
+    """A plan from above in world space: cells, faces, AABB, points, fixes of GPS and cameras.
 
     The figure has one more key, "blocks": `planned`; `count` and `colors` of all blocks; `names` of cameras,
     `grades` for the legend of seams, and for blocks on top of each other `layers`, the `layer` shown and the
     `stride` of ids between layers. The trace "blocks" has the ids of the lowest layer as `z`.
 
     Args: points (P, 3) of the scene, such as those of `plan_map.read_points`; seams of faces by their blocks;
-    planned, False of an outline: its only block is none.
+    planned, False of an outline: its only block is none, and cameras without a name are fixes; fixes (F, 3).
     """
     view = window_on(plan, points)
     return {
@@ -45,6 +46,7 @@ def map_figure(
             _line("faces", view.faces(), _GREY, "solid"),
             *_seams(view, seams or {}),
             _line("box", view.outline()[: None if planned else 0], _GREY, "dash"),
+            _fixes(view, fixes),
             *_cameras(view, planned=planned),
             _labels(view, planned=planned),
         ],
@@ -53,7 +55,7 @@ def map_figure(
             "planned": planned,
             "count": plan.grid.count,
             "colors": view.colors,
-            "names": list(plan.names),
+            "names": list(filter(None, plan.names)),
             "grades": _grades((seams or {}).values()),
             "layers": view.layers,
             "layer": view.layer,
@@ -147,6 +149,25 @@ def _seams(view: MapWindow, seams: Mapping[tuple[int, int], float]) -> list[dict
     return traces
 
 
+def _fixes(view: MapWindow, fixes: NDArray[np.floating]) -> dict[str, Any]:
+    """A cross where GPS has each panorama."""
+    across, up, _ = view.axes
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "name": "fixes",
+        "x": np.round(fixes[:, across].astype(float), 3).tolist(),
+        "y": np.round(fixes[:, up].astype(float), 3).tolist(),
+        "marker": {
+            "symbol": "cross-thin-open",
+            "size": 9,
+            "color": _GREY,
+            "line": {"color": _GREY, "width": 1.5},
+        },
+        "hoverinfo": "skip",
+    }
+
+
 def _cameras(view: MapWindow, *, planned: bool) -> list[dict[str, Any]]:
     """A disc for each camera in the colour of its own block, and rings for other blocks that it trains."""
     plan = view.plan
@@ -154,7 +175,7 @@ def _cameras(view: MapWindow, *, planned: bool) -> list[dict[str, Any]]:
     size = float(np.clip(60 / max(len(blocks), 1) ** 0.5, 0.45, 1.0))
     traces = []
     for ring in reversed(range(len(RINGS) if len(blocks) <= _RINGED else 1)):
-        here = [k for k, its in enumerate(blocks) if len(its) > ring]
+        here = [k for k, its in enumerate(blocks) if len(its) > ring and plan.names[k]]
         places = plan.centers[here][:, list(view.axes[:2])]
         traces.append(
             {

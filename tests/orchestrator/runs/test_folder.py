@@ -7,9 +7,10 @@ import pytest
 
 from panolog.orchestrator.runs import info, lock
 from panolog.orchestrator.runs.config import RunConfig
-from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.folder import RunFolder, model_of, shown_model
 from panolog.orchestrator.runs.info import SceneRef, check_output, make_info, read_info, write_info
 from panolog.scene.errors import InputError
+from panolog.workers.tasks import COARSE, TaskId
 
 SCENE = SceneRef(path="/scene", fingerprint="f")
 
@@ -27,6 +28,31 @@ def test_run_json_holds_the_resolved_settings(folder: RunFolder) -> None:
     assert (found.scene, found.config, found.seed) == (SCENE, RunConfig(width=64, seed=3), 3)
     assert {"panolog", "python", "torch", "ray"} <= set(found.versions)
     assert json.loads(folder.info.read_text())["config"]["sky"]["count"] == 100_000
+
+
+def test_a_3d_view_shows_the_latest_snapshot_while_stage_one_trains(folder: RunFolder) -> None:
+    snapshot, last, block = folder.snapshot(COARSE), folder.checkpoint(COARSE), TaskId.block(0)
+    snapshot.parent.mkdir()
+
+    def written(path: Path, time: int) -> None:
+        path.touch()
+        os.utime(path, (time, time))
+
+    with pytest.raises(InputError, match="no model yet"):
+        shown_model(folder)
+    written(snapshot, 10)
+    assert shown_model(folder) == shown_model(folder, COARSE) == snapshot
+    with pytest.raises(InputError, match="block/000 has no model yet"):
+        shown_model(folder, block)
+    written(last, 20)
+    with lock.hold(folder.lock):
+        assert shown_model(folder) == snapshot and model_of(folder) == last  # what is exported is whole
+    assert shown_model(folder) == last
+    written(snapshot, 30)
+    assert shown_model(folder) == snapshot  # the driver was killed after it
+    for path in (folder.model(COARSE), folder.point_cloud):
+        written(path, 5)
+        assert shown_model(folder) == path
 
 
 def test_a_run_needs_no_version_of_ray(monkeypatch: pytest.MonkeyPatch) -> None:

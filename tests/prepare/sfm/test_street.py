@@ -11,8 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from panolog.prepare.panorama_files import LayerFiles
+from panolog.prepare.sfm import sketch
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene, workspace_folder
 from panolog.prepare.sfm.report import SfmReport
+from panolog.prepare.sfm.sketch import Sketch
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
@@ -102,17 +104,29 @@ def test_features_of_other_masks_are_not_used(street: Made, tmp_path: Path) -> N
         assert _interrupted(street.source, output, "features", layers=layers) == wanted
 
 
-def test_an_interruption_changes_nothing(street: Made, tmp_path: Path) -> None:
-    output = tmp_path / "scene"
+def test_neither_an_interruption_nor_who_watches_changes_anything(
+    street: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is shown while poses are found grows to all panoramas, upright, where they end up."""
+    output, shown = tmp_path / "scene", list[Sketch]()
     shutil.copytree(street.matched, workspace_folder(output), symlinks=True)
-    again = make_scene(street.source, output, SfmSettings(distance=None), no_progress).found.model
+    monkeypatch.setattr(sketch, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(sketch, "_SHARE", 1e9)
+    again = make_scene(street.source, output, SfmSettings(), no_progress, show=shown.append).found.model
+    counts = [len(it.names) for it in shown]
+    assert counts[:5] == [3, 4, 5, 6, 7] and set(shown[4].names) == set(NAMES)
+    assert all(len(it.points) > 20 and not len(it.fixes) for it in shown)
+    assert drift(shown[-1].centers, street.scene.centers) < 0.02 * np.ptp(street.scene.centers)
+    assert np.ptp(shown[-1].centers[:, 2]) < 0.1 * np.ptp(shown[-1].centers)
     first = street.report.found.model
     assert again.rows == first.rows and len(again.points) == len(first.points)
     for (rows, where), (others, there) in zip(again.sightings, first.sightings, strict=True):
         assert np.array_equal(rows, others) and np.array_equal(where, there)
 
 
-def test_a_cropped_video_with_gps_and_gravity_becomes_a_scene_with_masks_in_metres(tmp_path: Path) -> None:
+def test_a_cropped_video_with_gps_and_gravity_becomes_a_scene_with_masks_in_metres(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shots = [replace(shot, turn=(shot.turn[0], 12.0, shot.turn[2])) for shot in walk([0.4] * 12)]
     rows = slice(WIDTH // 16, 3 * WIDTH // 8)  # without an eighth above, a quarter below
     images = [np.ascontiguousarray(render(shot, WIDTH)[rows]) for shot in shots]
@@ -126,8 +140,16 @@ def test_a_cropped_video_with_gps_and_gravity_becomes_a_scene_with_masks_in_metr
         for number, (place, up) in enumerate(zip(places, ups, strict=True))
     ]
     add_track(video, b"gpmd", samples, len(samples) * step)
-    made = make_scene(video, tmp_path / "scene", SfmSettings(frames=6), no_progress)
+    monkeypatch.setattr(sketch, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(sketch, "_SHARE", 1e9)
+    shown = list[Sketch]()
+    made = make_scene(video, tmp_path / "scene", SfmSettings(frames=6), no_progress, show=shown.append)
     scene = read_scene(tmp_path / "scene")
+    first, *_, last = shown
+    assert first.names == () and np.ptp(first.fixes[:, 1]) == pytest.approx(metres * 0.4 * 11, rel=0.2)
+    assert len(last.fixes) == len(first.fixes) >= len(last.names) >= 4
+    apart = np.linalg.norm(last.centers[:, None] - last.fixes, axis=2).min(axis=1)
+    assert apart.max() < 0.05 * np.ptp(last.fixes[:, 1])  # in one frame
     numbers = [int(panorama.stem.rsplit("_", 1)[1]) for panorama in scene.panoramas]
     assert 4 <= len(numbers) <= 6
     assert made.world.frame == "enu" and made.world.up.source == "files"

@@ -1,10 +1,5 @@
-"""Files of a finished model to save: made by a process on request.
+"""Files of a finished model to save, made on request: `main` does that in the process of `making`."""
 
-This file is also the program that makes one:
-`python -m panolog.orchestrator.watch.dashboard.models.downloads ROOT RUN KIND OUTPUT`.
-"""
-
-import sys
 from collections import OrderedDict
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +8,7 @@ from typing import Literal
 from fastapi.responses import Response
 
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below
-from panolog.orchestrator.watch.dashboard.models.making import Turns, reading, run_program
+from panolog.orchestrator.watch.dashboard.models.making import Maker, Turns, reading
 from panolog.orchestrator.watch.dashboard.responses import Download, file_name
 from panolog.scene.errors import InputError
 
@@ -32,7 +27,7 @@ class Downloads:
         self._folder = TemporaryDirectory(prefix="panolog-downloads-")
         self._files: OrderedDict[_Made, Path] = OrderedDict()
         self._number = 0
-        self._turns = Turns("files")
+        self._turns, self._maker = Turns("files"), Maker()
 
     async def make(self, entry: RunEntry, kind: Kind) -> None:
         """Makes a file, unless it is there.
@@ -47,7 +42,7 @@ class Downloads:
                 return
             self._number += 1
             path = Path(self._folder.name) / f"{self._number}{ENDINGS[kind]}"
-            await run_program(__name__, [str(entry.root), entry.path, kind, str(path)], "the file")
+            await self._maker.make(__name__, [str(entry.root), entry.path, kind, str(path)], "the file")
             self._files[made] = path
             while len(self._files) > _CACHED:
                 self._files.popitem(last=False)[1].unlink()  # who is receiving it has it open
@@ -60,8 +55,9 @@ class Downloads:
         handle = open_below(path, path.parent)
         return Download(handle, "application/octet-stream", {}, f"{file_name(entry)}{ENDINGS[kind]}")
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """Removes all files."""
+        await self._maker.close()
         self._folder.cleanup()
 
 
@@ -73,8 +69,8 @@ def _of(entry: RunEntry, kind: Kind) -> _Made:
     return entry.id, kind, known.st_mtime_ns, known.st_size
 
 
-def _main(root: str, run: str, kind: str, output: str) -> None:
-    """Makes one file, of files that are really below the run alone."""
+def main(root: str, run: str, kind: str, output: str) -> None:
+    """Makes one file, of files that are really below the run alone. Raises InputError if it cannot."""
     from panolog.export.formats import ChosenModel, write_format  # noqa: PLC0415
     from panolog.export.site.write import MOST_IN_ONE  # noqa: PLC0415
     from panolog.orchestrator.watch.views.site import build  # noqa: PLC0415
@@ -88,7 +84,3 @@ def _main(root: str, run: str, kind: str, output: str) -> None:
         one_file = kind != "spz"  # whose sky would be a second one
         model = ChosenModel(locate(folder.point_cloud), place, sky=one_file)
         write_format(kind, model, Path(output))
-
-
-if __name__ == "__main__":
-    _main(*sys.argv[1:])

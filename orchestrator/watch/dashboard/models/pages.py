@@ -1,7 +1,7 @@
-"""Pages of models in 3D for the dashboard: what a finished run has written, or made by a process on request.
+"""Pages of models in 3D for the dashboard: what a finished run has written, or made on request.
 
-A model needs torch and far more memory than a server should use, so this file is also the program that
-makes one page: `python -m panolog.orchestrator.watch.dashboard.models.pages ROOT RUN TASK OUTPUT`.
+`main` makes one in the process of `making`. That of a training is made anew as long as someone looks at it,
+but takes no more than a small part of the machine, which may be the one that trains.
 
 A page is a folder whose scripts fetch the model in parts. It runs in an origin of its own, from which
 browsers send no cookie, so its address has a random key that grants its files, and nothing else.
@@ -12,7 +12,7 @@ import json
 import re
 import secrets
 import shutil
-import sys
+import time
 from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass
@@ -24,9 +24,10 @@ from fastapi.responses import Response
 from panolog.export.site.page import described, photograph_number
 from panolog.export.site.write import media_type
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.folder import model_of
+from panolog.orchestrator.runs.folder import shown_model
+from panolog.orchestrator.runs.machines.machine import cores
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below, read_below
-from panolog.orchestrator.watch.dashboard.models.making import Turns, reading, run_program
+from panolog.orchestrator.watch.dashboard.models.making import Maker, Turns, reading
 from panolog.orchestrator.watch.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.watch.dashboard.responses import Download
 from panolog.orchestrator.watch.views.site.photographs import WIDE
@@ -34,7 +35,8 @@ from panolog.scene.errors import InputError
 from panolog.workers.tasks import TaskId
 
 _CACHED = 8  # pages
-_REFRESH_S = 10  # between two looks of a page for a newer model of a training
+_REFRESH_S = 3  # between two looks of a page for a newer model of a training
+_SHARE = 0.01  # of the machine's cores that newer models for pages may take
 _MOST = 1_000_000  # Gaussians of a page that is made on request
 _DESCRIPTION_BYTES = 32_000_000  # of a scene.json at most
 _PATH = re.compile(r"/models/([0-9a-f]{48})/.*", re.DOTALL)
@@ -66,16 +68,19 @@ class _Site:
     description: bytes  # scene.json
     names: list[str]  # of the cameras, whose photographs are in `scene`
     scene: Path | None  # None: the photographs are not on this machine
+    stays: float = 0.0  # time.monotonic() until which no newer one takes its place
 
     @staticmethod
-    def of(folder: Path, scene: Path | None, *, temporary: bool, live: bool = False) -> "_Site":
+    def of(
+        folder: Path, scene: Path | None, *, temporary: bool, live: bool = False, stays: float = 0.0
+    ) -> "_Site":
         """Args: live, the model may become another. Raises InputError if it is no page."""
         data, names = read_below(folder / "scene.json", folder, _DESCRIPTION_BYTES), list[str]()
         if scene is not None:
             data, names = described(data)
         if live:
             data = json.dumps(json.loads(data) | {"refresh": _REFRESH_S}).encode()
-        return _Site(folder, temporary, data, names, scene)
+        return _Site(folder, temporary, data, names, scene, stays)
 
 
 _Source = tuple[RunEntry, str | None, Path | None]  # the arguments of `ModelPages.make`
@@ -89,7 +94,7 @@ class ModelPages:
         self._sites: OrderedDict[str, _Site] = OrderedDict()  # by key
         self._keys: dict[tuple[object, ...], str] = {}  # by what they show
         self._sources: dict[str, _Source] = {}  # by key: of those that were made for this server
-        self._turns = Turns("3D views")
+        self._turns, self._maker = Turns("3D views"), Maker()
 
     async def make(self, entry: RunEntry, task: str | None, scene: Path | None) -> str:
         """Makes the page of the current model of a run, or of one of its tasks, and returns its key.
@@ -97,7 +102,7 @@ class ModelPages:
         Args: scene, the folder of the run's photographs, None if that is not on this machine.
         Raises InputError if there is no such model, it cannot be read, or too many requests wait.
         """
-        model = model_of(entry.folder, TaskId.parse(task) if task else None)
+        model = shown_model(entry.folder, TaskId.parse(task) if task else None)
         known = model.stat()
         shown = (entry.id, task, model.name, known.st_mtime_ns, known.st_size, scene)
         if self._key(shown) is None:
@@ -109,8 +114,8 @@ class ModelPages:
 
     async def renew(self, key: str) -> None:
         """Brings a page up to the present model of its run; one that cannot be made leaves it as it is."""
-        source = self._sources.get(key)
-        if source is None or key not in self._sites:
+        source, site = self._sources.get(key), self._sites.get(key)
+        if source is None or site is None or time.monotonic() < site.stays:
             return
         known = set(self._sites)
         with suppress(InputError, OSError):
@@ -152,8 +157,9 @@ class ModelPages:
         headers["Cache-Control"] = "private, max-age=3600"
         return Download(handle, media_type(path), headers, None)
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """Removes all pages."""
+        await self._maker.close()
         self._folder.cleanup()
 
     def _key(self, shown: tuple[object, ...]) -> str | None:
@@ -184,16 +190,15 @@ class ModelPages:
         if task is None and not web.is_symlink() and written.is_file() and written.stat().st_mtime >= newest:
             return await asyncio.to_thread(_Site.of, web, scene, temporary=False)
         output = Path(self._folder.name) / secrets.token_hex(8)
-        await self._write(entry, task, output)
+        arguments = [str(entry.root), entry.path, task or "", str(output)]
+        seconds = await self._maker.make(__name__, arguments, "the 3D view")
+        stays = time.monotonic() + seconds / (_SHARE * cores())
         live = lock.held(entry.folder.lock) and not entry.folder.point_cloud.is_file()
-        return await asyncio.to_thread(_Site.of, output, scene, temporary=True, live=live)
-
-    async def _write(self, entry: RunEntry, task: str | None, output: Path) -> None:
-        await run_program(__name__, [str(entry.root), entry.path, task or "", str(output)], "the 3D view")
+        return await asyncio.to_thread(_Site.of, output, scene, temporary=True, live=live, stays=stays)
 
 
-def _main(root: str, run: str, task: str, output: str) -> None:
-    """Makes one page, of files that are really below the run alone."""
+def main(root: str, run: str, task: str, output: str) -> None:
+    """Makes one page, of files that are really below the run alone. Raises InputError if it cannot."""
     from panolog.export.site.write import write_site  # noqa: PLC0415
     from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run  # noqa: PLC0415
 
@@ -201,7 +206,3 @@ def _main(root: str, run: str, task: str, output: str) -> None:
         wanted = Wanted(TaskId.parse(task) if task else None, most=_MOST)
         shown = site_of_run(folder, wanted, locate)
         write_site(Path(output), shown.write_model, shown.page)
-
-
-if __name__ == "__main__":
-    _main(*sys.argv[1:])

@@ -132,7 +132,8 @@ def _answers(folder: RunFolder, view: RunView, found: Findings) -> Iterator[tupl
         plan, planned = read_plan(folder.known_plan), folder.plan.exists()
         model = folder.model(COARSE)
         points = read_points(model if model.exists() or planned else folder.outline_points)
-        yield f"{_PATH}/map", map_figure(plan, points, by_blocks(found.seams), planned=planned)
+        fixes = {"fixes": read_points(folder.outline_fixes)} if folder.outline_fixes.exists() else {}
+        yield f"{_PATH}/map", map_figure(plan, points, by_blocks(found.seams), planned=planned, **fixes)
         yield from _cameras(folder, plan)
     if folder.database.exists():
         without = Filter(without=frozenset({Progressed.__name__}))

@@ -23,12 +23,12 @@ from panolog.export.site.page import (
     photograph_url,
 )
 from panolog.export.site.write import MOST_IN_ONE, SKY, write_page, write_site
-from panolog.export.sky import render_sky, write_sky_image
+from panolog.export.sky import WIDTH, render_sky, write_sky_image
 from panolog.export.sog.folder import INDEX
 from panolog.export.sog.streamed import write_streamed
 from panolog.export.sog.write import write_sog
 from panolog.export.splats import InMemory, Selection, Splats
-from panolog.orchestrator.runs.folder import RunFolder, model_of, read_head
+from panolog.orchestrator.runs.folder import RunFolder, read_head, shown_model
 from panolog.orchestrator.watch.views.site.photographs import panorama_rotations, photograph
 from panolog.orchestrator.watch.views.site.source import Model, open_model
 from panolog.orchestrator.watch.views.site.viewpoints import Viewpoint, Viewpoints, read_viewpoints
@@ -69,12 +69,12 @@ class Shown:
 
 
 def site_of_run(folder: RunFolder, wanted: Wanted, locate: Locate = here) -> Shown:
-    """The page of the current model of a run or of a task (`model_of`).
+    """The page of the current model of a run or of a task (`shown_model`).
 
     Args: locate says where the run's files are to be read.
     Raises InputError or RunError if the run or its model cannot be read, or there is no such camera.
     """
-    path = locate(model_of(folder, wanted.task))
+    path = locate(shown_model(folder, wanted.task))
     viewpoints = read_viewpoints(folder, wanted.task, wanted.camera, locate)
     place = wanted.place or place_of(folder, viewpoints, locate)
     model = open_model(path, place.upside_down, wanted.selection)
@@ -144,15 +144,18 @@ def _page(title: str, model: Model, place: Georeference, wanted: Wanted) -> Page
         step=radius / _STEPS,
         metres_per_unit=place.unit,
         frame=place.frame,
-        sky=None if model.sky is None or not wanted.sky else _sky_picture(model.sky, place.frame),
+        sky=_sky_picture(model, place.frame) if wanted.sky else None,
     )
 
 
-def _sky_picture(sky: Gaussians, frame: Frame) -> bytes:
-    """JPEG."""
+def _sky_picture(model: Model, frame: Frame) -> bytes | None:
+    """JPEG, of a model in training a small one, which is soon another; None without a sky."""
+    if model.sky is None:
+        return None
+    width = WIDTH if model.iteration is None else WIDTH // 2
     with TemporaryDirectory(prefix="panolog-view-") as folder:
         path = Path(folder) / SKY
-        write_sky_image(path, render_sky(sky, frame))
+        write_sky_image(path, render_sky(model.sky, frame, width))
         return path.read_bytes()
 
 
@@ -173,7 +176,7 @@ def _reduced(
         _write_indices(folder)
         return f"{STREAMED}/{INDEX}"
 
-    return replace(page, shown=model.total - left), write
+    return replace(page, shown=model.total - model.missing - left), write
 
 
 def _sky_source(sky: Gaussians, frame: Frame) -> InMemory:

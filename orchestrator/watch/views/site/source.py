@@ -8,12 +8,13 @@ import torch
 
 from panolog.export.frame import HALF_TURN, Frame
 from panolog.export.reading import is_ply, read_model
-from panolog.export.splats import InMemory, ModelSource, Selection, Splats, SplatSource
+from panolog.export.splats import REST, InMemory, ModelSource, Selection, Splats, SplatSource
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_header, read_sky
+from panolog.workers.showing.previews import WHOLE
 from panolog.workers.training import checkpoint
-from panolog.workers.training.optimizer import ModelState
+from panolog.workers.training.optimizer import gaussians_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +23,8 @@ class Model:
 
     scene: SplatSource  # in the exported frame; the sky, if there is nothing else
     sky: Gaussians | None  # in the model's coordinates
-    total: int  # Gaussians in the file
+    total: int  # Gaussians
+    missing: int = 0  # of them that are not in the file
     iteration: int | None = None  # of a checkpoint
 
 
@@ -62,13 +64,15 @@ def _of_export(path: Path, chosen: Selection) -> Model:
 
 def _of_checkpoint(path: Path, frame: Frame, chosen: Selection) -> Model:
     saved = checkpoint.load(path)
-    gaussians = ModelState.from_tensors(saved.tensors).gaussians
+    gaussians = gaussians_of(saved.tensors)
+    degree = min(chosen.degree, REST.index(saved.tensors["shN"].shape[1]))  # a snapshot has 0
     splats, scene = Splats.of(gaussians), (~_is_sky(gaussians)).numpy()
     selection = replace(chosen, part="scene" if scene.any() else "all")
     kept = splats.select(selection.keeps(splats, scene))
-    turned = kept.reduced(chosen.degree).turned(frame)
+    turned = kept.reduced(degree).turned(frame)
     sky = gaussians.select(_is_sky(gaussians)) if gaussians.sky and scene.any() else None
-    return Model(InMemory(turned), sky, len(gaussians), saved.iteration)
+    total = int(saved.tensors.get(WHOLE, torch.tensor(len(gaussians))))
+    return Model(InMemory(turned), sky, total, total - len(gaussians), saved.iteration)
 
 
 def _is_checkpoint(file: Path) -> bool:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,12 +31,13 @@ from panolog.partition.plan import read_plan
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_header, ply_offset, read_ply
-from panolog.workers.events import Event, Preview
+from panolog.workers.events import Checkpoint, Event, Preview
 from panolog.workers.merge import retained
 from panolog.workers.scoring import ScoreSpec
 from panolog.workers.seams.schema import parse_seams
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
+from panolog.workers.training import checkpoint
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.fakes import DIED, CrashError, Harness, SetClock, begins, fails, well
 
@@ -87,6 +89,29 @@ def test_of_many_previews_the_first_the_latest_and_some_between_are_kept(harness
     shown = [preview["iteration"] for preview in pictures.previews(entry, "coarse")["previews"]]
     assert [harness.folder.relative(harness.folder.preview(COARSE, at)) for at in shown] == kept[::-1]
     assert pictures.previews(entry, None)["previews"][0]["iteration"] == 30_000
+
+
+def test_a_snapshot_of_stage_one_is_kept_until_its_model_is_there(harness: Harness) -> None:
+    folder, tensors, seen = harness.folder, {"x": torch.arange(4.0)}, list[tuple[int, dict[str, Any]]]()
+
+    def preview(iteration: int) -> Preview:
+        saved = Checkpoint(COARSE, iteration, tensors)
+        return Preview(COARSE, iteration, "a.jpg", b"\xff\xd8\xff", held_out=True, snapshot=saved)
+
+    def look() -> None:
+        found = checkpoint.load(folder.snapshot(COARSE))
+        seen.append((found.iteration, found.tensors))
+
+    plain = Preview(COARSE, 50, "b.jpg", b"\xff\xd8\xff")
+    assert harness.drive(begins(COARSE, preview(10), preview(30), look, plain)).outcome == "done"
+    ((iteration, found),) = seen
+    assert iteration == 30 and torch.equal(found["x"], tensors["x"])
+    assert not folder.snapshot(COARSE).exists()
+    assert [(it.view, it.held_out) for it in harness.records(PreviewSaved)] == [
+        ("a.jpg", True),
+        ("a.jpg", True),
+        ("b.jpg", False),
+    ]
 
 
 @pytest.mark.parametrize(("failed", "attempts"), [(DIED, 3), (TRUNCATED, 2)], ids=["retries", "confirmed"])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
 from panolog.orchestrator.engine.driver.demands import Sizes, image_cache
@@ -58,6 +59,10 @@ class Offer(Noting):
     def images(self, rows: Iterable[int]) -> set[Path]:
         return {file for row in rows for file in self.job.scene.panoramas[row].files}
 
+    @property
+    def shown(self) -> set[Path]:
+        return {self.job.scene.panoramas[self.job.scene.test[0]].image}
+
 
 @pytest.fixture
 def offer(tmp_path: Path) -> Offer:
@@ -65,15 +70,16 @@ def offer(tmp_path: Path) -> Offer:
 
 
 def test_each_task_gets_its_own_panoramas_and_the_model_that_it_needs(offer: Offer) -> None:
-    scene, merged = offer.job.scene, offer.job.folder.point_cloud
-    for task, rows, made in (
-        (COARSE, scene.train, set[Path]()),
-        (TaskId.shard(0), offer.job.shards[0], {offer.coarse}),
-        (TaskId.block(0), BLOCK, {offer.coarse}),
-        (EVAL, scene.test, {merged}),
+    """What trains also gets the picture of a held-out panorama."""
+    scene, merged, nothing = offer.job.scene, offer.job.folder.point_cloud, set[Path]()
+    for task, rows, made, shown in (
+        (COARSE, scene.train, nothing, offer.shown),
+        (TaskId.shard(0), offer.job.shards[0], {offer.coarse}, nothing),
+        (TaskId.block(0), BLOCK, {offer.coarse}, offer.shown),
+        (EVAL, scene.test, {merged}, nothing),
     ):
         offer.specs.of(task)
-        assert (offer.scene, offer.run) == (offer.images(rows), made), task
+        assert (offer.scene, offer.run) == (offer.images(rows) | shown, made), task
     vars(offer.specs).update(faces=FACES)
     spec = offer.specs.of(EVAL)
     assert isinstance(spec, EvaluateSpec) and spec.seams is not None and spec.seams.faces == FACES
@@ -89,7 +95,33 @@ def test_a_block_also_gets_the_panoramas_that_it_is_compared_on(
     spec = offer.specs.of(TaskId.block(0))
     assert isinstance(spec, TrainSpec) and spec.initial == ModelFile(offer.coarse)
     assert (spec.cell, spec.views, spec.compared) == (CELL, BLOCK, compared)
-    assert offer.scene == offer.images((*BLOCK, *compared))
+    assert offer.scene == offer.images((*BLOCK, *compared)) | offer.shown
+
+
+class Half:
+    """What is on one side of the place."""
+
+    def __init__(self, least: float) -> None:
+        self._least = least
+
+    def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return points[:, 0] >= self._least
+
+
+@pytest.mark.parametrize(("least", "row"), [(-9.0, 2), (0.3, 1), (0.6, None)])
+def test_a_task_shows_the_most_central_held_out_panorama_of_its_part(
+    offer: Offer, least: float, row: int | None
+) -> None:
+    """Of Stage I, the whole place has more of them than a block may have."""
+    scene = replace(offer.job.scene, train=(0, 3), test=(1, 2, 4))
+    vars(offer.specs).update(_job=replace(offer.job, scene=scene))
+    offer.specs.plan.cell = lambda _: Half(least)  # type: ignore[method-assign, assignment, return-value]
+    block, coarse = offer.specs.of(TaskId.block(0)), offer.specs.of(COARSE)
+    assert isinstance(block, TrainSpec) and isinstance(coarse, TrainSpec)
+    assert (block.shown, coarse.shown) == (row, 2)
+    scene.panoramas[2].image.unlink()
+    coarse = offer.specs.of(COARSE)
+    assert isinstance(coarse, TrainSpec) and coarse.shown is None  # the training does without it
 
 
 GIB = 2**30

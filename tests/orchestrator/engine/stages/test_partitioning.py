@@ -24,6 +24,7 @@ from panolog.partition.plan import PartitionConfig, make_plan, read_plan
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply, write_ply
+from panolog.scene.write import Offset, Origin, write_offset
 from panolog.workers.events import Event, Trained
 from panolog.workers.merge import retained
 from panolog.workers.specs import TaskSpec
@@ -31,6 +32,7 @@ from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training.initialise import scene_gaussians, scene_length
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.fakes import Harness, trained, well
+from tests.prepare.world.stills import GPS, PLACE, write_still
 from tests.workers.small import WIDTH, small_scene
 
 CONFIG = RunConfig(width=64, blocks="2x1x1")
@@ -53,6 +55,30 @@ def test_the_outline_of_a_place_is_a_plan_of_one_block(scene: Scene, tmp_path: P
     written = folder.outline.read_bytes()
     write_outline(folder, replace(scene, train=scene.train[:3]), CONFIG)
     assert folder.outline.read_bytes() == written  # a resumed run keeps it
+    write_outline(folder, replace(scene, train=scene.train[:3]), CONFIG, anew=True)
+    assert read_plan(folder.outline).rows == scene.train[:3]
+    assert not len(read_points(folder.outline_fixes))  # the scene does not say where it is
+
+
+def test_gps_in_the_files_is_in_the_world_of_the_run(scene: Scene, tmp_path: Path) -> None:
+    """What is subtracted from coordinates, by the scene and on reading, is subtracted from it too."""
+    offset, far, folder = (5.0, -4.0, 3.0), (1000.0, 0.0, 0.0), RunFolder(tmp_path / "run")
+    latitude, longitude = 47 + (22 + 39.12 / 60) / 60, 8 + 32.5 / 60
+    origin = Origin(latitude=latitude - 0.001, longitude=longitude, altitude=400.0)
+    write_offset(scene.root, Offset(offset=offset, frame="ENU", origin=origin))
+    level = {tag: value for tag, value in PLACE.items() if tag not in (GPS.GPSAltitude, GPS.GPSAltitudeRef)}
+    panoramas = list(scene.panoramas)
+    for row, place in enumerate((PLACE, level, None)):
+        path = write_still(tmp_path / f"{row}.jpg", np.zeros((32, 64, 3), np.uint8), place=place)
+        panoramas[row] = replace(panoramas[row], image=path)
+    panoramas[3] = replace(panoramas[3], image=tmp_path / "gone.jpg")
+    write_outline(folder, replace(scene, panoramas=tuple(panoramas), offset=far), CONFIG)
+    north = 111.177  # metres of a thousandth of a degree there, by the series of the meridian
+    wanted = np.array([[0, north, 8.5], [0, north, 0]]) - offset - far
+    np.testing.assert_allclose(read_points(folder.outline_fixes), wanted, atol=0.05)
+    (scene.root / "offset.json").write_text("nonsense")
+    write_outline(folder, scene, CONFIG, anew=True)
+    assert not len(read_points(folder.outline_fixes))
 
 
 def test_of_many_points_some_are_kept(scene: Scene, tmp_path: Path) -> None:

@@ -15,8 +15,10 @@ from panolog.orchestrator.runs.config import load_config
 from panolog.orchestrator.runs.preparation.settings import Options
 from panolog.orchestrator.runs.state import ignore
 from panolog.prepare.sfm.pipeline import SfmSettings, WithMasks, workspace_folder
+from panolog.prepare.sfm.sketch import Sketch
 from panolog.prepare.sources.gather import panoramas_in_folder
 from panolog.scene.files import write_bytes
+from panolog.scene.read import read_scene
 from panolog.scene.write import StageProgress
 from tests.orchestrator.cli.session.test_session import calibrating
 
@@ -56,8 +58,15 @@ class FakeSfm:
         progress: StageProgress,
         with_masks: WithMasks,
         memory: int,
+        show: Callable[[Sketch], None],
     ) -> Report:
         assert memory > 0
+        scene, nothing = read_scene(self.town), np.empty((0, 3))
+        names = tuple(panorama.name for panorama in scene.panoramas)
+        sketches = {
+            "features": Sketch((), nothing, nothing, scene.centers),
+            "poses": Sketch(names[:5], scene.centers[:5], scene.points, nothing),
+        }
         self.calls.append(settings)
         work = workspace_folder(output.resolve())
         layers = with_masks(*panoramas_in_folder(source))
@@ -65,6 +74,7 @@ class FakeSfm:
         self.masks.append(found)
         for part in ("features", "poses"):
             progress(part, 0, 10)
+            show(sketches[part])
             self.at(part)
             if not (work / part).exists():
                 work.mkdir(exist_ok=True)

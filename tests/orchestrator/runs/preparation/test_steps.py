@@ -1,5 +1,6 @@
 """A run of panoramas makes its scene first: step by step, whatever stops it."""
 
+import json
 import os
 import signal
 import threading
@@ -20,6 +21,8 @@ from panolog.orchestrator.runs.preparation.settings import Options, Step, read_s
 from panolog.orchestrator.runs.records import Noticed, Preparing
 from panolog.orchestrator.runs.state import ignore
 from panolog.orchestrator.runs.store import read_records
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
+from panolog.orchestrator.watch.dashboard.maps import MapCache
 from panolog.prepare.sfm.pipeline import workspace_folder
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
@@ -139,6 +142,25 @@ def test_status_shows_how_far_the_preparation_is_and_no_other_process_joins(
     assert (step["status"], step["what"], step["done"], step["total"]) == ("running", "poses", 0, 10)
     assert (masks["status"], check["status"]) == ("done", "waiting")
     assert call("pause", root, 0).exit_code == 2
+
+
+def test_the_map_grows_with_the_poses(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    """GPS comes first, then the panoramas that have a pose, and at last those that train."""
+    seen, entry = list[dict[str, Any]](), RunEntry(tmp_path, "run")
+
+    def look(at: str) -> None:
+        if at in ("features", "poses", "check"):
+            figure = json.loads(MapCache().map_of(entry))
+            seen.append(
+                {trace["name"]: trace for trace in figure["data"]} | {"names": figure["blocks"]["names"]}
+            )
+
+    sfm.at = look
+    start(raw, entry.folder.root, action=lambda: look("check"))
+    found = [(len(it["fixes"]["x"]), len(it["cameras"]["x"]), len(it["names"])) for it in seen]
+    assert found == [(9, 0, 0), (0, 5, 5), (0, 7, 7)]  # of nine panoramas two are held out
+    scene = read_scene(entry.folder.scene)
+    np.testing.assert_allclose(seen[2]["cameras"]["x"], scene.centers[list(scene.train), 0])
 
 
 def with_masks(town: Path, source: Path, count: int) -> Path:

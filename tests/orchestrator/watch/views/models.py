@@ -11,7 +11,8 @@ from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import write_ply
 from panolog.workers.events import Checkpoint
-from panolog.workers.tasks import TaskId
+from panolog.workers.showing.previews import snapshot
+from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.optimizer import ModelState
 
@@ -51,6 +52,13 @@ def save_checkpoint(folder: RunFolder, task: TaskId, count: int = 20, iteration:
     checkpoint.save(
         folder.checkpoint(task), Checkpoint(task, iteration, ModelState.start(some(count, 2)).tensors())
     )
+
+
+def save_snapshot(folder: RunFolder, model: Gaussians, iteration: int = 5, most: int = 10**6) -> None:
+    """What Stage I in training shows of a model."""
+    folder.of(COARSE).mkdir(parents=True, exist_ok=True)
+    tensors = snapshot(model, np.zeros(3), most)
+    checkpoint.save(folder.snapshot(COARSE), Checkpoint(COARSE, iteration, tensors))
 
 
 def save_plan(folder: RunFolder, names: Sequence[str] = NAMES, centers: np.ndarray = CENTERS) -> None:

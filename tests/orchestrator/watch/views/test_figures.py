@@ -2,6 +2,7 @@
 
 import base64
 import json
+from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,19 @@ def test_plotly_takes_the_figure_and_json_too(plan: Plan) -> None:
     figure = figures.map_figure(plan, POINTS)
     go.Figure({"data": figure["data"], "layout": figure["layout"]})  # checks every name and value
     json.dumps(figure, allow_nan=False)
+
+
+def test_fixes_of_gps_are_seen_from_above_and_stand_for_cameras_without_a_pose(plan: Plan) -> None:
+    fixes = np.array([[1.0, 2.0, 30.0], [-3.5, 4.0, np.pi]])
+    figure = figures.map_figure(plan, POINTS, fixes=fixes)
+    assert (trace(figure, "fixes")["x"], trace(figure, "fixes")["y"]) == ([1.0, -3.5], [2.0, 4.0])
+    assert len(trace(figure, "cameras")["x"]) == len(plan.rows)
+    nameless = replace(plan, names=("",) * len(plan.rows))
+    before = figures.map_figure(nameless, POINTS[:0], planned=False, fixes=plan.centers)
+    assert trace(before, "cameras")["x"] == before["blocks"]["names"] == []
+    assert len(trace(before, "fixes")["x"]) == len(plan.rows)
+    go.Figure({"data": before["data"], "layout": before["layout"]})
+    assert trace(figures.map_figure(plan, POINTS), "fixes")["x"] == []
 
 
 def test_each_pixel_has_the_block_of_its_place(plan: Plan) -> None:

@@ -188,10 +188,9 @@ export function actions(path) {
       return whys.every(Boolean) && el("p", { class: "muted small" }, `Not possible now: ${whys[0]}.`);
     },
     /** @param {RunPage} run */
-    update({ actions: current, result, paused, summary: { status, tasks } }) {
+    update({ actions: current, result, paused, summary: { status } }) {
       given = current;
-      const model = tasks.some((task) => task.checkpoint || task.status === "done");
-      replaceIfChanged(byId("actions"), [given, result, status, model, paused], () => {
+      replaceIfChanged(byId("actions"), [given, result, status, paused], () => {
         setMessage(
           byId("why"),
           status === "done" || given.allowed ? (given.failed ?? "") : `Actions are disabled: ${given.why}`,
@@ -201,7 +200,7 @@ export function actions(path) {
           status === "running"
             ? button("stop", [], refusal("stop"))
             : status !== "done" && button("resume", [], refusal("resume")),
-          model && viewer(null),
+          result.in_3d && viewer(null),
           result.model && downloads(),
           result.report && link("report.html", "Report"),
         ];

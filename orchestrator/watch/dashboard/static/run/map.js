@@ -17,12 +17,13 @@ const FULL = 0.42; // and of what is done
 const MARK = 60; // of 255, added to the opacity of the selected block
 /** A mark for each state, next to the number of a block: its colour alone says nothing to many. @type {Record<string, string>} */
 const MARKS = { done: "✓", failed: "✕", paused: "‖", running: "▸" };
-/** Sign and meaning of what else the map has, and whether only a plan has it. @type {[string, string, boolean][]} */
+/** Sign and meaning of what else the map has, and which part of it that is; null: what only a plan has. @type {[string, string, string | null][]} */
 const MARKED = [
-  ["●", "camera", false],
-  ["◎", "rings: other blocks that it trains", true],
-  ["∴", "points", false],
-  ["╌", "box, beyond which cells bend", true],
+  ["●", "camera", "cameras"],
+  ["◎", "rings: other blocks that it trains", null],
+  ["∴", "points", "points"],
+  ["+", "GPS", "fixes"],
+  ["╌", "box, beyond which cells bend", null],
 ];
 const coarse = matchMedia("(pointer: coarse)"); // a finger on the map scrolls the page
 
@@ -111,7 +112,7 @@ export function planMap(path, choose) {
     byId("map-empty").hidden = true;
     byId("legend").hidden = false;
     const { planned } = figure.blocks;
-    const drawn = MARKED.filter(([, , ofPlan]) => planned || !ofPlan);
+    const drawn = MARKED.filter(([, , part]) => (part === null ? planned : part === "points" || trace(part).x?.length));
     byId("legend").replaceChildren(
       ...drawn.map(([mark, text]) => el("li", { class: "mark" }, el("span", { "aria-hidden": "true" }, mark), text)),
       ...(planned ? BLOCK_STATUSES : []).map((status) =>
@@ -174,8 +175,11 @@ export function planMap(path, choose) {
   /** Updates the text for screen readers. */
   function label() {
     drawn = key();
-    if (!figure?.blocks.planned)
-      return plot.setAttribute("aria-label", `The ${cameraRows().length} cameras and the points from above`);
+    if (!figure?.blocks.planned) {
+      const cameras = cameraRows().length;
+      const what = cameras ? `The ${cameras} cameras and the points` : "Where GPS has the panoramas,";
+      return plot.setAttribute("aria-label", `${what} from above`);
+    }
     const shares = [...statuses.values()].map(([, share]) => share);
     const done = percent(shares.reduce((sum, share) => sum + share, 0) / Math.max(shares.length, 1));
     const groups = Object.entries(Object.groupBy(statuses.values(), ([status]) => status));
@@ -201,6 +205,7 @@ export function planMap(path, choose) {
       [1, withAlpha(ink, 0.95)],
     ];
     for (const name of ["faces", "box"]) trace(name).line.color = line;
+    trace("fixes").marker.line.color = text;
     const labels = trace("labels");
     /** @type {number[]} */
     const ids = labels.customdata;
@@ -292,7 +297,7 @@ export function planMap(path, choose) {
     /** @param {RunPage} run @param {Map<number, [string, number]>} current */
     update({ summary: { blocks }, result }, current) {
       statuses = current;
-      const plan = blocks.length ? JSON.stringify(blocks) : result.map ? "outline" : "";
+      const plan = blocks.length ? JSON.stringify(blocks) : (result.outline ?? (result.map ? "outline" : ""));
       if (plan && plan !== requested) {
         requested = plan;
         load();

@@ -1,4 +1,4 @@
-// Renders next to the photographs: training views of each task over the iterations, and the held-out views at the end.
+// Renders next to the photographs: a panorama of each task over the iterations, and the held-out ones at the end.
 
 /** @import { HeldOutView, HeldOutViews, PreviewList, RunEvent, RunPage } from "../shared/messages.js" */
 import { get, snapshot, urlOf } from "panolog/shared/api.js";
@@ -66,7 +66,7 @@ export function views(path) {
       el("option", { value: `view/${number}`, selected: `view/${number}` === state.chosen }, name),
     );
     return [
-      trained.length ? el("optgroup", { label: "Training views" }, trained) : null,
+      trained.length ? el("optgroup", { label: "In training" }, trained) : null,
       held.length ? el("optgroup", { label: "Held-out views" }, held) : null,
     ];
   }
@@ -88,7 +88,7 @@ export function views(path) {
         .sort((a, b) => a.event - b.event)
         .map((preview) => ({
           url: urlOf(`${path}/previews/${preview.event}`) ?? "",
-          text: `${preview.view}, iteration ${count(preview.iteration)}${hatched}`,
+          text: `${preview.view}${preview.held_out ? ", held out" : ""}, iteration ${count(preview.iteration)}${hatched}`,
         }));
     }
     const last = state.frames.length - 1;

@@ -357,7 +357,9 @@ export interface Results {
   model: boolean;
   report: boolean;
   view: boolean;
+  in_3d: boolean;
   map: boolean;
+  outline: string | null;
   exposure: string | null;
   findings: string;
 }
@@ -449,13 +451,14 @@ export interface RunRow {
   error: string | null;
 }
 
-/** A render of a training view, above the photograph. */
+/** A render of a panorama, above the photograph. */
 export interface SavedPreview {
   event: number;
   task: string;
   iteration: number;
   view: string;
   time: number;
+  held_out: boolean;
 }
 
 /** A face between two blocks, see `workers.seams.measurement`. */

@@ -4,6 +4,7 @@ import os
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,8 @@ from panolog.export.reading import read_model
 from panolog.orchestrator.engine.stages.partitioning import write_plan
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.watch.dashboard.models import downloads, pages
+from panolog.orchestrator.watch.dashboard.models import downloads, making, pages
+from panolog.orchestrator.watch.dashboard.models.making import Maker
 from panolog.orchestrator.watch.dashboard.models.pages import page_policy
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
 from panolog.scene.gaussians import Gaussians
@@ -24,11 +26,12 @@ from panolog.scene.ply import ply_exported, read_ply, write_ply
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.watch.dashboard.browser import opened
 from tests.orchestrator.watch.dashboard.served import POST, SCORES, Served, plan, raw, serving, write_run
-from tests.orchestrator.watch.views.models import save_checkpoint, some
+from tests.orchestrator.watch.views.models import save_checkpoint, save_snapshot, some
 from tests.orchestrator.watch.views.sites import SIZE, layers, ready, shown, until, viewpoints_of
 from tests.scenes import write_scene
 
 TOKEN = "t" * 43
+MODELS = "panolog.stage.app.root.children.filter((one) => one.name === 'model').length === 1"
 FETCH = "fetch('/api/runs').then(() => 'answered', () => 'refused')"
 
 
@@ -78,7 +81,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 @pytest.fixture(scope="module")
 def served(folder: RunFolder) -> Iterator[Served]:
     """A server that requires a token, and a client that has it."""
-    with serving(folder.root.parent, token=TOKEN) as served:
+    with pytest.MonkeyPatch.context() as patch, serving(folder.root.parent, token=TOKEN) as served:
+        patch.setattr(making, "_IDLE_S", 0.2)  # its process ends with each test
         served.client.headers["Authorization"] = f"Bearer {TOKEN}"
         yield served
 
@@ -158,28 +162,45 @@ def test_a_model_that_is_not_there_or_not_the_runs_own_is_a_line(tmp_path: Path)
 def test_a_model_in_training_is_replaced_by_newer_ones_and_the_view_stays(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From its first checkpoint on: upright, at a panorama, with cameras, before there is a plan."""
+    """From its first picture on: upright, at a panorama, with cameras, before there is a plan."""
     monkeypatch.setattr(pages, "_REFRESH_S", 1)
+    monkeypatch.setattr(pages, "_SHARE", 1e6)  # as soon as there is one
     folder = write_run(tmp_path / "run")
     write_json(folder.outline, plan().to_json())
-    save_checkpoint(folder, COARSE)
     with lock.hold(folder.lock), serving(tmp_path) as served:
+        page_of_run = f"/api/runs/{served.id('run')}"
+        assert not served.get(page_of_run)["result"]["in_3d"]
+        model = layers(viewpoints_of(folder))
+        other = replace(model, sh0=-model.sh0)  # the same in other colours
+        save_snapshot(folder, model)
+        assert served.get(page_of_run)["result"]["in_3d"]
         url = served.url + url_of(served)
         first = httpx.get(f"{url}scene.json").json()
-        assert (first["iteration"], first["total"], first["refresh"]) == (5, 20, 1)
+        assert (first["iteration"], first["total"], first["refresh"]) == (5, len(model), 1)
         assert [camera["name"] for camera in first["cameras"]] == [f"{number}.jpg" for number in range(4)]
         assert first["start"]["position"] in [camera["position"] for camera in first["cameras"]]
         with opened(browser, url, width=SIZE[0], height=SIZE[1]) as page:
             ready(page)
-            expect(page.locator("#count")).to_have_text("20 Gaussians · iteration 5")
+            count = page.locator("#count")
+            expect(count).to_have_text(f"{len(model)} Gaussians · iteration 5")
+            begun = shown(page)
+            assert len(np.unique(begun.reshape(-1, 3), axis=0)) > 1_000
+            save_checkpoint(folder, COARSE, 25, iteration=1_000)  # it has other details
+            save_snapshot(folder, other, iteration=1_200)
+            expect(count).to_have_text(f"{len(model)} Gaussians · iteration 1,200", timeout=300_000)
+            until(page, MODELS)
+            changed = np.abs(shown(page).astype(int) - begun).max(axis=2)
+            drawn = np.abs(begun.astype(int) - begun[0, 0]).max(axis=2) > 60
+            assert drawn.mean() > 0.05 and (changed[drawn] > 30).mean() > 0.8  # it is drawn at the same place
+            bare = (begun == begun[0, 0]).all(axis=2)
+            assert bare.mean() > 0.05 and (changed[bare] > 8).mean() < 0.02
             page.evaluate("panolog.flight.set({ position: [1, 2, 3], yaw: 40, pitch: 5 })")
-            save_checkpoint(folder, COARSE, 30, iteration=1_200)
-            expect(page.locator("#count")).to_have_text("30 Gaussians · iteration 1,200")
+            save_snapshot(folder, some(35, 2), iteration=1_300, most=21)
+            expect(count).to_have_text("23 of 35 Gaussians · iteration 1,300", timeout=300_000)
             assert page.evaluate("[...panolog.flight.position, panolog.flight.yaw]") == [1, 2, 3, 40]
             save_model(folder, some(40))
-            expect(page.locator("#count")).to_have_text("40 Gaussians")
-            models = "panolog.stage.app.root.children.filter((one) => one.name === 'model').length"
-            until(page, f"{models} === 1")
+            expect(count).to_have_text("40 Gaussians", timeout=300_000)
+            until(page, MODELS)
 
 
 @pytest.mark.system
@@ -262,11 +283,12 @@ def test_a_file_is_made_once_for_each_model(
 ) -> None:
     made = list[str]()
 
-    async def counted(module: str, arguments: list[str], what: str) -> None:
+    async def counted(_: Maker, module: str, arguments: list[str], what: str) -> float:
         made.append(arguments[2])
         Path(arguments[3]).write_bytes(small.point_cloud.read_bytes())
+        return 0.0
 
-    monkeypatch.setattr(downloads, "run_program", counted)  # what it makes: the test above
+    monkeypatch.setattr(Maker, "make", counted)  # what it makes: the test above
     with serving(small.root.parent) as served:
         first = saved(served, "ply", tmp_path).read_bytes()
         assert saved(served, "ply", tmp_path).read_bytes() == first

@@ -1,0 +1,76 @@
+"""The process that makes pages and files: one for all requests, whatever they come to."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from panolog.orchestrator.watch.dashboard.models import making
+from panolog.orchestrator.watch.dashboard.models.making import Maker
+from panolog.scene.errors import InputError
+from tests.orchestrator.watch.dashboard.models import trial
+
+pytestmark = pytest.mark.system
+Make = Callable[[str], Awaitable[float]]
+
+
+def with_maker(work: Callable[[Make], Awaitable[None]], notes: Path) -> list[int]:
+    """Does some work with a process that is ended afterwards. Returns the process of each request."""
+
+    async def run() -> None:
+        maker = Maker()
+        try:
+            await work(lambda kind: maker.make(trial.__name__, [kind, str(notes)], "the thing"))
+        finally:
+            await maker.close()
+
+    asyncio.run(run())
+    found = [int(line) for line in notes.read_text().splitlines()]
+    assert not any(psutil.pid_exists(pid) for pid in found)
+    return found
+
+
+async def refused(made: Awaitable[float]) -> str:
+    with pytest.raises(InputError) as caught:
+        await made
+    return str(caught.value)
+
+
+def test_one_process_makes_all_and_says_in_one_line_what_is_wrong(tmp_path: Path) -> None:
+    async def work(make: Make) -> None:
+        assert 0 <= await make("print") < 60
+        assert await refused(make("refuse")) == "a.ply: is no model"
+        assert await refused(make("fail")) == "ValueError: one line"
+        assert await make("print") < 60
+
+    assert len(set(with_maker(work, tmp_path / "notes"))) == 1
+
+
+def test_the_next_request_gets_another_process_after_one_that_has_died_or_hung(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def work(make: Make) -> None:
+        assert await refused(make("die")) == "the thing could not be made"
+        await make("print")
+        monkeypatch.setattr(making, "_TIMEOUT_S", 1.0)
+        assert await refused(make("hang")) == "the thing was not made within 1 seconds"
+        monkeypatch.setattr(making, "_TIMEOUT_S", 300.0)
+        await make("print")
+
+    *before, last = with_maker(work, tmp_path / "notes")
+    assert len(set(before)) == 2 and last not in before
+
+
+def test_it_ends_when_nothing_was_wanted_for_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(making, "_IDLE_S", 0.2)
+
+    async def work(make: Make) -> None:
+        await make("print")
+        first = int((tmp_path / "notes").read_text())
+        while psutil.pid_exists(first) and psutil.Process(first).status() != psutil.STATUS_ZOMBIE:
+            await asyncio.sleep(0.05)
+        await make("print")
+
+    assert len(set(with_maker(work, tmp_path / "notes"))) == 2

@@ -1,0 +1,1 @@
+"""What a task in training shows of itself."""
