@@ -341,14 +341,15 @@ def _count(blocks: str) -> int:
 
 
 def other_settings(stored: dict[str, Any], config: dict[str, Any]) -> str:
-    """Settings of a stored result that would be others now; empty if there are none.
+    """Settings of a stored result that would be others now and change a model; empty if there are none.
 
     Settings that have come since then count as having had their defaults.
     """
     if not stored:
         return "settings that are not stored with it"
     then = flat(RunConfig(recipe="paper")) | stored
-    changes = [f"{key} = {then.get(key)}, not {value}" for key, value in differing(then, config).items()]
+    changed = differing(then, config, ("preview.",))
+    changes = [f"{key} = {then.get(key)}, not {value}" for key, value in changed.items()]
     return ", ".join(changes)
 
 

@@ -132,7 +132,7 @@ def test_circles_of_different_places_are_refused(walked: list[tuple[Image, Image
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("kind", ["video", "folder"])
+@pytest.mark.parametrize("kind", ["video", pytest.param("folder", marks=pytest.mark.nightly)])
 def test_raw_files_become_a_scene_in_one_command(
     kind: str, walked: list[tuple[Image, Image]], tmp_path: Path
 ) -> None:

@@ -1,6 +1,6 @@
 """A run of several sources: what it notes of them, what it masks in each, and what it refuses."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from panolog.orchestrator.runs.preparation import notes
 from panolog.orchestrator.runs.preparation.settings import Options, Step, read_settings
 from panolog.prepare.sfm import pipeline
 from panolog.prepare.sfm.pipeline import SfmSettings, WithMasks, workspace_folder
+from panolog.prepare.sfm.sketch import Sketch
 from panolog.prepare.sources.find import find_sources
 from panolog.prepare.sources.gather import gather
 from panolog.scene.errors import InputError
@@ -44,6 +45,7 @@ def gathering(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[Path]]:
         progress: StageProgress,
         with_masks: WithMasks,
         memory: int,
+        _show: Callable[[Sketch], None],
     ) -> None:
         calls.append(source)
         found = gather(find_sources(source), workspace_folder(output.resolve()), settings, progress)
