@@ -50,12 +50,14 @@ def scene(exact: bool = False) -> tuple[Gaussians, Camera, torch.Tensor]:
 def block(exact: bool) -> tuple[Gaussians, Baked, Camera, torch.Tensor]:
     """Some at middle distances, with others before, among and behind; half has left the active tiles.
 
-    They are the farther the more to the right, so that spans of neighbouring tiles differ.
+    Own ones to the right are farther, so that what is near composites among them in some of its tiles alone.
     """
     at = camera(84)
     spread, height = torch.rand(2, 90, generator=torch.Generator().manual_seed(2))
-    azimuth = torch.linspace(-0.8, 0.4, 90) + 0.4 * spread
-    gaussians = replace(placed(90, directions(azimuth, 0.4 * height), at, -1.5), exact=exact)
+    azimuth = torch.linspace(-2.4, 1.6, 90) + 0.4 * spread
+    near = (azimuth < -0.4) == (torch.arange(90) % 4 != 1)  # own ones to the left
+    away = torch.where(near, 1.0, 2.5)[:, None]
+    gaussians = replace(placed(90, away * directions(azimuth, 0.4 * height), at, -1.5), exact=exact)
     own, exterior = surrounded(gaussians, at, torch.arange(20, 70, 2))
     center = -at.rotation.T @ at.translation
     means = torch.where(torch.arange(len(own))[:, None] % 2 == 0, own.means, 2 * center - own.means)
