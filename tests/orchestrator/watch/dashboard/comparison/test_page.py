@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
@@ -15,6 +16,7 @@ from tests.orchestrator.history import BEGAN, append, started
 from tests.orchestrator.watch.dashboard.browser import PHONE, SMALL, opened, unreachable
 from tests.orchestrator.watch.dashboard.served import EVIL, Served, serving
 from tests.orchestrator.watch.views.comparison.runs import VALUES, metrics, progressed, write, write_picture
+from tests.ray_head import wait_until
 from tests.visual.compare import expand
 
 pytestmark = pytest.mark.system
@@ -60,8 +62,9 @@ def grey(box: Locator) -> tuple[int, int]:
     return int(row[len(row) // 4]), int(row[-len(row) // 4])
 
 
-def near(found: tuple[int, int], wanted: tuple[int, int]) -> bool:
-    return max(abs(a - b) for a, b in zip(found, wanted, strict=True)) < 12
+def shows(box: Locator, *wanted: int) -> None:
+    """Waits until the left and the right part of a picture have these greys: it is loaded after a choice."""
+    wait_until(lambda: max(map(abs, np.subtract(grey(box), wanted))) < 12, f"the greys {wanted}")
 
 
 def test_runs_are_chosen_in_the_list_with_the_keyboard(browser: Browser, served: Served) -> None:
@@ -108,18 +111,18 @@ def test_any_two_runs_and_the_ground_truth_are_compared_and_runs_are_left_out(
         box = page.locator(".compare")
         box.scroll_into_view_if_needed()
         expect(page.locator(".tag")).to_have_text(["first", "second"])
-        assert near(grey(box), (20, 120))
+        shows(box, 20, 120)
         page.get_by_label("Left").select_option(label=NAMES[2])
-        assert near(grey(box), (180, 120))
+        shows(box, 180, 120)
         page.get_by_label("Right").select_option(label="ground truth")
         expect(page.locator(".tag")).to_have_text([NAMES[2], "ground truth"])
-        assert near(grey(box), (180, 230))
+        shows(box, 180, 230)
         page.get_by_label("Left").select_option(label="ground truth")
         page.get_by_label("Right").select_option(label="first")
-        assert near(grey(box), (230, 20))
+        shows(box, 230, 20)
         page.get_by_role("button", name="360°").click()
         expect(box.locator("canvas")).to_have_attribute("data-angles", "0.000 0.000 0.800")
-        assert near(grey(box), (230, 20))
+        shows(box, 230, 20)
         page.get_by_role("button", name="c.jpg").click()
         expect(page.locator("#picture-caption")).to_contain_text("c.jpg · first: WS-PSNR 28.00")
         page.locator("#metric").select_option(label="LPIPS")
