@@ -84,7 +84,7 @@ class Scene:
         return np.stack([np.column_stack([each.rotation, each.translation]) for each in self.panoramas])
 
     def without_holdout(self) -> "Scene":
-        """The same scene in which the held-out panoramas train too, so that none can be measured on."""
+        """This scene with its held-out panoramas among those that train, so that none can be measured on."""
         return replace(self, train=tuple(sorted({*self.train, *self.test})), test=())
 
     def without_points(self) -> "Scene":

@@ -147,7 +147,7 @@ class TrainingStep:
         yield self.now() - start
 
     def _parts_on_card(self, launch: Launch, problem: Problem) -> Iterator[float]:
-        """The same through autograd: an iteration on a card is launched as a whole."""
+        """Seconds of forward pass, loss and backward pass through autograd, as an iteration is one launch."""
         start = self.now()
         leaves, rendered = self.forward()
         yield self.now() - start

@@ -193,7 +193,7 @@ def seconds(gpu: Gpu, kinds: Mapping[str, float], warps: float, size: float) -> 
 
 
 def milliseconds(gpu: Gpu, of: Work | CaseSpec) -> Iterator[tuple[str, float, str]]:
-    """Of each kernel its name, time, and which part of the card limits it; then those of sorting."""
+    """The name, milliseconds and limiting part of the card of each kernel, then of each sort."""
     work = of if isinstance(of, Work) else work_of(of)
     made = launched(work)
     programs = {
@@ -227,7 +227,7 @@ class Timed:
         self.seconds: dict[str, list[float]] = {}
 
     def __call__(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
-        """As `parts.Launch`."""
+        """Launches a kernel as `parts.Launch` does, and waits for it."""
         start = self._now()
         self._launch(kernel, grid, block, **arguments)
         self.seconds.setdefault(kernel, []).append(self._now() - start)

@@ -112,7 +112,7 @@ class Half:
 def test_a_task_shows_the_most_central_held_out_panorama_of_its_part(
     offer: Offer, least: float, row: int | None
 ) -> None:
-    """Of Stage I, the whole place has more of them than a block may have."""
+    """Stage I has the whole place, with more held-out panoramas than a block may have."""
     scene = replace(offer.job.scene, train=(0, 3), test=(1, 2, 4))
     vars(offer.specs).update(_job=replace(offer.job, scene=scene))
     offer.specs.plan.cell = lambda _: Half(least)  # type: ignore[method-assign, assignment, return-value]
