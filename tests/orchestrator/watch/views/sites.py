@@ -17,6 +17,7 @@ from playwright.sync_api import Page
 
 from panolog.orchestrator.cli.commands.view import Site, SiteServer
 from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_file
 from panolog.orchestrator.watch.views.site.viewpoints import Viewpoints, read_viewpoints
 from panolog.renderer.camera import Camera, Lens, perspective
 from panolog.renderer.render import render, to_bytes
@@ -140,6 +141,18 @@ def layers(viewpoints: Viewpoints, count: int = 60) -> Gaussians:
     depth = torch.linspace(2, 12, count)[:, None]
     across = (torch.rand(count, 2, generator=random) - 0.5) * depth * 0.9
     return balls(viewpoints, torch.cat([across, depth], 1), depth[:, 0] * 0.1)
+
+
+def page_of_layers(root: Path) -> tuple[Path, Gaussians, Viewpoints]:
+    """The page of `layers` as one file, with their model and the viewpoints, which begin at 1.jpg."""
+    folder = begun(root / "run")
+    save_plan(folder)
+    viewpoints = viewpoints_of(folder, "1.jpg")
+    model = layers(viewpoints)
+    folder.of(COARSE).mkdir()
+    write_ply(folder.model(COARSE), model)
+    write_file(site_of_run(folder, Wanted(camera="1.jpg")), root / "page.html")
+    return root / "page.html", model, viewpoints
 
 
 def balls(viewpoints: Viewpoints, places: torch.Tensor, radii: torch.Tensor) -> Gaussians:

@@ -9,17 +9,15 @@ import pytest
 import torch
 from playwright.sync_api import Browser, Page, expect
 
-from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_file, write_folder
+from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
-from tests.orchestrator.history import begun
 from tests.orchestrator.watch.dashboard.browser import DESK, KEYBOARD, PHONE, SMALL, opened
-from tests.orchestrator.watch.views.models import save_plan
 from tests.orchestrator.watch.views.sites import (
     COUNT,
     SIZE,
     cloud,
-    layers,
+    page_of_layers,
     psnr,
     ready,
     rendered,
@@ -80,14 +78,8 @@ def pass_by(page: Page, seconds: float) -> None:
 
 
 def test_the_picture_of_one_file_is_that_of_our_renderer(browser: Browser, tmp_path: Path) -> None:
-    folder = begun(tmp_path / "run")
-    save_plan(folder)
-    viewpoints = viewpoints_of(folder, "1.jpg")
-    model = layers(viewpoints)
-    folder.of(COARSE).mkdir()
-    write_ply(folder.model(COARSE), model)
-    write_file(site_of_run(folder, Wanted(camera="1.jpg")), tmp_path / "page.html")
-    with opened(browser, (tmp_path / "page.html").as_uri(), width=SIZE[0], height=SIZE[1]) as page:
+    file, model, viewpoints = page_of_layers(tmp_path)
+    with opened(browser, file.as_uri(), width=SIZE[0], height=SIZE[1]) as page:
         picture = shown(page)
     quality = psnr(picture, rendered(model, viewpoints, SIZE, background=picture[0, 0]))
     assert quality >= 25, f"{quality:.1f} dB"

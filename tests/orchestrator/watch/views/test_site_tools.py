@@ -8,14 +8,9 @@ import torch
 from playwright.sync_api import Browser, Page
 
 from panolog.export.splats import Selection, Splats
-from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_file
 from panolog.renderer.poses import read_poses
-from panolog.scene.ply import write_ply
-from panolog.workers.tasks import COARSE
-from tests.orchestrator.history import begun
 from tests.orchestrator.watch.dashboard.browser import opened
-from tests.orchestrator.watch.views.models import save_plan
-from tests.orchestrator.watch.views.sites import SIZE, layers, psnr, rendered, shown, viewpoints_of
+from tests.orchestrator.watch.views.sites import SIZE, page_of_layers, psnr, rendered, shown
 from tests.visual.compare import expand
 
 pytestmark = pytest.mark.system
@@ -27,14 +22,8 @@ def press(page: Page, name: str) -> None:
 
 
 def test_views_are_saved_cropped_and_rendered_from(browser: Browser, tmp_path: Path) -> None:
-    folder = begun(tmp_path / "run")
-    save_plan(folder)
-    viewpoints = viewpoints_of(folder, "1.jpg")
-    model = layers(viewpoints)
-    folder.of(COARSE).mkdir()
-    write_ply(folder.model(COARSE), model)
-    write_file(site_of_run(folder, Wanted(camera="1.jpg")), tmp_path / "page.html")
-    with opened(browser, (tmp_path / "page.html").as_uri(), width=SIZE[0], height=SIZE[1]) as page:
+    file, model, viewpoints = page_of_layers(tmp_path)
+    with opened(browser, file.as_uri(), width=SIZE[0], height=SIZE[1]) as page:
         whole = shown(page)
         with page.expect_download() as picture:
             press(page, "picture")
