@@ -43,6 +43,7 @@ from panolog.orchestrator.runs.state import replay
 from panolog.partition.cells import Grid
 from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import ConfigError, InputError, RunError
+from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import read_ply
 from panolog.workers.tasks import Stage, TaskId
 from panolog.workers.training.schedule import Schedule
@@ -229,6 +230,8 @@ class Bench:
             notes.append(f"resumed ({drivers - 1}): work done twice counts twice")
         plan = read_plan(RunFolder(root).plan) if RunFolder(root).plan.exists() else None
         overlap, added = overlap_of(plan.assignment) if plan else (None, None)
+        model = read_ply(RunFolder(root).point_cloud)
+        means = {name: evaluation["mean"].get(name) for name in results.METRICS}
         densified, resets = turns(variant.resolved(self.settings, self.seed, length))
         result = Result(
             self.scene.name,
@@ -238,10 +241,10 @@ class Bench:
             densified=densified,
             resets=resets,
             blocks=sum(block.train for block in replay(records).plan or ()),
-            metrics={name: evaluation["mean"].get(name) for name in results.METRICS} | _closer(root, device),
+            metrics=means | _closer(root, model, device),
             gaussians=evaluation["gaussians"],
             bytes=evaluation["bytes"],
-            haze=haze(read_ply(RunFolder(root).point_cloud)),
+            haze=haze(model),
             seconds=seconds | borrowed,
             longest=_longest(records),
             threads=cores(),
@@ -257,13 +260,13 @@ class Bench:
         return replace(result, curve=(*points, last))
 
 
-def _closer(root: Path, device: str) -> dict[str, float | None]:
-    """The quality of the model at twice the width of training, where the panoramas have that."""
+def _closer(root: Path, model: Gaussians, device: str) -> dict[str, float | None]:
+    """The quality of a run's model at twice the width of training, where the panoramas have that."""
     gallery = Gallery.of(root, device)
     if gallery.scene.width < 2 * gallery.width:
         return {}
     twice = replace(gallery, width=2 * gallery.width)
-    return {"twice_ws_psnr": twice.quality(read_ply(RunFolder(root).point_cloud))["ws_psnr"]}
+    return {"twice_ws_psnr": twice.quality(model)["ws_psnr"]}
 
 
 @dataclass

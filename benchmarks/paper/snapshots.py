@@ -10,10 +10,9 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 from pathlib import Path
 from shutil import rmtree
-from threading import Event, Thread
 
 import torch
 
@@ -21,6 +20,7 @@ from benchmarks.paper.measure import Gallery
 from benchmarks.paper.results import Point
 from benchmarks.paper.variants import POINTS
 from benchmarks.runs import clock, history
+from panolog.orchestrator.runs.clock import repeated
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import CheckpointSaved, ModelSaved
 from panolog.partition.plan import Plan, read_plan
@@ -49,21 +49,12 @@ def kept(root: Path, folder: Path, *, wanted: bool = True) -> Iterator[None]:
     if not wanted:
         yield
         return
-    ended = Event()
-    watcher = Thread(target=_watch, args=(root, folder, ended), daemon=True)
     folder.mkdir(parents=True, exist_ok=True)
-    watcher.start()
     try:
-        yield
+        with repeated(partial(look, root, folder), _INTERVAL):
+            yield
     finally:
-        ended.set()
-        watcher.join()
-
-
-def _watch(root: Path, folder: Path, ended: Event) -> None:
-    while not ended.wait(_INTERVAL):
         look(root, folder)
-    look(root, folder)
 
 
 def look(root: Path, folder: Path) -> None:

@@ -1,6 +1,9 @@
 """Time as the driver sees it, so that a simulation can have its own."""
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Event, Thread
 from typing import Protocol
 
 
@@ -41,3 +44,21 @@ class Steady:
 
     def sleep(self, seconds: float) -> None:
         self._clock.sleep(seconds)
+
+
+@contextmanager
+def repeated(call: Callable[[], None], seconds: float) -> Iterator[None]:
+    """Calls something in a thread every so many seconds, while the context lasts."""
+    ended = Event()
+
+    def repeat() -> None:
+        while not ended.wait(seconds):
+            call()
+
+    thread = Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()

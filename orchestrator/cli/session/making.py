@@ -6,10 +6,9 @@ repeated. So a run that was killed at any moment ends with the scene of an undis
 
 import json
 import shutil
-import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +22,7 @@ from panolog.orchestrator.engine.stages.outline import write_outline, write_sket
 from panolog.orchestrator.engine.stages.scenes import divided
 from panolog.orchestrator.runs import control
 from panolog.orchestrator.runs import info as run_info
+from panolog.orchestrator.runs.clock import repeated
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.control import Action, ControlRequest
 from panolog.orchestrator.runs.folder import RunFolder, command_line
@@ -56,25 +56,16 @@ def discard(folder: RunFolder, made: list[Path]) -> None:
     run_info.discard(folder, made)
 
 
-@contextmanager
-def stoppable(folder: RunFolder) -> Iterator[None]:
+def stoppable(folder: RunFolder) -> AbstractContextManager[None]:
     """While the context lasts, a request to stop the run interrupts the main thread as Ctrl-C does."""
-    ended = threading.Event()
 
-    def watch() -> None:
-        while not ended.wait(_POLL_S):
-            with suppress(OSError):
-                wanted = [it for it in control.take(folder) if isinstance(it, ControlRequest)]
-                if any(it.action == Action.STOP for it in wanted):
-                    interrupt()
+    def look() -> None:
+        with suppress(OSError):
+            wanted = [it for it in control.take(folder) if isinstance(it, ControlRequest)]
+            if any(it.action == Action.STOP for it in wanted):
+                interrupt()
 
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        watcher.join()
+    return repeated(look, _POLL_S)
 
 
 @dataclass
