@@ -13,9 +13,8 @@ _PACKED = "an archive; unpack it, and give the folder"
 _LIGHT = "a picture of high dynamic range; save it tone-mapped, as TIFF or PNG of 8 or 16 bits"
 _LENSES = f"a video of two lenses; {STITCH}"
 _VIDEO = "a video; give it by itself, or next to the folder: `panolog run FOLDER VIDEO -o RUN`"
-VIDEOS = frozenset(
-    {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".insv", ".osv"}
-)  # that a folder may hold
+_STITCHED = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+VIDEOS = frozenset({*_STITCHED, ".insv", ".osv"})  # that a folder may hold
 _KINDS = {
     ".insp": f"a photograph of two fisheye lenses (Insta360); {STITCH}",
     ".insv": _LENSES,
@@ -28,7 +27,7 @@ _KINDS = {
     **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".gz", ".tgz"), _PACKED),
     **dict.fromkeys((".exr", ".hdr"), _LIGHT),
     **dict.fromkeys((".psd", ".psb", ".xcf"), "a file of an editor; export it as TIFF or PNG"),
-    **dict.fromkeys((".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"), _VIDEO),
+    **dict.fromkeys(_STITCHED, _VIDEO),
 }
 
 

@@ -15,8 +15,7 @@ from panolog.renderer import ops
 from panolog.renderer.adam import BETAS, EPSILON, Moving, check_moving
 from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.motion import MOTION_SUMS
-
-PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")  # in the order of `_core`
+from panolog.scene.gaussians import PARAMETERS
 
 
 class Seen(NamedTuple):
@@ -146,7 +145,7 @@ def backward(
 
 
 def _arrays(moving: Moving | None) -> tuple[object, ...] | None:
-    """As the kernel takes it."""
+    """What `_core` takes of a parameter that moves, in its order; None for one that does not."""
     if moving is None:
         return None
     *tensors, count, lr, units = moving

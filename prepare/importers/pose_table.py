@@ -48,14 +48,9 @@ _ALIASES = {
 _CANONICAL = {alias: name for name, aliases in _ALIASES.items() for alias in aliases}
 _PLACE = ("x", "y", "z")
 _ATTITUDES = (("qw", "qx", "qy", "qz"), ("omega", "phi", "kappa"), ("yaw", "pitch", "roll"))
+_QUATERNION = ("q0", "q1", "q2", "q3", "q4")
 _UNCLEAR = {
-    (
-        "q0",
-        "q1",
-        "q2",
-        "q3",
-        "q4",
-    ): "which of its numbers is the real part is unknown: name them qw, qx, qy, qz",
+    _QUATERNION: "which of its numbers is the real part is unknown: name them qw, qx, qy, qz",
     ("tx", "ty", "tz"): "a translation is not where the camera is: give that as x, y, z",
     ("lat", "latitude", "lon", "longitude"): "project the angles on the earth to metres: x, y, z",
 }
@@ -171,7 +166,7 @@ def _attitude(path: Path, head: Sequence[str], columns: dict[str, int]) -> tuple
     if twice := [name for name, column in columns.items() if column < 0]:
         raise SceneError(f"{where} has several columns for {', '.join(twice)}; leave one of each")
     begun = [names for names in _ATTITUDES if set(names) & columns.keys()]
-    shown = [f"{', '.join(names)}" for names in begun or _ATTITUDES]
+    shown = [", ".join(names) for names in begun or _ATTITUDES]
     if len(begun) > 1:
         raise SceneError(f"{where} has several attitudes ({'; '.join(shown)}), which may differ; leave one")
     if not begun:

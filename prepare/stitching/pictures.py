@@ -16,7 +16,7 @@ from panolog.prepare.stitching.circles import CircleError, Picture, halves
 from panolog.prepare.stitching.lenses import APPROXIMATE, Pair, Up, pairs_as_json, read_pairs
 from panolog.prepare.stitching.stitch import Stitcher
 from panolog.prepare.world.exif import camera_of, essential_exif
-from panolog.prepare.world.image_blocks import with_segments
+from panolog.prepare.world.image_blocks import EXIF_HEAD, with_segments
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, natural_key, write_bytes
 from panolog.scene.image_files import decode, decode_colors, read_info
@@ -28,7 +28,6 @@ INSP = ".insp"  # a JPEG that Insta360 names so where it is not stitched
 _SAMPLED = 8  # pictures in which the lenses are looked for
 _SIDE = 2048  # pixels of a lens's picture in which that is done, at most
 _QUALITY = 95
-_EXIF = b"Exif\0\0"
 Key = tuple[str, int, int]  # of a camera, and the width and height of its pictures
 
 
@@ -172,7 +171,7 @@ def _stitch(file: Path, target: Path, stitcher: Stitcher, changed: int, note: Ca
     whole = stitcher.panorama(halves(picture))
     jpeg = bytes(cv2.imencode(".jpg", whole, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
     if (block := essential_exif(file)) is not None:
-        jpeg = with_segments(jpeg, _EXIF + block)
+        jpeg = with_segments(jpeg, EXIF_HEAD + block)
     target.parent.mkdir(parents=True, exist_ok=True)
     with atomic(target) as temporary:
         temporary.write_bytes(jpeg)

@@ -7,11 +7,10 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from panolog.prepare.world.exif import Attitude, GpsFix
-from panolog.prepare.world.image_blocks import with_segments
+from panolog.prepare.world.image_blocks import XMP_HEAD, with_segments
 
 _SECOND = 1_000_000  # parts of a second; of a second of arc, one is 30 micrometres on the ground
 _LARGEST = 65_534  # ISO that fits; one more means that it does not
-_XMP = b"http://ns.adobe.com/xap/1.0/\0"
 
 
 def stamped(
@@ -33,7 +32,7 @@ def stamped(
     if fix is not None or taken is not None or exposure is not None:
         contents.append(_exif(fix, taken, exposure))
     if attitude is not None:
-        contents.append(_XMP + _packet(attitude))
+        contents.append(XMP_HEAD + _packet(attitude))
     return with_segments(jpeg, *contents)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.provenance import MAX_BYTES
 from panolog.prepare.world.exif import Attitude, Crop, Exif, essential_exif, read_exif
-from panolog.prepare.world.image_blocks import with_segments
+from panolog.prepare.world.image_blocks import EXIF_HEAD, XMP_HEAD, with_segments
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, stem_of
 from panolog.scene.image_files import decode_colors, decode_used, read_info
@@ -28,7 +28,6 @@ from panolog.scene.write import Progress, no_progress
 _THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama
 _HEADER = 33  # bytes of a PNG before its second chunk
 _QUALITY = 95  # of a JPEG
-_EXIF_HEAD, _XMP_HEAD = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"  # of segments of a JPEG
 _POSE = {"Heading": "heading", "Pitch": "pitch", "Roll": "roll"}
 _XMP = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
@@ -133,8 +132,8 @@ def write_derived(path: Path, exif: Exif, pixels: NDArray[np.uint8], output: Pat
             chunks += _chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + _packet(exif.attitude))
         encoded = encoded[:_HEADER] + chunks + encoded[_HEADER:]
     else:
-        segments = [] if block is None else [_EXIF_HEAD + block]
-        segments += [] if exif.attitude is None else [_XMP_HEAD + _packet(exif.attitude)]
+        segments = [] if block is None else [EXIF_HEAD + block]
+        segments += [] if exif.attitude is None else [XMP_HEAD + _packet(exif.attitude)]
         encoded = bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
         encoded = with_segments(encoded, *segments)
     output.parent.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,8 @@ from panolog.scene.pictures.profiles import jpeg_segments
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_APP1, _EXIF_HEAD, _XMP_HEAD = 0xE1, b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"
+_APP1 = 0xE1
+EXIF_HEAD, XMP_HEAD = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"  # of segments of a JPEG
 _PNG_XMP = b"XML:com.adobe.xmp\0"
 _BLOCK = 2**20  # bytes of a PNG's EXIF or XMP; a JPEG's have 65,533 at most
 _READ = 2**22  # bytes that are read in all: the entries of EXIF may all point at the same large block
@@ -39,10 +40,10 @@ def read_blocks(file: Bounded) -> tuple[Bounded | None, bytes | None]:
         return file, None
     exif = xmp = None
     for part in _parts(file, magic):
-        if part.startswith(_EXIF_HEAD) and exif is None:
-            exif = Bounded(io.BytesIO(part[len(_EXIF_HEAD) :]))
-        elif part.startswith(_XMP_HEAD) and xmp is None:
-            xmp = part[len(_XMP_HEAD) :]
+        if part.startswith(EXIF_HEAD) and exif is None:
+            exif = Bounded(io.BytesIO(part[len(EXIF_HEAD) :]))
+        elif part.startswith(XMP_HEAD) and xmp is None:
+            xmp = part[len(XMP_HEAD) :]
         if exif is not None and xmp is not None:
             break
     return exif, xmp
@@ -64,9 +65,9 @@ def _webp_parts(file: Bounded) -> Iterator[bytes]:
         kind, length = struct.unpack("<4sI", head)
         after = file.tell() + length + length % 2
         if kind == b"EXIF" and length <= _BLOCK:
-            yield _EXIF_HEAD + file.read(length).removeprefix(_EXIF_HEAD)
+            yield EXIF_HEAD + file.read(length).removeprefix(EXIF_HEAD)
         elif kind == b"XMP " and length <= _BLOCK:
-            yield _XMP_HEAD + file.read(length)
+            yield XMP_HEAD + file.read(length)
         file.seek(after)
 
 
@@ -74,8 +75,8 @@ def _jpeg_parts(file: Bounded) -> Iterator[bytes]:
     """The contents of the APP1 segments with EXIF or XMP before the first scan."""
     for marker, length in jpeg_segments(file):
         after = file.tell() + length
-        head = file.read(min(length, len(_XMP_HEAD))) if marker == _APP1 else b""
-        if head.startswith((_EXIF_HEAD, _XMP_HEAD)):
+        head = file.read(min(length, len(XMP_HEAD))) if marker == _APP1 else b""
+        if head.startswith((EXIF_HEAD, XMP_HEAD)):
             yield head + file.read(length - len(head))
         file.seek(after)
 
@@ -86,11 +87,11 @@ def _png_parts(file: Bounded) -> Iterator[bytes]:
         length, kind = struct.unpack(">I4s", head)
         after = file.tell() + length + 4  # and a checksum
         if kind == b"eXIf" and length <= _BLOCK:
-            yield _EXIF_HEAD + file.read(length).removeprefix(_EXIF_HEAD)
+            yield EXIF_HEAD + file.read(length).removeprefix(EXIF_HEAD)
         elif kind == b"iTXt" and length <= _BLOCK:
             data = file.read(length)
             if data.startswith(_PNG_XMP):
-                yield _XMP_HEAD + _text(data[len(_PNG_XMP) :])
+                yield XMP_HEAD + _text(data[len(_PNG_XMP) :])
         file.seek(after)
 
 

@@ -20,8 +20,8 @@ from panolog.renderer.cuda.parts import (
     project,
     project_backward,
 )
+from panolog.scene.gaussians import PARAMETERS
 
-_PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 _IMAGES = ("color", "alpha", "inverse_depth", "grad_color", "grad_alpha", "grad_inverse_depth")
 
 
@@ -30,7 +30,7 @@ def _problem(given: dict[str, Any]) -> tuple[dict[str, Tensor], bytes, Exterior 
     size, exact = (given["width"], given["height"]), given["exact"]
     rotation, translation = (given[name].detach().cpu() for name in ("rotation", "translation"))
     camera = camera_struct(rotation, translation, *size, given["near"], exact)
-    parameters = contiguous(**{name: given[name] for name in _PARAMETERS})
+    parameters = contiguous(**{name: given[name] for name in PARAMETERS})
     return parameters, camera, Exterior.of(given["exterior"], *size, exact)
 
 

@@ -12,11 +12,11 @@ from torch import Tensor
 from panolog.renderer.adam import Moving
 from panolog.renderer.baked import bake
 from panolog.renderer.cuda.iteration import Problem
-from panolog.renderer.iteration import PARAMETERS, backward, forward, loss_of, take
+from panolog.renderer.iteration import backward, forward, loss_of, take
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
 from panolog.renderer.motion import MOTION_SUMS
 from panolog.renderer.render import Render, render
-from panolog.scene.gaussians import Gaussians
+from panolog.scene.gaussians import PARAMETERS, Gaussians
 from tests.renderer.agreement import NEAR
 from tests.renderer.hard_scenes import as_leaves, camera, cloud
 
