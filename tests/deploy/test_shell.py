@@ -18,7 +18,8 @@ LIMIT_S = 300
 # Programs that record how they were called, with the token's length in place of the token.
 RECORDS = '#!/bin/bash\necho "${0##*/} $* token ${#RAY_AUTH_TOKEN} $RAY_AUTH_MODE" >> "$CALLS"\n'
 RUNS = RECORDS + "exec sleep 600\n"
-AFTER_SRUN = RECORDS + 'until grep --quiet ^srun "$CALLS"; do sleep 0.05; done\n'
+# What the script starts in the background may record its call after the driver's.
+AFTER_OTHERS = "".join(f'until grep --quiet "^{call}" "$CALLS"; do sleep 0.05; done\n' for call in ("srun", "ray start"))
 DRIVER = RECORDS.replace("\n", "\ntrap 'exit 130' TERM\n", 1) + "sleep 600 & wait\n"
 
 
@@ -78,7 +79,7 @@ class Slurm:
 
 @pytest.mark.parametrize("code", [0, 2])
 def test_slurm_starts_ray_on_all_nodes_and_ends_as_the_driver_does(tmp_path: Path, code: int) -> None:
-    slurm = Slurm(tmp_path, f"{AFTER_SRUN}exit {code}\n")
+    slurm = Slurm(tmp_path, f"{RECORDS}{AFTER_OTHERS}exit {code}\n")
     with slurm.started() as process:
         assert process.wait(LIMIT_S) == code
     (head,) = (call for call in slurm.calls_of("ray") if call.startswith("ray start"))
