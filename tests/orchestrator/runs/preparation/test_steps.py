@@ -32,6 +32,9 @@ from tests.prepare.networks.networks import given, red_depth
 
 pytestmark = pytest.mark.system
 
+KILLED_AT = ("masks", "poses", "check")  # the first step, the one with work of its own to keep, the last one
+OTHERS = [pytest.param(moment, marks=pytest.mark.nightly) for moment in ("features", "report")]
+
 
 def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> None:
     assert calm.point_cloud.exists()
@@ -56,7 +59,7 @@ def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> N
     assert done["preparation"]["registered"] == 9
 
 
-@pytest.mark.parametrize("moment", ["features", "poses", "report", "masks", "check"])
+@pytest.mark.parametrize("moment", [*KILLED_AT, *OTHERS])
 def test_a_run_killed_in_a_step_ends_with_the_same_bytes(
     moment: str, calm: RunFolder, raw: Path, sfm: FakeSfm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
