@@ -16,10 +16,10 @@ from typing import Any, BinaryIO
 from fastapi import HTTPException
 from fastapi.responses import Response
 
-from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below, opened, read_below
+from panolog.orchestrator.runs.folder import RunFolder, open_below, opened
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.views import queries
-from panolog.orchestrator.watch.views.pages.findings import Findings, finding_pictures, read_findings
+from panolog.orchestrator.watch.views.pages.findings import finding_pictures, read_findings
 from panolog.orchestrator.watch.views.preparation import picture_path
 from panolog.orchestrator.watch.views.site.photographs import STORE_S, require_size, small_copy
 from panolog.scene.errors import InputError, StoreLostError
@@ -28,7 +28,6 @@ from panolog.scene.read import check_names, image_folder, model_folder
 from panolog.scene.stores.outline import made_here, whole
 
 _SIZE = 50_000_000  # bytes of a JPEG at most
-_MEASURED = 200_000_000  # bytes of a file of what was measured at most
 _COVER = 320  # pixels of the width of a run's picture in the list
 _REDUCED = 1024  # pixels of the width of a panorama's copy
 _CACHED = 64  # copies, of some hundred kilobytes each
@@ -100,21 +99,15 @@ def of_preparation(entry: RunEntry, name: str) -> Response:
     return _own(entry, picture_path(entry.folder, name))
 
 
-def findings(entry: RunEntry) -> Findings:
-    """What was measured of a run. Raises InputError if a file is damaged or not below the run."""
-    folder = entry.folder
-    return read_findings(folder, lambda path: read_below(path, folder.root, _MEASURED))
-
-
 def of_findings(entry: RunEntry, name: str) -> Response:
-    """A picture of the findings. Raises InputError as `preview` and `findings`."""
-    return _own(entry, finding_pictures(entry.folder, findings(entry)).get(name))
+    """A picture of the findings. Raises InputError as `preview` and `read_findings`."""
+    return _own(entry, finding_pictures(entry.folder, read_findings(entry.folder)).get(name))
 
 
 def _own(entry: RunEntry, path: Path | None) -> Response:
     if path is None:
         raise HTTPException(404, "there is no such picture")
-    data = read_below(path, entry.folder.root, _SIZE)
+    data = entry.folder.read(path, _SIZE)
     for kind, begin in (("jpeg", _JPEG), ("png", _PNG)):
         if data.startswith(begin):
             return Response(data, 200, {"Cache-Control": "private, max-age=60"}, f"image/{kind}")
@@ -129,7 +122,7 @@ def _event(entry: RunEntry, number: int, kind: str) -> dict[str, Any]:
 
 
 def _jpeg(entry: RunEntry, path: Path) -> Response:
-    data = read_below(path, entry.folder.root, _SIZE)
+    data = entry.folder.read(path, _SIZE)
     if not data.startswith(_JPEG):
         raise InputError(f"{path.name}: is not a JPEG")
     return _response(data)

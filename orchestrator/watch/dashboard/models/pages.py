@@ -24,9 +24,9 @@ from fastapi.responses import Response
 from panolog.export.site.page import described, photograph_number
 from panolog.export.site.write import media_type
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.folder import shown_model
+from panolog.orchestrator.runs.folder import open_below, read_below, shown_model
 from panolog.orchestrator.runs.machines.machine import cores
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below, read_below
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.dashboard.models.making import Maker, Turns, reading
 from panolog.orchestrator.watch.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.watch.dashboard.responses import Download
