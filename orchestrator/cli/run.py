@@ -218,6 +218,7 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     from panolog.orchestrator.runs.storage.state import read_state
     from panolog.orchestrator.runs.store import read_milestones
     from panolog.orchestrator.watch.views.preparation import prepared_share, view_preparation, with_step
+    from panolog.orchestrator.watch.views.summary import summarize
 
     folder = RunFolder(root)
     info = read_json(folder)
@@ -228,13 +229,10 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     if running and not state.waiting:  # a full disk takes no record of it
         state = replace(state, waiting=presence.waiting(folder.presence))
     prepared = view_preparation(folder, state, running=running)
-    state = with_step(state, prepared)
+    state, done = with_step(state, prepared), prepared_share(prepared) if prepared else None
+    summary = summarize(state, running=running, root=run, prepared=done)
     if as_json:
-        from panolog.orchestrator.watch.views.summary import summarize
-
         head = {"run": run, "scene": scene, "width": width}
-        done = prepared_share(prepared) if prepared else None
-        summary = summarize(state, running=running, root=run, prepared=done)
         head |= {"preparation": prepared.model_dump(mode="json")} if prepared else {}
         head |= {"store": vars(mirror) | {"lag": mirror.lag}} if mirror else {}
         print_json(head | summary.model_dump(mode="json"))
@@ -244,7 +242,7 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     from panolog.orchestrator.watch.views.terminal import WIDE, page
 
     console = get_console()
-    shown = page(state, root=root, name=run, running=running, wide=console.width >= WIDE)
+    shown = page(summary, root=run, wide=console.width >= WIDE)
     console.print(shown, crop=False)  # a command longer than a line is whole
     if mirror:
         console.print(mirror.line, style="yellow" if mirror.late else "dim", markup=False, highlight=False)
