@@ -5,16 +5,10 @@ from dataclasses import dataclass, field, replace
 
 from panolog.orchestrator.runs.money.records import BudgetReached, BudgetSet
 from panolog.orchestrator.runs.records import (
-    Delivered,
-    EvaluationSaved,
-    MeasuresSaved,
-    Merged,
-    ModelSaved,
-    PlanSaved,
     PreflightSaved,
     Preparing,
     Progressed,
-    ScoresSaved,
+    Result,
     Stored,
     TaskFailed,
     TaskStarted,
@@ -23,16 +17,6 @@ from panolog.orchestrator.runs.records import (
 from panolog.orchestrator.runs.state import RunState, apply, replay
 from panolog.workers.tasks import Stage, TaskId
 
-_RESULTS = (
-    PreflightSaved,
-    ModelSaved,
-    ScoresSaved,
-    PlanSaved,
-    Merged,
-    MeasuresSaved,
-    EvaluationSaved,
-    Delivered,
-)
 # What follows the training, also one that a limit has ended.
 _FOLLOWING = (Stage.MERGE, Stage.MEASURE, Stage.EVAL, Stage.DELIVER)
 
@@ -85,7 +69,7 @@ class History:
         elif isinstance(record, Preparing):
             if self.spans.keys() <= {Stage.PREPARE}:  # else it is a new driver of a run that is past it
                 self._note_preparing(record.task.stage, stored.time)
-        elif isinstance(record, _RESULTS) or (isinstance(record, TaskFailed) and record.final):
+        elif isinstance(record, PreflightSaved | Result) or (isinstance(record, TaskFailed) and record.final):
             span = self.spans.get(record.task.stage) or Span(self._latest_end() or stored.time)
             self.spans[record.task.stage] = replace(span, ended=stored.time)
         elif isinstance(record, BudgetReached):

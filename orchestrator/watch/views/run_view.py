@@ -10,6 +10,7 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from panolog.orchestrator.runs.config import RunConfig, flat, keys
+from panolog.orchestrator.runs.machines.gpus import GpuUsage
 from panolog.orchestrator.runs.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.watch.views.history import History, Span
 from panolog.orchestrator.watch.views.preparation import PreparationView, prepared_share
@@ -47,15 +48,6 @@ class StageView(ViewModel):
     done: int
 
 
-class GpuUsageView(ViewModel):
-    """What a GPU does; `utilization` 0 to 1."""
-
-    name: Text
-    utilization: float | None
-    memory_used: int | None
-    memory_total: int | None
-
-
 class UsageView(ViewModel):
     """What a machine does, measured at `time` in epoch seconds: `cpu` 0 to 1, the disk that the run uses."""
 
@@ -65,7 +57,7 @@ class UsageView(ViewModel):
     memory_total: int
     disk_used: int
     disk_total: int
-    gpus: tuple[GpuUsageView, ...]
+    gpus: tuple[GpuUsage, ...]
 
 
 class NodeView(ViewModel):
