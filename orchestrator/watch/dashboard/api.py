@@ -314,7 +314,10 @@ async def get_compared_curves(request: Request, runs: ComparedRuns) -> Response:
 def _comparison(runs: Sequence[Watch | UnreadRun]) -> Comparison:
     """The comparison with the URLs of its pictures."""
     found = [read_watch(run) for run in runs]
-    numbers = {run.id: pictures.numbers(run.folder.database) for run in found if isinstance(run, ReadRun)}
+    views = {
+        run.id: pictures.views(run.folder.database)["views"] for run in found if isinstance(run, ReadRun)
+    }
+    numbers = {id: {view["name"]: view["number"] for view in every} for id, every in views.items()}
 
     def url(run: ReadRun, view: str) -> str | None:
         number = numbers[run.id].get(view)

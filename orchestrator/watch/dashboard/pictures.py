@@ -55,7 +55,7 @@ def _removed(folder: RunFolder, event: dict[str, Any]) -> bool:
 
 def views(database: Path) -> dict[str, Any]:
     """The held-out panoramas by name, each with its latest metrics."""
-    events = queries.views(database, _VIEWS)
+    events = queries.views(database, _VIEWS) if database.exists() else []
     latest = {str(event.get("view")): event for event in reversed(events)}
     return {
         "views": [
@@ -63,12 +63,6 @@ def views(database: Path) -> dict[str, Any]:
             for name, event in sorted(latest.items(), key=lambda item: natural_key(item[0]))
         ]
     }
-
-
-def numbers(database: Path) -> dict[str, int]:
-    """The number of the latest comparison of each held-out panorama: see `view`."""
-    events = queries.views(database, _VIEWS) if database.exists() else []
-    return {str(event.get("view")): event["id"] for event in reversed(events)}
 
 
 def preview(entry: RunEntry, number: int) -> Response:
