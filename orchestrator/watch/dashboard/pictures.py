@@ -85,7 +85,7 @@ def cover(entry: RunEntry, number: int) -> Response:
         else entry.folder.root / str(_event(entry, number, "PreviewSaved")["path"])
     )
     with opened(path, entry.folder.root) as file:
-        return _response(small_copy(file, path.name, _COVER, rendered=True))
+        return _response(small_copy(file, path.name, _COVER, "render"))
 
 
 def of_preparation(entry: RunEntry, name: str) -> Response:
