@@ -55,13 +55,16 @@ A POST needs `X-PanoLOG: 1` and the content type application/json.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import Response, StreamingResponse
 from pydantic import Field
 
+from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.watch.dashboard import pictures, stream
 from panolog.orchestrator.watch.dashboard.dependencies import (
     Body,
@@ -75,7 +78,6 @@ from panolog.orchestrator.watch.dashboard.dependencies import (
     respond,
     respond_json,
 )
-from panolog.orchestrator.watch.dashboard.maps import MapCache
 from panolog.orchestrator.watch.dashboard.queues.panel import QueueAction
 from panolog.orchestrator.watch.dashboard.responses import (
     json_response,
@@ -96,6 +98,7 @@ from panolog.orchestrator.watch.views.plan_page import (
     BlockCameras,
     CameraView,
     cameras_of,
+    map_of,
     plan_of,
     scores_of,
     view_camera,
@@ -103,8 +106,10 @@ from panolog.orchestrator.watch.views.plan_page import (
 from panolog.scene.errors import InputError
 from panolog.scene.stores.outline import local_folder, made_here
 from panolog.scene.stores.url import is_url
+from panolog.workers.tasks import COARSE
 
 router = APIRouter()
+_one_map = Lock()  # one is made at a time
 _EventId = Annotated[int, Field(ge=0, lt=2**63)]
 
 
@@ -140,8 +145,7 @@ async def get_run(request: Request, registry: Registry, run: Run) -> Response:
 @router.get("/api/runs/{id}/map")
 async def get_map(request: Request, run: Run) -> Response:
     """Its plan from above."""
-    cache: MapCache = request.app.state.maps
-    return await respond(request, 404, lambda: json_response(request, cache.map_of(run.entry)))
+    return await respond(request, 404, lambda: json_response(request, encoded_map(run.entry.folder)))
 
 
 @router.get("/api/runs/{id}/camera/{row}")
@@ -153,13 +157,30 @@ async def get_camera(request: Request, run: Run, row: int) -> Response:
 @router.get("/api/runs/{id}/camera/{row}/panorama")
 async def get_panorama(request: Request, run: Run, row: int) -> Response:
     """Its picture."""
-    return await respond(request, 404, _panorama, request.app.state.panoramas, run, row)
+    return await respond(request, 404, _panorama, run, row)
 
 
 @router.get("/api/runs/{id}/block/{number}")
 async def get_block(request: Request, run: Run, number: int) -> Response:
     """The cameras of a block of its plan."""
     return await respond_json(request, _block, run, number, status=404)
+
+
+def encoded_map(folder: RunFolder) -> bytes:
+    """The map from above, as JSON, kept as long as it stays as it is; pages draw the status of blocks.
+
+    Raises InputError if there is no plan yet or it cannot be read.
+    """
+    outlined = (folder.outline_points, folder.outline_fixes)
+    files = (folder.known_plan, folder.model(COARSE), *outlined, folder.seams)
+    stats = [path.stat() for path in files if path.exists()]
+    with _one_map:
+        return _encoded(folder, tuple((stat.st_mtime_ns, stat.st_size) for stat in stats))
+
+
+@lru_cache(maxsize=4)  # of about a megabyte each
+def _encoded(folder: RunFolder, _: tuple[tuple[int, int], ...]) -> bytes:
+    return encode(map_of(folder))
 
 
 def _block(run: Watch, number: int) -> BlockCameras | None:
@@ -178,11 +199,11 @@ def _camera_view(run: Watch, row: int) -> CameraView | None:
     return view_camera(plan, k, scores_of(run.entry.folder, plan), why)
 
 
-def _panorama(cache: pictures.PanoramaCache, run: Watch, row: int) -> Response:
+def _panorama(run: Watch, row: int) -> Response:
     plan = plan_of(run.entry.folder)
     if row not in plan.rows:
         raise InputError("the plan of this run has no such panorama")
-    return cache.small(scene_of(run), plan.names[plan.rows.index(row)])
+    return pictures.panorama(scene_of(run), plan.names[plan.rows.index(row)])
 
 
 def scene_of(run: Watch) -> Path:

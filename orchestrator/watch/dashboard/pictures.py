@@ -7,7 +7,7 @@ stores only scenes are read that this machine has read before.
 
 import os
 import re
-from collections import OrderedDict
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
@@ -30,10 +30,10 @@ from panolog.scene.stores.outline import made_here, whole
 _SIZE = 50_000_000  # bytes of a JPEG at most
 _COVER = 320  # pixels of the width of a run's picture in the list
 _REDUCED = 1024  # pixels of the width of a panorama's copy
-_CACHED = 64  # copies, of some hundred kilobytes each
 _PREVIEW_PATH = re.compile(r"(coarse|(district|blocks|round|repair)/\d{3,9})/previews/\d{6,12}\.jpg")
 _JPEG = b"\xff\xd8\xff"
 _PNG = b"\x89PNG\r\n\x1a\n"
+_one = Lock()  # one copy is made at a time
 _VIEWS = 2_000  # held-out panoramas in the list at most
 
 
@@ -138,26 +138,21 @@ def open_panorama(scene: Path, name: str) -> BinaryIO:
         raise InputError(f"{name} is missing in {folder}, or a link that leads out of the scene") from error
 
 
-class PanoramaCache:
-    """Small copies of panoramas, the last requested ones; one is made at a time."""
+def panorama(scene: Path, name: str, width: int = _REDUCED) -> Response:
+    """A JPEG of a panorama of a scene, of at most `width` pixels. One is made at a time.
 
-    def __init__(self) -> None:
-        self._copies: OrderedDict[tuple[int, ...], bytes] = OrderedDict()
-        self._lock = Lock()
+    Raises InputError as `open_panorama`, or if it cannot be decoded.
+    """
+    with open_panorama(scene, name) as file, _one:
+        known = os.fstat(file.fileno())
+        version = (known.st_dev, known.st_ino, known.st_mtime_ns, known.st_size)
+        return _response(_small(scene, name, width, version))
 
-    def small(self, scene: Path, name: str, width: int = _REDUCED) -> Response:
-        """A JPEG of a panorama, of at most `width` pixels.
 
-        Raises InputError as `open_panorama`, or if it cannot be decoded.
-        """
-        with open_panorama(scene, name) as file, self._lock:
-            known = os.fstat(file.fileno())
-            key = (known.st_dev, known.st_ino, known.st_mtime_ns, known.st_size, width)
-            copy = self._copies.pop(key, None) or small_copy(_whole(file, scene, name), name, width)
-            self._copies[key] = copy
-            while len(self._copies) > _CACHED:
-                self._copies.popitem(last=False)
-        return _response(copy)
+@lru_cache(maxsize=64)  # of some hundred kilobytes each
+def _small(scene: Path, name: str, width: int, _: tuple[int, ...]) -> bytes:
+    with open_panorama(scene, name) as file:
+        return small_copy(_whole(file, scene, name), name, width)
 
 
 def _whole(file: BinaryIO, scene: Path, name: str) -> BinaryIO:

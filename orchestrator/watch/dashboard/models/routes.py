@@ -82,7 +82,7 @@ async def get_model_page(request: Request, key: str, path: str) -> Response:
     if path == DESCRIPTION:
         await pages.renew(key)
     policy = page_policy(request.headers.get("host", ""), key)
-    return await respond(request, 404, pages.file, key, path, policy, request.app.state.panoramas)
+    return await respond(request, 404, pages.file, key, path, policy)
 
 
 @contextmanager
