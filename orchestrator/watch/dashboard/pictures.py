@@ -66,14 +66,14 @@ def views(database: Path) -> dict[str, Any]:
 
 
 def preview(entry: RunEntry, number: int) -> Response:
-    """A preview by the id of its event. Raises InputError if its file is not below the run or no JPEG."""
-    return _jpeg(entry, entry.folder.root / str(_event(entry, number, "PreviewSaved")["path"]))
+    """A preview by the id of its event. Raises InputError if its file is not below the run or no picture."""
+    return _own(entry, entry.folder.root / str(_event(entry, number, "PreviewSaved")["path"]))
 
 
 def view(entry: RunEntry, number: int) -> Response:
     """A comparison by the id of its event. Raises InputError and ValueError as `preview`."""
     name = str(_event(entry, number, "ViewEvaluated")["view"])
-    return _jpeg(entry, entry.folder.picture(name))
+    return _own(entry, entry.folder.picture(name))
 
 
 def cover(entry: RunEntry, number: int) -> Response:
@@ -113,13 +113,6 @@ def _event(entry: RunEntry, number: int, kind: str) -> dict[str, Any]:
     if event is None:
         raise HTTPException(404, "there is no such picture")
     return event
-
-
-def _jpeg(entry: RunEntry, path: Path) -> Response:
-    data = entry.folder.read(path, _SIZE)
-    if not data.startswith(_JPEG):
-        raise InputError(f"{path.name}: is not a JPEG")
-    return _response(data)
 
 
 def open_panorama(scene: Path, name: str) -> BinaryIO:
