@@ -50,7 +50,8 @@ from panolog.orchestrator.runs.records import (
     RunContinued,
     RunWaiting,
 )
-from panolog.orchestrator.runs.retention.clean import remove_models
+from panolog.orchestrator.runs.retention.clean import remove_all
+from panolog.orchestrator.runs.retention.survey import models_of_parts
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import report_or_notice
@@ -373,7 +374,7 @@ def _report(folder: RunFolder, journal: Journal) -> None:
 def _retained(folder: RunFolder, journal: Journal, config: RunConfig) -> RunState:
     """The state of a run that is done, once the models that its settings do not keep are removed."""
     if not config.retention.models and (
-        notice := journal.until_done(lambda: remove_models(folder, journal.state))
+        notice := journal.until_done(lambda: remove_all(folder, models_of_parts(folder, journal.state)))
     ):
         journal.record([notice])
     return journal.state
