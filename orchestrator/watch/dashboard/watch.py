@@ -11,14 +11,14 @@ from typing import Any
 
 from panolog.orchestrator.runs import lock, presence, reading
 from panolog.orchestrator.runs.folder import INFO_BYTES, RunFolder, shown_model
-from panolog.orchestrator.runs.records import Progressed, RunBegan, RunEnded, Stored
+from panolog.orchestrator.runs.records import RunBegan, RunEnded, Stored
 from panolog.orchestrator.runs.storage.state import read_state
 from panolog.orchestrator.runs.store import as_event, read_milestones, read_news
 from panolog.orchestrator.watch.dashboard import actions
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry, require_plain
 from panolog.orchestrator.watch.dashboard.messages import Actions, Results, RunChanges, RunPage, RunRow
 from panolog.orchestrator.watch.views import queries
-from panolog.orchestrator.watch.views.history import History
+from panolog.orchestrator.watch.views.history import History, without_older_progress
 from panolog.orchestrator.watch.views.pages.encoding import encode
 from panolog.orchestrator.watch.views.pages.findings import findings_version
 from panolog.orchestrator.watch.views.preparation import stamp_of, version_of, view_preparation, with_step
@@ -86,9 +86,7 @@ class Snapshot:
 
 def latest_events(records: Sequence[Stored]) -> list[dict[str, Any]]:
     """Records for the pages, newest first: of progress only the latest of each task."""
-    latest = {stored.record.task: stored.id for stored in records if isinstance(stored.record, Progressed)}
-    kept = [s for s in records if not isinstance(s.record, Progressed) or latest[s.record.task] == s.id]
-    return [as_event(stored) for stored in kept[: -_MESSAGE - 1 : -1]]
+    return [as_event(stored) for stored in without_older_progress(records)[: -_MESSAGE - 1 : -1]]
 
 
 class Watch:

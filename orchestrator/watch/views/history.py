@@ -1,6 +1,6 @@
 """A run's state with what pages show beyond it: when stages began and ended, and where tasks run."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from panolog.orchestrator.runs.money.records import BudgetReached, BudgetSet
@@ -51,11 +51,7 @@ class History:
     def add(self, records: Iterable[Stored]) -> set[str]:
         """Adds later records, in order. Returns the tasks that they are about."""
         stored = list(records)
-        progress = {s.record.task: s.id for s in stored if isinstance(s.record, Progressed)}
-        newest = (
-            s for s in stored if not isinstance(s.record, Progressed) or progress[s.record.task] == s.id
-        )
-        self.state = apply(self.state, newest)
+        self.state = apply(self.state, without_older_progress(stored))
         for item in stored:
             self._note(item)
             self.last = item.id
@@ -94,3 +90,9 @@ class History:
         """When a limit has ended a stage early; None of one that it has not, or that follows."""
         span = self.spans.get(stage)
         return None if span is None or stage in _FOLLOWING else self.limited
+
+
+def without_older_progress(records: Sequence[Stored]) -> list[Stored]:
+    """Records, of progress only the latest of each task."""
+    latest = {stored.record.task: stored.id for stored in records if isinstance(stored.record, Progressed)}
+    return [s for s in records if not isinstance(s.record, Progressed) or latest[s.record.task] == s.id]
