@@ -10,7 +10,6 @@ import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from io import FileIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -266,11 +265,8 @@ def read_object(path: Path, most: int) -> dict[str, Any]:
     Args: most, bytes that are read.
     """
     try:
-        with FileIO(
-            path, opener=lambda name, how: os.open(name, how | os.O_NOFOLLOW | os.O_NONBLOCK)
-        ) as file:
-            content = json.loads(file.read(most) or b"")
-    except (OSError, ValueError, RecursionError):
+        content = json.loads(read_below(path, path.parent, most))
+    except (OSError, InputError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
 
