@@ -12,6 +12,7 @@ import yaml
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
+from panolog.orchestrator.runs.folder import flat
 from panolog.orchestrator.runs.machines.config import DeadlinesConfig, QuarantineConfig, ScalingConfig
 from panolog.partition.cells import MOST_BLOCKS, Cells, Cuts, Grid
 from panolog.partition.plan import PartitionConfig
@@ -389,12 +390,3 @@ def as_settings(config: RunConfig) -> list[str]:
     """What the user has set, as options `--set KEY=VALUE`; the rest is left to the defaults."""
     given = flat(config.model_dump(mode="json", exclude_unset=True))
     return [word for key, value in given for word in ("--set", f"{key}={json.dumps(value)}")]
-
-
-def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The settings of a nested mapping by dotted key."""
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value

@@ -271,6 +271,15 @@ def read_object(path: Path, most: int) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
+def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of a JSON object by dotted key, such as the settings in run.json."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Writes a JSON object atomically, for people too; makes its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 from pydantic.fields import FieldInfo
 
-from panolog.orchestrator.runs.config import flat, known_settings
+from panolog.orchestrator.runs.config import known_settings
+from panolog.orchestrator.runs.folder import flat
 from panolog.orchestrator.runs.machines.gpus import GpuUsage
 from panolog.orchestrator.runs.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.watch.views.history import History, Span
