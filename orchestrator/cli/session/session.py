@@ -47,8 +47,6 @@ from panolog.orchestrator.runs.records import (
     Preparing,
     Record,
     RunBegan,
-    RunContinued,
-    RunWaiting,
 )
 from panolog.orchestrator.runs.retention.clean import remove_all
 from panolog.orchestrator.runs.retention.survey import models_of_parts
@@ -199,7 +197,6 @@ class _Beginning:
     pool: Pool | None
     nice: int | None
     made: Scene | None = None  # None until it is prepared
-    _since: float = 0.0  # Clock.monotonic() of the latest reason to wait
 
     @property
     def scene(self) -> Scene:
@@ -263,7 +260,9 @@ class _Beginning:
         self.journal.until_done(lambda: save_measured(folder, measured, self.scene))
         self.journal.record([Preparing("calibrating")])
         prices, local = prices_of(self.journal.state), self.address is None
-        found = _examine(workers, self.scene, info.config, root, self.warn, prices, self._waits, local=local)
+        found = _examine(
+            workers, self.scene, info.config, root, self.warn, prices, self.journal.explain, local=local
+        )
         found.require()
         info = info.model_copy(update={"config": found.config})
         self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
@@ -277,12 +276,6 @@ class _Beginning:
         layers = [Noticed(None, line) for line in lines]
         self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), *layers, done])
         return found.config
-
-    def _waits(self, why: str) -> None:
-        """For a machine, or "" once there is one."""
-        now = self.journal.clock.monotonic()
-        self._since = now if why else self._since
-        self.journal.record([RunWaiting(why) if why else RunContinued(now - self._since)])
 
     def warn(self, line: str) -> None:
         """Something the user should read once."""
