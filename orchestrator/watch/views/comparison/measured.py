@@ -2,12 +2,12 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from statistics import fmean
 from typing import Any
 
 from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.units import means
 from panolog.orchestrator.watch.views.comparison.schema import METRICS, MeasuredView
 from panolog.scene.errors import InputError, RunFolderError
 
@@ -60,16 +60,6 @@ def read_measured(folder: RunFolder) -> Measured | None:
     )
     mean = means(views.values()) if views else _values(content.get("mean"))
     return Measured(head, views, mean)
-
-
-def means(views: Iterable[Values]) -> dict[str, float | None]:
-    """The mean of each metric over the views that have it; None where none has."""
-    found: dict[str, list[float]] = {name: [] for name in METRICS}
-    for values in views:
-        for name in METRICS:
-            if (value := values.get(name)) is not None:
-                found[name].append(value)
-    return {name: fmean(numbers) if numbers else None for name, numbers in found.items()}
 
 
 def finite(value: float | None) -> float | None:
