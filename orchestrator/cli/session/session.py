@@ -47,10 +47,9 @@ from panolog.orchestrator.runs.records import (
     Preparing,
     Record,
     RunBegan,
-    RunContinued,
-    RunWaiting,
 )
-from panolog.orchestrator.runs.retention.clean import remove_models
+from panolog.orchestrator.runs.retention.clean import remove_all
+from panolog.orchestrator.runs.retention.survey import models_of_parts
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import report_or_notice
@@ -198,7 +197,6 @@ class _Beginning:
     pool: Pool | None
     nice: int | None
     made: Scene | None = None  # None until it is prepared
-    _since: float = 0.0  # Clock.monotonic() of the latest reason to wait
 
     @property
     def scene(self) -> Scene:
@@ -262,7 +260,9 @@ class _Beginning:
         self.journal.until_done(lambda: save_measured(folder, measured, self.scene))
         self.journal.record([Preparing("calibrating")])
         prices, local = prices_of(self.journal.state), self.address is None
-        found = _examine(workers, self.scene, info.config, root, self.warn, prices, self._waits, local=local)
+        found = _examine(
+            workers, self.scene, info.config, root, self.warn, prices, self.journal.explain, local=local
+        )
         found.require()
         info = info.model_copy(update={"config": found.config})
         self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
@@ -276,12 +276,6 @@ class _Beginning:
         layers = [Noticed(None, line) for line in lines]
         self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), *layers, done])
         return found.config
-
-    def _waits(self, why: str) -> None:
-        """For a machine, or "" once there is one."""
-        now = self.journal.clock.monotonic()
-        self._since = now if why else self._since
-        self.journal.record([RunWaiting(why) if why else RunContinued(now - self._since)])
 
     def warn(self, line: str) -> None:
         """Something the user should read once."""
@@ -373,7 +367,7 @@ def _report(folder: RunFolder, journal: Journal) -> None:
 def _retained(folder: RunFolder, journal: Journal, config: RunConfig) -> RunState:
     """The state of a run that is done, once the models that its settings do not keep are removed."""
     if not config.retention.models and (
-        notice := journal.until_done(lambda: remove_models(folder, journal.state))
+        notice := journal.until_done(lambda: remove_all(folder, models_of_parts(folder, journal.state)))
     ):
         journal.record([notice])
     return journal.state

@@ -1,6 +1,5 @@
 """RUN/prepare/settings.json: of what a run makes its scene, and how. Written before the first step begins."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -8,7 +7,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.scene.errors import RunFolderError
+from panolog.scene.errors import InputError, RunFolderError
 from panolog.workers.tasks import StrEnum
 
 NADIR = (
@@ -107,27 +106,14 @@ def read_settings(folder: RunFolder) -> Settings | None:
     Raises RunFolderError if they cannot be read or are of another format.
     """
     path = settings_path(folder)
-    try:
-        with path.open("rb") as file:
-            content = file.read(MOST_BYTES + 1)
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except OSError as error:
-        raise RunFolderError(f"{path}: cannot be read: {error.strerror}") from error
-    settings = parse_settings(content)
-    if settings is None:
-        raise RunFolderError(f"{path}: is not of this PanoLOG's format; start a new run")
-    return settings
-
-
-def parse_settings(content: bytes) -> Settings | None:
-    """The settings from the bytes of their file; None if they are of another format."""
-    if len(content) > MOST_BYTES:
+    if not path.exists():
         return None
     try:
-        return Settings.model_validate(json.loads(content))
-    except (ValidationError, ValueError, RecursionError):
-        return None
+        return Settings.model_validate_json(folder.read(path, MOST_BYTES))
+    except InputError as error:
+        raise RunFolderError(f"{path.parent}/{error}") from error
+    except ValidationError as error:
+        raise RunFolderError(f"{path}: is not of this PanoLOG's format; start a new run") from error
 
 
 def as_arguments(options: Options) -> Iterator[str]:

@@ -15,11 +15,11 @@ import os
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import HTTPConnection
 from starlette.responses import HTMLResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -132,15 +132,20 @@ class Guard:
 
     def _intercept(self, scope: Scope) -> Response | None:
         """The response in place of the requested one; None if the request may pass."""
-        headers, token = Headers(scope=scope), self._access.token
+        request, token = HTTPConnection(scope), self._access.token
+        headers = request.headers
         if token is None:
             host = headers.get("host", "").lower()
             name = host if host.endswith("]") else host.rpartition(":")[0] or host
             if name not in _LOCAL:
                 return _refuse("this dashboard can be reached as localhost only")
-        elif (given := _token_of(scope)) is not None and _same(given, token):
+        elif (
+            scope["path"] == "/"
+            and scope["method"] in _SAFE
+            and _same(request.query_params.get("token"), token)
+        ):
             return self._set_cookie(token)
-        elif not (self._has_token(headers, token) or self._granted(scope["path"])):
+        elif not (self._has_token(request, token) or self._granted(scope["path"])):
             return _refuse("open the address with the token that `panolog dashboard` has printed")
         if scope["method"] not in _SAFE and not _is_ours(headers):
             return _refuse("this request came from another site")
@@ -153,28 +158,15 @@ class Guard:
         )
         return answer
 
-    def _has_token(self, headers: Headers, token: str) -> bool:
-        kind, _, bearer = headers.get("authorization", "").partition(" ")
-        if kind.lower() == "bearer" and _same(bearer.strip(), token):
-            return True
-        try:
-            morsel = SimpleCookie(headers.get("cookie", "")).get(self._access.cookie)
-        except CookieError:
-            return False
-        return morsel is not None and _same(morsel.value, token)
+    def _has_token(self, request: HTTPConnection, token: str) -> bool:
+        kind, _, bearer = request.headers.get("authorization", "").partition(" ")
+        bearer = bearer.strip() if kind.lower() == "bearer" else ""
+        return _same(bearer, token) or _same(request.cookies.get(self._access.cookie), token)
 
 
-def _token_of(scope: Scope) -> str | None:
-    """The token in the query, which only the first page accepts."""
-    if scope["path"] != "/" or scope["method"] not in _SAFE:
-        return None
-    values: list[str] = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
-    return values[0] if values else None
-
-
-def _same(given: str, token: str) -> bool:
+def _same(given: str | None, token: str) -> bool:
     """Compares in constant time."""
-    return secrets.compare_digest(given.encode(), token.encode())
+    return secrets.compare_digest((given or "").encode(errors="replace"), token.encode())
 
 
 def _is_ours(headers: Headers) -> bool:

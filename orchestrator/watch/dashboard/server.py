@@ -21,11 +21,9 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from panolog.orchestrator.watch.dashboard.api import router
 from panolog.orchestrator.watch.dashboard.guard import Access, Guard
-from panolog.orchestrator.watch.dashboard.maps import MapCache
 from panolog.orchestrator.watch.dashboard.models.downloads import Downloads
 from panolog.orchestrator.watch.dashboard.models.pages import ModelPages
 from panolog.orchestrator.watch.dashboard.models.routes import router as model_router
-from panolog.orchestrator.watch.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.watch.dashboard.registry import RunRegistry
 from panolog.orchestrator.watch.views.pages.encoding import encode
 from panolog.orchestrator.watch.views.pages.shell import (
@@ -61,7 +59,6 @@ def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
     app.state.registry, app.state.pages, app.state.downloads = registry, pages, downloads
-    app.state.maps, app.state.panoramas = MapCache(), PanoramaCache()
     app.include_router(router)
     app.include_router(model_router)
     app.add_api_route("/", _index)

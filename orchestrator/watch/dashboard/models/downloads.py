@@ -7,7 +7,8 @@ from typing import Literal
 
 from fastapi.responses import Response
 
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below
+from panolog.orchestrator.runs.folder import open_below
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.dashboard.models.making import Maker, Turns, reading
 from panolog.orchestrator.watch.dashboard.responses import Download, file_name
 from panolog.scene.errors import InputError

@@ -17,8 +17,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO
 
-from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, by_handle, open_below
+from panolog.orchestrator.runs.folder import RunFolder, by_handle, open_below
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.scene.errors import InputError, PanologError, in_one_line
 from panolog.scene.files import Locate
 

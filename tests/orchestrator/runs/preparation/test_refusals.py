@@ -16,7 +16,8 @@ from panolog.orchestrator.runs.preparation.settings import (
     Options,
     Step,
     as_arguments,
-    parse_settings,
+    read_settings,
+    settings_path,
 )
 from panolog.orchestrator.runs.state import ignore
 from panolog.prepare.check import scene_check
@@ -189,7 +190,9 @@ def test_options_survive_the_way_through_a_command_line(
 def test_files_of_the_preparation_that_are_none_are_not_believed(content: bytes, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.preparation.mkdir()
-    assert parse_settings(content) is None
+    settings_path(folder).write_bytes(content)
+    with pytest.raises(InputError, match=r"settings\.json"):
+        read_settings(folder)
     for path in (notes.progress_path(folder), notes.result_path(folder, Step.SFM)):
         path.write_bytes(content)
     assert notes.read_progress(folder) is None

@@ -21,8 +21,8 @@ from panolog.orchestrator.runs.preparation.settings import Options, Step, read_s
 from panolog.orchestrator.runs.records import Noticed, Preparing
 from panolog.orchestrator.runs.state import ignore
 from panolog.orchestrator.runs.store import read_records
+from panolog.orchestrator.watch.dashboard.api import encoded_map
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
-from panolog.orchestrator.watch.dashboard.maps import MapCache
 from panolog.prepare.sfm.pipeline import workspace_folder
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
@@ -153,7 +153,7 @@ def test_the_map_grows_with_the_poses(raw: Path, sfm: FakeSfm, tmp_path: Path) -
 
     def look(at: str) -> None:
         if at in ("features", "poses", "check"):
-            figure = json.loads(MapCache().map_of(entry))
+            figure = json.loads(encoded_map(entry.folder))
             seen.append(
                 {trace["name"]: trace for trace in figure["data"]} | {"names": figure["blocks"]["names"]}
             )

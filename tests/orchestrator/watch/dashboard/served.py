@@ -72,7 +72,7 @@ def write_whole_run(root: Path, scene: str = "/scenes/town") -> RunFolder:
     write_plan(folder, plan(), SCORES)
     for path in (folder.root / "coarse" / "previews" / "000050.jpg", folder.images / "a" / "0.jpg"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), np.zeros((8, 16, 3), np.uint8))
+        cv2.imwrite(str(path), np.zeros((16, 16, 3), np.uint8))
     folder.point_cloud.write_bytes(b"ply\n")
     folder.report.write_text("<script>1</script>")
     append(
