@@ -186,6 +186,7 @@ def preparation(
             show_default=False,
         ),
     ] = None,
+    mask_model: Annotated[Path | None, _making("M.onnx", "Mask what this network finds: people.")] = None,
     depth_model: Annotated[Path | None, _making("M.onnx", "Estimate depth with this network.")] = None,
 ) -> "Options":
     """The options that make a scene of panoramas or a video, as far as they are not the defaults."""
@@ -196,8 +197,8 @@ def preparation(
     sfm |= {"trajectory": str(trajectory)} if trajectory is not None else {}
     sfm |= {"gps": False} if not gps else {}
     sfm |= {"partial": True} if partial else {}
-    model = None if depth_model is None else str(depth_model)
-    return Options(sfm=sfm, nadir=nadir, static=static, depth_model=model)
+    mask, depth = (None if model is None else str(model) for model in (mask_model, depth_model))
+    return Options(sfm=sfm, nadir=nadir, static=static, mask_model=mask, depth_model=depth)
 
 
 def with_run_config(command: Callable[..., None]) -> Callable[..., None]:
