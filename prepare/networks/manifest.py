@@ -29,7 +29,9 @@ class ManifestPart(BaseModel):
 class Input(ManifestPart):
     """The image that the network takes: value = (byte / divisor - mean) / std, channel by channel."""
 
-    name: str = Field(min_length=1, description="of the network's input")
+    name: str | None = Field(
+        default=None, min_length=1, description="of the network's input; none = it has only one"
+    )
     width: int = Field(
         ge=8, le=4 * MAX_HEIGHT, description="columns; 2 * height, with wrap more, with tiles height"
     )
@@ -175,7 +177,7 @@ def manifest_path(model: Path) -> Path:
             return path
     raise ConfigError(
         f"{model}: there is no manifest {candidates[0].name} next to it, which says what the model expects "
-        "and means; docs/depth-and-masks.md shows one"
+        "and means; docs/depth-and-masks.md shows one, and `panolog models` writes those that it knows"
     )
 
 
@@ -193,6 +195,15 @@ def read_manifest(path: Path, kind: type[Kind]) -> Kind:
             raise ConfigError(f"{path}: there is no field {field}") from error
         message = first["msg"].removeprefix("Value error, ")
         raise ConfigError(f"{path}: {field}: {message}") from error
+
+
+def manifest_task(path: Path) -> Literal["mask", "depth"]:
+    """What a manifest is for. Raises ConfigError: it cannot be read, or is for nothing that there is."""
+    tree = _read(path)
+    task = tree.get("task") if isinstance(tree, dict) else None
+    if task not in {"mask", "depth"}:
+        raise ConfigError(f"{path}: task: must be mask or depth")
+    return "mask" if task == "mask" else "depth"
 
 
 def _read(path: Path) -> Any:

@@ -1,6 +1,6 @@
 """Panoramas for networks of perspective pictures: square views that cover the sphere, and back.
 
-Such networks know people upright and undistorted, which an operator below the camera is nowhere in a panorama.
+Such networks know people upright and undistorted, as an operator below the camera is nowhere in a panorama.
 So they get views with the horizon in the middle, views tilted up and down, and one straight up and one down,
 each of which overlaps its neighbours by a third.
 """
@@ -67,7 +67,9 @@ class Tiles:
         joined = np.zeros((self.width // 2, self.width), bool)
         for view, ((_, maps), shift) in zip(found, self._each(), strict=True):
             if view.any():
-                scaled = cv2.resize(view.astype(np.uint8), (self.size, self.size), None, 0, 0, cv2.INTER_NEAREST)
+                scaled = cv2.resize(
+                    view.astype(np.uint8), (self.size, self.size), None, 0, 0, cv2.INTER_NEAREST
+                )
                 back = cv2.remap(scaled, *maps, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, 0)
                 joined |= np.roll(back, shift, axis=1) > 0
         return joined

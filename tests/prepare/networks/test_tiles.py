@@ -56,7 +56,8 @@ def test_a_network_of_views_finds_what_is_red_where_it_is(tmp_path: Path, scale:
         "input": given(size, width=size, seam="tiles", fov=90),
         "ignore": {"output": "found", "threshold": 0.5, "above": "ignore"},
     }
-    nodes, shape = [channel(0, "red"), pool], ["N", 3, size, size]
+    shape: list[int | str] = ["N", 3, size, size]
+    nodes = [channel(0, "red"), pool]
     network = MoverNetwork(save(tmp_path, nodes, ["found"], manifest, shape=shape, constants=CHANNELS))
     wanted, near = spots(network.width, 0.15), spots(network.width, 0.19)
     found = network.find(np.where(wanted[..., None], [255, 0, 0], [0, 255, 255]).astype(np.uint8))

@@ -136,7 +136,7 @@ def test_a_network_masks_folders_and_videos_and_what_it_has_done_is_kept(
     assert written[0] == written[1]
     assert {it.parent.name for it in masks} == {"photos", "walk"}
     for mask in masks:
-        ignored = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) == 0
+        ignored = np.asarray(cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)) == 0
         assert 0.5 < ignored.sum() / (30 * 24) < 2
         assert ignored[:, :20].any() and ignored[:, -20:].any() and not ignored[:, 24:-24].any()
     result = notes.read_result(RunFolder(tmp_path / "run"), Step.MASKS)
