@@ -186,7 +186,7 @@ def preparation(
             show_default=False,
         ),
     ] = None,
-    mask_model: Annotated[Path | None, _making("M.onnx", "Mask what this network finds: people.")] = None,
+    mask_model: Annotated[Path | None, _making("M.onnx", "Mask what this network finds, as people.")] = None,
     depth_model: Annotated[Path | None, _making("M.onnx", "Estimate depth with this network.")] = None,
 ) -> "Options":
     """The options that make a scene of panoramas or a video, as far as they are not the defaults."""

@@ -11,11 +11,13 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
+from panolog.prepare.networks.tiles import Tiles
 from panolog.scene.errors import ConfigError, in_one_line
 
 MAX_BYTES = 65_536  # of a manifest
 MAX_DEPTH = 8  # of its nesting
 MAX_HEIGHT = 4_096  # rows of the input; each takes hundreds of bytes per column in the network
+MAX_TILED = 8_192  # columns of a panorama that views are as fine as; maps of these take 40 bytes per pixel
 Three = tuple[float, float, float]
 Kind = TypeVar("Kind", bound=BaseModel)
 
@@ -61,9 +63,13 @@ class Input(ManifestPart):
             raise ValueError("wrap is the number of repeated columns, above 0 with seam: wrap and only there")
         if (self.seam == "tiles") != (self.fov is not None):
             raise ValueError("fov is the angle of a view in degrees, given with seam: tiles and only there")
-        if self.seam == "tiles":
+        if self.fov is not None:
             if self.width != self.height:
                 raise ValueError(f"with seam: tiles, width must be height = {self.height}, not {self.width}")
+            if (wide := Tiles(self.width, self.fov).width) > MAX_TILED:
+                raise ValueError(
+                    f"views are as fine as a panorama of {wide} columns, more than {MAX_TILED}; raise the fov"
+                )
             return self
         if self.width != 2 * self.height + 2 * self.wrap:
             raise ValueError(

@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.networks.seam import Floats
-
+Floats = NDArray[np.float32]
 _APART = 2 / 3  # of the field of view, at most: between the middles of neighbours
 _COUNTS = 15 / 16  # of a view to each side: what a network sees cut off at its border is less sure
 

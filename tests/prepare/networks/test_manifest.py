@@ -99,6 +99,10 @@ def test_a_mask_manifest_has_one_head(tmp_path: Path) -> None:
         ({"fov": 90}, "input: fov is the angle of a view in degrees"),
         ({"seam": "tiles", "fov": 90}, "input: with seam: tiles, width must be height = 32, not 64"),
         ({"seam": "tiles", "fov": 20, "width": 32}, "input.fov: Input should be greater than or equal to 40"),
+        (
+            {"seam": "tiles", "fov": 90, "width": 4096, "height": 4096},
+            "12868 columns, more than 8192; raise",
+        ),
     ],
 )
 def test_views_are_square_and_have_an_angle(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

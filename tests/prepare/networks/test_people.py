@@ -18,7 +18,7 @@ from panolog.scene.write import no_progress
 from tests.data import shared
 from tests.prepare.networks.people import finder, paint_people
 
-pytestmark = [pytest.mark.system, pytest.mark.nightly]
+pytestmark = [pytest.mark.system, pytest.mark.nightly, pytest.mark.timeout(3600)]
 
 WIDTH, ITERATIONS = 256, 300
 CLEAN_WITHIN, MASKS_WITHIN, ABOVE = 1.0, 0.3, 0.6  # dB of PSNR and of WS-PSNR
