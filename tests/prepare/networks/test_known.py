@@ -23,6 +23,11 @@ DEPTH = {
 }
 
 
+@pytest.fixture(autouse=True)
+def small_town(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(known, "_TOWN", 64)
+
+
 def reds(folder: Path, threshold: float = 0.9) -> Path:
     """A network of views that masks what is red."""
     manifest = {
