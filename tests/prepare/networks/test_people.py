@@ -15,6 +15,7 @@ from panolog.scene.image_files import decode
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
+from panolog.workers.events import Trained
 from tests.data import shared
 from tests.prepare.networks.people import finder, paint_people
 
@@ -50,14 +51,13 @@ def trained(scene: Scene, clean: Scene) -> tuple[float, float, float]:
     """PSNR and WS-PSNR of held-out panoramas, which are without people, and the share of people's colour."""
     config = panolog.RunConfig(width=WIDTH, iterations=ITERATIONS)
     *_, last = panolog.train(scene, config)
-    model = last.gaussians  # type: ignore[union-attr]  # the last event is the result
-    mean = panolog.evaluate(model, clean, width=WIDTH)["mean"]
+    assert isinstance(last, Trained)
+    mean = panolog.evaluate(last.gaussians, clean, width=WIDTH)["mean"]
     colored = []
     for row in clean.test:
         it = clean.panoramas[row]
-        red, green, blue = np.moveaxis(
-            render_panorama(model, it.rotation, it.translation, WIDTH, 0.1).astype(int), -1, 0
-        )
+        shown = render_panorama(last.gaussians, it.rotation, it.translation, WIDTH, 0.1).astype(int)
+        red, green, blue = np.moveaxis(shown, -1, 0)
         colored.append((np.minimum(red, blue) - green > COLORED).mean())
     return mean["psnr"], mean["ws_psnr"], float(np.mean(colored))
 
