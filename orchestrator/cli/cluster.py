@@ -76,6 +76,7 @@ def submit(
     sources, run = [on_head(it, "SCENE") for it in source], on_head(output, "--output")
     for what, path in {
         "--trajectory": options.sfm.get("trajectory"),
+        "--mask-model": options.mask_model,
         "--depth-model": options.depth_model,
     }.items():
         if path is not None:

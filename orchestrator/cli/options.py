@@ -195,6 +195,7 @@ def preparation(
             show_default=False,
         ),
     ] = None,
+    mask_model: Annotated[Path | None, _making("M.onnx", "Mask what this network finds, as people.")] = None,
     depth_model: Annotated[Path | None, _making("M.onnx", "Estimate depth with this network.")] = None,
 ) -> "Options":
     """The options that make a scene of panoramas or a video, as far as they are not the defaults."""
@@ -205,8 +206,8 @@ def preparation(
     sfm |= {"trajectory": str(trajectory)} if trajectory is not None else {}
     sfm |= {"gps": False} if not gps else {}
     sfm |= {"partial": True} if partial else {}
-    model = None if depth_model is None else str(depth_model)
-    return Options(sfm=sfm, nadir=nadir, static=static, depth_model=model)
+    mask, depth = (None if model is None else str(model) for model in (mask_model, depth_model))
+    return Options(sfm=sfm, nadir=nadir, static=static, mask_model=mask, depth_model=depth)
 
 
 def grouped(**groups: Callable[..., Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:

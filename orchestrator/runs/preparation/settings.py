@@ -43,6 +43,7 @@ class Options(BaseModel):
         default=None, ge=0, le=90, description="degrees around straight down; 0 = none"
     )
     static: bool | None = Field(default=None, description="mask what is the same in all panoramas")
+    mask_model: str | None = Field(default=None, description="ONNX network; its manifest is next to it")
     depth_model: str | None = Field(default=None, description="ONNX network; its manifest is next to it")
 
     @field_validator("sfm")
@@ -76,7 +77,8 @@ class Settings(Options):
 
     def steps(self) -> tuple[Step, ...]:
         """Those that there are, in order."""
-        wanted = {Step.MASKS: bool(self.nadir or self.static), Step.DEPTH: self.depth_model is not None}
+        masks = bool(self.nadir or self.static or self.mask_model)
+        wanted = {Step.MASKS: masks, Step.DEPTH: self.depth_model is not None}
         return tuple(step for step in Step if wanted.get(step, True))
 
     def of(self, step: Step) -> dict[str, Any]:
@@ -85,7 +87,8 @@ class Settings(Options):
             case Step.SFM:
                 return {"source": self.source, **({"others": self.others} if self.others else {}), **self.sfm}
             case Step.MASKS:
-                return {"nadir": self.nadir, "static": self.static}
+                network = {"model": self.mask_model} if self.mask_model else {}
+                return {"nadir": self.nadir, "static": self.static, **network}
             case Step.DEPTH:
                 return {"model": self.depth_model}
         return {}
@@ -134,5 +137,6 @@ def as_arguments(options: Options) -> Iterator[str]:
         yield from ("--nadir", str(options.nadir))
     if options.static is not None:
         yield "--static" if options.static else "--no-static"
-    if options.depth_model is not None:
-        yield from ("--depth-model", options.depth_model)
+    for what, model in {"--mask-model": options.mask_model, "--depth-model": options.depth_model}.items():
+        if model is not None:
+            yield from (what, model)

@@ -154,7 +154,8 @@ def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     image(tmp_path / "two" / "b.jpg", 64, 32)
     run = ("run", tmp_path / "two", "-o")
     assert "is not empty and not a run" in one_line(call(*run, tmp_path / "full"))
-    assert "there is no such model" in one_line(call(*run, root, "--depth-model", tmp_path / "no.onnx"))
+    for network in ("--mask-model", "--depth-model"):
+        assert "there is no such model" in one_line(call(*run, root, network, tmp_path / "no.onnx"))
     assert "the panoramas have 64 pixels" in one_line(call(*run, root, "--width", 128))
     assert not root.exists()
 
@@ -169,6 +170,7 @@ def test_options_survive_the_way_through_a_command_line(
         },
         nadir=7.5,
         static=False,
+        mask_model="people.onnx",
         depth_model="m.onnx",
     )
     seen = list[Options]()
