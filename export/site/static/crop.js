@@ -1,6 +1,6 @@
 // A box of which the model is shown, as `panolog export --crop` takes it: axes are those of the model.
 
-import { at, button, copy } from "./dom.js";
+import { at } from "./dom.js";
 import { shifted } from "./flight.js";
 import { line, visible } from "./overlay.js";
 import { around, corners, placed, shown } from "./world.js";
@@ -37,13 +37,13 @@ export class Crop {
     this._near = step * NEAR;
     /** All of the model. */
     this.whole = around(corners(boxOf(stage.bounds)).map((corner) => placed(frame, corner)));
+    /** Called after each change. */
+    this.onChanged = () => {};
     this._reach = reach(this.whole, around(cameras.map((camera) => placed(frame, camera))), MARGIN * step);
     /** What is kept. @type {Box} */
     this.box = { lower: [...this.whole.lower], upper: [...this.whole.upper] };
     this._sliders = ["lower", "upper"].flatMap((side) => [0, 1, 2].map((axis) => this._slider(side, axis)));
     stage.onDrawn.push(() => this._draw());
-    button("whole").addEventListener("click", () => this.reset());
-    button("copy").addEventListener("click", () => copy(at("option")));
     this._show();
   }
 
@@ -53,8 +53,9 @@ export class Crop {
     return [0, 1, 2].some((i) => this.box.lower[i] > lower[i] || this.box.upper[i] < upper[i]);
   }
 
-  /** For the command line. */
+  /** For the command line, "" if nothing is left out. */
   get option() {
+    if (!this.cuts) return "";
     return `--crop=${[...this.box.lower, ...this.box.upper].map((value) => Number(value.toPrecision(6))).join(",")}`;
   }
 
@@ -97,10 +98,8 @@ export class Crop {
   }
 
   _show() {
-    at("option").textContent = this.option;
-    at("kept").hidden = !this.cuts;
-    button("copy").disabled = button("whole").disabled = !this.cuts;
     this._stage.keep(this.cuts ? into(this.box, this._frame) : null);
+    this.onChanged();
   }
 
   /** Draws the edges of the box while something is left out. */
