@@ -54,10 +54,11 @@ def take_model_picture(folder: Path, camera: str) -> None:
     with TemporaryDirectory() as temporary, chromium() as browser:
         html = Path(temporary) / "page.html"
         write_file(site_of_run(RunFolder(folder), Wanted(camera=camera)), html)
-        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page = browser.new_page(viewport={"width": 1600, "height": 900})
         page.set_default_timeout(_PATIENCE)
         page.goto(html.as_uri())
         expect(page.locator("#home")).to_be_enabled(timeout=_PATIENCE)
+        page.locator("#more").click()
         page.wait_for_timeout(5_000)  # drawn in full resolution
         page.screenshot(path=HERE / "view-3d.jpg", type="jpeg", quality=82)
 

@@ -1,8 +1,7 @@
 // What is made of the view: a picture, the whole screen, what an export keeps, and a camera path.
 
-import { Crop } from "./crop.js";
+import { Crop, Floaters } from "./crop.js";
 import { at, button, copy, download, press } from "./dom.js";
-import { Floaters } from "./floaters.js";
 import { Path } from "./path.js";
 
 /** @typedef {import("./page.js").Page} Page @typedef {import("./stage.js").Stage} Stage */

@@ -142,7 +142,11 @@ def _work(requests: IO[bytes], answers: IO[bytes], idle: float, nice: int) -> No
     import torch  # noqa: PLC0415
 
     torch.set_num_threads(1)
-    import_module("panolog.orchestrator.watch.views.site.build")  # is no part of what a request takes
+    for needed in (
+        "watch.views.site.build",
+        "watch.dashboard.models.pages",
+    ):  # no part of what a request takes
+        import_module(f"panolog.orchestrator.{needed}")
     os.nice(nice)
     while select.select([requests], [], [], idle)[0] and (line := requests.readline()):
         module, *arguments = json.loads(line)
