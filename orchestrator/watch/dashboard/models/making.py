@@ -145,7 +145,7 @@ def _work(requests: IO[bytes], answers: IO[bytes], idle: float, nice: int) -> No
     for needed in (
         "watch.views.site.build",
         "watch.dashboard.models.pages",
-    ):  # no part of what a request takes
+    ):  # no part of a request
         import_module(f"panolog.orchestrator.{needed}")
     os.nice(nice)
     while select.select([requests], [], [], idle)[0] and (line := requests.readline()):
