@@ -141,7 +141,6 @@ function lastState() {
 
 const line = connectionLine((time) => {
   lost = time;
-  document.body.classList.toggle("lost", time !== null);
   if (known) show(known);
 }, lastState);
 stream(
