@@ -81,10 +81,7 @@ def run(
                 first = ["run", *source, "-o", str(root), *as_settings(config), *as_arguments(options)]
                 code = _supervise(root, first, driver, budget.options(), address, max_resumes)
             else:
-                with progress_bar("starting"):
-                    from panolog.orchestrator.cli.session import session
-
-                with _display(root, output, dashboard=dashboard) as show:
+                with _session(root, output, dashboard=dashboard) as (session, show):
                     given = source if len(source) > 1 else source[0]
                     state = session.start(given, root, config, address, show, None, nice, options, budget)
         _end(root, code, state)
@@ -127,10 +124,7 @@ def resume(
                     once = budget.options() + ["--accept-changes"] * accept_changes
                     code = _supervise(root, first, options, once, address, max_resumes)
                 else:
-                    with progress_bar("starting"):
-                        from panolog.orchestrator.cli.session import session
-
-                    with _display(root, run, dashboard=dashboard) as show:
+                    with _session(root, run, dashboard=dashboard) as (session, show):
                         given = (root, address, show, None, nice, after, budget)
                         state = session.resume(*given, accept_changes=accept_changes)
         _end(root, code, state)
@@ -325,20 +319,32 @@ def _followed(root: Path, notify: list[str], log: list[str]) -> Iterator[None]:
 
 
 @contextmanager
-def _display(root: Path, name: str, *, dashboard: bool = False) -> Iterator[Any]:
+def _session(root: Path, name: str, *, dashboard: bool) -> Iterator[tuple[Any, Any]]:
+    """Yields the module that drives runs, and as `_display`. Both it and the dashboard take seconds."""
+    from panolog.orchestrator.cli.session.companion import companion_dashboard
+
+    with companion_dashboard(root, say) if dashboard else nullcontext():
+        with progress_bar("starting"):
+            from panolog.orchestrator.cli.session import session
+
+        with _display(root, name) as show:
+            yield session, show
+
+
+@contextmanager
+def _display(root: Path, name: str) -> Iterator[Any]:
     """Shows a run on stderr while the context lasts. Yields what to call with every change of its state.
 
     Args: name, of the run in commands. If the run is interrupted, says how to resume it and exits with 130.
     Raises RunError for an error that nothing foresees, once the run's history has it.
     """
-    from panolog.orchestrator.cli.session.companion import companion_dashboard
     from panolog.orchestrator.engine.driver.ending import internal
     from panolog.orchestrator.runs.folder import RunFolder
     from panolog.orchestrator.watch.views.terminal import progress
     from panolog.scene.errors import PanologError, RunError
 
     try:
-        with companion_dashboard(root, say) if dashboard else nullcontext(), progress(err(), root) as show:
+        with progress(err(), root) as show:
             yield show
     except KeyboardInterrupt as error:
         if not RunFolder(root).info.exists():

@@ -348,13 +348,16 @@ def _comparison(runs: Sequence[Watch | UnreadRun]) -> Comparison:
 
 
 @router.get("/api/stream")
-async def get_stream(registry: Registry, run: str | None = None, changes: bool = False) -> Response:
+async def get_stream(
+    request: Request, registry: Registry, run: str | None = None, changes: bool = False
+) -> Response:
     """The list or a run, again whenever it has changed."""
     if run is None:
         messages = stream.runs(registry)
     else:
         watch, topic = await find_run(registry, run)
-        messages = stream.run(registry, watch, topic, changes=changes)
+        begin = request.app.state.pages.begin
+        messages = stream.run(registry, watch, topic, begin, changes=changes)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     return StreamingResponse(messages, 200, headers, "text/event-stream")
 

@@ -13,6 +13,7 @@ import hashlib
 import ipaddress
 import os
 import secrets
+import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from panolog.orchestrator.watch.views.pages.shell import LIVE_IMPORTS
 from panolog.scene.errors import InputError
 from panolog.scene.files import user_folder
 
+_SEND_TIMEOUT_MS = 60_000  # after which a client that reads nothing is disconnected
 _LOCAL = {"localhost", "127.0.0.1", "[::1]"}
 _SAFE = {"GET", "HEAD"}
 _OWN_HEADER = "x-panolog"  # a header that no other site can send without being allowed to
@@ -182,3 +184,31 @@ def _is_ours(headers: Headers) -> bool:
 
 def _refuse(line: str) -> Response:
     return Response(encode({"error": line}), 403, {"Cache-Control": "no-store"}, "application/json")
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket; port 0 for a free one. Raises InputError if the address cannot be used."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    # With the protocol: only then does asyncio know that it is TCP and turn Nagle's algorithm off.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener.setsockopt(
+        socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _SEND_TIMEOUT_MS
+    )  # connections inherit it
+    try:
+        listener.bind((host, port))
+    except (OSError, OverflowError) as error:
+        listener.close()
+        why = getattr(error, "strerror", None) or str(error)
+        raise InputError(
+            f"{host}:{port}: cannot listen there: {why}; choose another --host or --port"
+        ) from error
+    listener.listen(socket.SOMAXCONN)
+    return listener
+
+
+def address(listener: socket.socket, host: str, token: str | None) -> str:
+    """The URL to open."""
+    name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
+    name = f"[{name}]" if ":" in name else name
+    return f"http://{name}:{listener.getsockname()[1]}/" + (f"?token={token}" if token else "")

@@ -35,9 +35,7 @@ from panolog.orchestrator.watch.views.pages.shell import (
     live_page,
     plotly,
 )
-from panolog.scene.errors import InputError
 
-_SEND_TIMEOUT_MS = 60_000  # after which a client that reads nothing is disconnected
 _REQUEST_TIMEOUT_S = 15.0  # in which a connection must have sent a request
 _MAX_CONNECTIONS = 1_000
 _SHUTDOWN_S = 4  # for open answers and the last messages of streams when the server ends
@@ -118,34 +116,6 @@ def _error(_: Request, error: Exception) -> Response:
         if line == HTTPStatus(status).phrase:
             line = line.lower()
     return Response(encode({"error": line}), status, headers, "application/json")
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """A listening socket; port 0 for a free one. Raises InputError if the address cannot be used."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # With the protocol: only then does asyncio know that it is TCP and turn Nagle's algorithm off.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    listener.setsockopt(
-        socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _SEND_TIMEOUT_MS
-    )  # connections inherit it
-    try:
-        listener.bind((host, port))
-    except (OSError, OverflowError) as error:
-        listener.close()
-        why = getattr(error, "strerror", None) or str(error)
-        raise InputError(
-            f"{host}:{port}: cannot listen there: {why}; choose another --host or --port"
-        ) from error
-    listener.listen(socket.SOMAXCONN)
-    return listener
-
-
-def address(listener: socket.socket, host: str, token: str | None) -> str:
-    """The URL to open."""
-    name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
-    name = f"[{name}]" if ":" in name else name
-    return f"http://{name}:{listener.getsockname()[1]}/" + (f"?token={token}" if token else "")
 
 
 class TimeoutProtocol(H11Protocol):

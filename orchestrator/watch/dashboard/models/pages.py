@@ -96,6 +96,10 @@ class ModelPages:
         self._sources: dict[str, _Source] = {}  # by key: of those that were made for this server
         self._turns, self._maker = Turns("3D views"), Maker()
 
+    async def begin(self) -> None:
+        """Prepares for a page that may soon be requested."""
+        await self._maker.start()
+
     async def make(self, entry: RunEntry, task: str | None, scene: Path | None) -> str:
         """Makes the page of the current model of a run, or of one of its tasks, and returns its key.
 

@@ -29,7 +29,7 @@ from panolog.orchestrator.runs.records import (
     TaskStarted,
     ViewEvaluated,
 )
-from panolog.orchestrator.watch.dashboard import server
+from panolog.orchestrator.watch.dashboard import guard, server
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.workers.tasks import COARSE, EVAL, TaskId
@@ -129,7 +129,7 @@ def serving(
     root: Path, *, token: str | None = None, port: int = 0, queue: Path | None = None
 ) -> Iterator[Served]:
     """A server in a thread while the context lasts."""
-    listener = server.listen("127.0.0.1", port)
+    listener = guard.listen("127.0.0.1", port)
     running = server.make_server(root, listener, token, queue)
     thread = Thread(target=running.run, kwargs={"sockets": [listener]})
     thread.start()
