@@ -64,15 +64,22 @@ class Solver:
         max_error: float,
         progress: StageProgress,
         places: NDArray[np.float64] | None = None,
+        known: pycolmap.Reconstruction | None = None,
     ) -> None:
         """Args: size, (width, height) of the panoramas; max_error, pixels that an observation may be off;
-        places, (K, 3) where panoramas were taken, if that is known, else NaN.
+        places, (K, 3) where panoramas were taken, if that is known, else NaN; known, poses that stay, with
+        their points, of panoramas of the database.
         """
         self._work, self._mapper, self._max_error, self._progress = work, mapper, max_error, progress
         self._ids, evidence = work.ids(), read_evidence(work, size)
         self._geometries = Geometries(work, size, max_error, evidence)
         evidence = look_again(self._geometries.marked(evidence), self._geometries)
-        self._skeleton = find_skeleton(evidence, places)
+        self._known, self._given = known, set[int]()
+        if known is not None:
+            self._given = set(posed(known, self._ids).poses)
+            judged = [pair for pair in evidence.pairs if not self._given.issuperset(pair.between)]
+            evidence = replace(evidence, pairs=tuple(judged))
+        self._skeleton = find_skeleton(evidence, places, self._given)
         guide = Guide(work, evidence.rays, max_error * 2 * np.pi / size[0])
         self._evidence = _thicker(evidence, self._skeleton, self._geometries, guide)
         self.cuts: list[Contradiction] = []  # for which `parts` has left panoramas out
@@ -93,6 +100,11 @@ class Solver:
                 todo += self._sides(rows - part.found.poses.keys())
         return sorted(found, key=lambda part: -len(part.found.poses))
 
+    def joined(self) -> Solution | None:
+        """What is known with those of the other panoramas that agree with it; None if there are none."""
+        found = self._part(range(len(self._ids)), cut=True)
+        return found if found is not None and found.found.poses.keys() > self._given else None
+
     def _part(self, rows: Collection[int], cut: bool) -> Solution | None:
         """The reconstruction of the most of these panoramas that agree; None if some do not, but to `cut`."""
         while (found := self.solve(rows)) is not None and not found.trusted:
@@ -101,16 +113,20 @@ class Solver:
                 return None
             before = sorted(found.found.poses)
             agreed = consistent_part(before, found.contradictions, found.skeleton, found.evidence)
-            rows = max(self._sides(agreed), key=len, default=set())
+            sides = [(side >= self._given, len(side), side) for side in self._sides(agreed)]
+            *_, rows = max(sides, key=lambda it: it[:2], default=(False, 0, set[int]()))
             if len(rows) == len(before):
                 return None
             self.cuts += [it for it in found.contradictions if not set(it.between) <= set(rows)]
         return found
 
     def _sides(self, rows: Collection[int]) -> list[set[int]]:
-        """The parts of these panoramas that the skeleton connects, but for guesses: nothing judges across."""
+        """The parts of these panoramas that the skeleton connects, but for guesses: nothing judges across.
+
+        Poses that are known judge also what a guess connects with them.
+        """
         skeleton = self._skeleton.among(rows)
-        of = components(skeleton.tree - skeleton.guessed, len(self._ids))
+        of = components(skeleton.edges if skeleton.given else skeleton.certain, len(self._ids))
         return [{row for row in rows if of[row] == side} for side in sorted({int(of[row]) for row in rows})]
 
     def solve(self, rows: Collection[int]) -> Solution | None:
@@ -119,9 +135,9 @@ class Solver:
         kept: Kept = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.tree}
         best: Solution | None = None
         for turn in range(_ROUNDS + 1):
-            part = write_pairs(self._work, kept, "pairs.db")
+            part = write_pairs(self._work, kept, "pairs.db", self._given)
             mapper = self._mapper if turn else "incremental"
-            model = map_pairs(part, mapper, self._max_error, self._progress)
+            model = map_pairs(part, mapper, self._max_error, self._progress, self._known)
             if model is None:
                 break
             found = posed(model, self._ids)
@@ -154,7 +170,7 @@ def _agreeing(solution: Solution, drift: float) -> Kept:
     """The tree, pairs that fit the poses and points, and all of panoramas that have no pose yet."""
     evidence, tree, poses = solution.evidence, solution.skeleton.tree, solution.found.poses
     pairs = [pair.between for pair in evidence.pairs] if drift else []
-    way = hops(tree, len(evidence.rays), pairs, _FARTHEST / max(drift, _DRIFT))
+    way = hops(solution.skeleton.edges, len(evidence.rays), pairs, _FARTHEST / max(drift, _DRIFT))
     kept: Kept = {}
     for pair in evidence.pairs:
         bound = min(_CLOSE + drift * way[pair.between], _FARTHEST) if drift else _CLOSE
@@ -180,12 +196,15 @@ def _fitting(found: Posed, evidence: Evidence, pair: Pair, bound: float) -> NDAr
     return pair.matches[fit]
 
 
-def write_pairs(work: Workspace, kept: Kept, name: str) -> Workspace:
-    """The same panoramas and features with these pairs alone, in a database of that name in the folder."""
+def write_pairs(work: Workspace, kept: Kept, name: str, given: Collection[int] = ()) -> Workspace:
+    """The same panoramas and features with these pairs alone, in a database of that name in the folder.
+
+    Features are those of the pairs, and of the panoramas `given`.
+    """
     part = replace(work, name=name)
     part.database.unlink(missing_ok=True)
     ids = work.ids()
-    used = {ids[row] for edge in kept for row in edge}
+    used = {ids[row] for rows in (*kept, given) for row in rows}
     with pycolmap.Database.open(work.database) as all_, pycolmap.Database.open(part.database) as some:
         for camera in all_.read_all_cameras():
             some.write_camera(camera, True)
