@@ -21,7 +21,8 @@ FOUND = np.array([OWN[0] + 1e-4, [1.0, 1.0, -5.0], [4.0, -2.0, 1.0]])  # its fir
 
 def _seen(shift: int, points: Array, off: float = 0.0) -> Array:
     """Where a panorama sees points (N, 3), so many pixels aside."""
-    return project_to_fractions(points + SHIFTS[shift]) + np.array([off / SIZE[0], 0.0])
+    where: Array = project_to_fractions(points + SHIFTS[shift]) + np.array([off / SIZE[0], 0.0])
+    return where
 
 
 @pytest.mark.parametrize("off", [0.3, 4.0])
