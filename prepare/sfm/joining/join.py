@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
+from panolog.prepare.networks.masks import GIVEN
 from panolog.prepare.panorama_files import LayerFiles, PanoramaFile, pictures_below
 from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.consistency.solve import Solver
@@ -58,7 +59,9 @@ def join_scene(
     taken = {known.scene.root.name, *(Path(it.name).parts[0] for it in known.images)}
     sources = find_sources(source, taken)
     gathered = gather(sources, folder, settings, progress, (known.panoramas, known.layers))
-    found = _join(known, gathered.panoramas, gathered.layers, folder, settings, progress, memory)
+    kept = [*known.given, *[None] * (len(gathered.panoramas) - len(known.given))]
+    layers = {**gathered.layers, GIVEN: kept}
+    found = _join(known, gathered.panoramas, layers, folder, settings, progress, memory)
     notes, scene = gathered.notes, Into(into, len(known.images))
     report = SfmReport(found, _world(known), notes, gathered.left_out, 1, sources.all, scene)
     made = any(panorama.path.is_relative_to(folder) for panorama in found.panoramas)
@@ -201,10 +204,6 @@ def _scene(known: KnownScene, found: Reconstruction) -> NewScene:
         pose = model.rotations[place], model.translations[place]
         images.append(PosedImage(panorama.name, panorama.path, *pose, model.sightings[place], quaternion))
     order = sorted(range(len(images)), key=lambda place: natural_key(images[place].name))
-    files = {
-        layer: [*given, *[None] * (len(found.panoramas) - len(given))]
-        for layer, given in found.layers.items()
-    }
     split = known.split
     if split is not None:
         new = [stem_of(image.name) for image in images[count:]]
@@ -215,7 +214,9 @@ def _scene(known: KnownScene, found: Reconstruction) -> NewScene:
         model.points,
         known.scene.colors,
         split=split,
-        layers={layer: [given[model.rows[place]] for place in order] for layer, given in files.items()},
+        layers={
+            layer: [files[model.rows[place]] for place in order] for layer, files in found.layers.items()
+        },
         offset=known.offset,
     )
 

@@ -27,7 +27,8 @@ class KnownScene:
     scene: Scene
     images: tuple[PosedImage, ...]  # with what they have observed
     panoramas: tuple[PanoramaFile, ...]
-    layers: LayerFiles  # also the masks of a user that were combined with others
+    layers: LayerFiles
+    given: tuple[Path | None, ...]  # masks of a user that were combined with others
     offset: Offset | None
     split: Mapping[str, list[str]] | None  # as train.txt and test.txt have it
 
@@ -36,7 +37,7 @@ def read_known(folder: Path) -> KnownScene:
     """Reads a scene that panoramas are to be added to. Raises SceneError as `read_scene` does."""
     scene = read_scene(folder)
     tracks = {image.name: image for image in read_colmap(model_folder(scene.root)).images}
-    images, kept = [], []
+    images, panoramas = list[PosedImage](), list[PanoramaFile]()
     for panorama in scene.panoramas:
         image = tracks[panorama.name]
         where = image.pixels / (image.camera.width, image.camera.height)
@@ -50,14 +51,14 @@ def read_known(folder: Path) -> KnownScene:
                 image.quaternion,
             )
         )
-        mine = PanoramaFile(scene.root, panorama.name, panorama.image, scene.root.name)
-        kept.append((mine, path if (path := mine.layer(GIVEN)).is_file() else None))
+        panoramas.append(PanoramaFile(scene.root, panorama.name, panorama.image, scene.root.name))
     layers: LayerFiles = {
         MASKS: [panorama.mask for panorama in scene.panoramas],
         SKY_MASKS: [panorama.sky_mask for panorama in scene.panoramas],
         DEPTHS: [panorama.depth for panorama in scene.panoramas],
-        GIVEN: [path for _, path in kept],
     }
+    combined = (panorama.layer(GIVEN) for panorama in panoramas)
+    given = tuple(path if path.is_file() else None for path in combined)
     offset = read_offset(scene.root)
     if scene.offset != NO_OFFSET:  # the model is far from its origin: what is read of it is not
         there = np.add(scene.offset, NO_OFFSET if offset is None else offset.offset)
@@ -66,7 +67,7 @@ def read_known(folder: Path) -> KnownScene:
     if any((scene.root / name).is_file() for name in ("train.txt", "test.txt")):
         parts = {"train.txt": scene.train, "test.txt": scene.test}
         split = {name: [scene.panoramas[row].stem for row in rows] for name, rows in parts.items()}
-    return KnownScene(scene, tuple(images), tuple(it for it, _ in kept), layers, offset, split)
+    return KnownScene(scene, tuple(images), tuple(panoramas), layers, given, offset, split)
 
 
 def with_new(known: KnownScene, found: SparseModel, size: tuple[int, int], most: float) -> SparseModel:

@@ -57,6 +57,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
         offset=Offset(offset=(5.0, 6.0, 7.0)),
     )
     write_scene(folder / "scene", new, link=False)
+    combined = folder / "scene" / "masks.given" / "day_2" / "1.png"
+    combined.parent.mkdir(parents=True)
+    combined.write_bytes(mask.read_bytes())
     affines = folder / "scene" / "sparse" / "0" / "depth_params.json"
     affines.write_text('{"day_2/0": {"scale": 1, "offset": 0}}')
     more = folder / "day 2"
@@ -105,7 +108,7 @@ def test_later_photographs_are_posed_and_nothing_moves(place: Place, tmp_path: P
         assert len(panorama.observed) > 50
     assert {found.panoramas[row].name for row in found.test} == {"day_2/0.png"}
     assert len(found.train) == 6
-    for file in ("offset.json", "sparse/0/depth_params.json"):
+    for file in ("offset.json", "sparse/0/depth_params.json", "masks.given/day_2/1.png"):
         assert (output / file).read_bytes() == (place.scene / file).read_bytes()
     said = json.loads((output / "sfm.json").read_text())
     assert said == report.as_json()
