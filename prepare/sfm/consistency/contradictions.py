@@ -124,6 +124,12 @@ def is_trusted(contradictions: Sequence[Contradiction], skeleton: Skeleton, rows
     return few and not broken and not is_repetitive(skeleton, rows)
 
 
+def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton) -> set[Edge]:
+    """The guesses that led from one panorama to the other where these contradict each other."""
+    paths = (tree_path(skeleton.edges, it.between) for it in contradictions)
+    return {edge for path in paths for edge in path if edge in skeleton.guessed}
+
+
 def consistent_part(
     rows: Sequence[int],
     contradictions: Sequence[Contradiction],
@@ -132,8 +138,9 @@ def consistent_part(
 ) -> list[int]:
     """The largest part of panoramas without a contradiction between them, ascending.
 
-    The tree is cut where it is weakest between two that contradict each other, and the smaller side left out,
-    or that without poses that are known; where too many geometries have rivals, at all of these before.
+    The tree is cut where it is weakest between two that contradict each other, and the smaller side left out;
+    where too many geometries have rivals, at all of these before. Panoramas whose poses are known stay, and
+    the cut is at each guess on the way.
     """
     coverage = {pair.between: pair.coverage for pair in evidence.pairs}
     part, star, known = set(rows), skeleton.star, sorted(skeleton.given)[:1]
@@ -148,7 +155,8 @@ def consistent_part(
         if not path:
             part -= {max(set(it.between) - skeleton.given)}
             continue
-        tree.remove(min(path, key=lambda edge: (coverage[edge], edge)))
+        guesses = skeleton.guessed.intersection(path) if known else frozenset()
+        tree -= guesses or {min(path, key=lambda edge: (coverage[edge], edge))}
         part = _largest(part, tree | star, known or it.between, len(evidence.rays))
         tree = {edge for edge in tree if set(edge) <= part}
     return sorted(part)

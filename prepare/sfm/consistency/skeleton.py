@@ -54,15 +54,19 @@ class Skeleton:
 
 
 def find_skeleton(
-    evidence: Evidence, places: NDArray[np.float64] | None = None, given: Collection[int] = ()
+    evidence: Evidence,
+    places: NDArray[np.float64] | None = None,
+    given: Collection[int] = (),
+    refuted: Collection[Edge] = (),
 ) -> Skeleton:
     """The skeleton of panoramas with these verified pairs.
 
     Args: places, (K, 3) where they were taken, if that is known, NaN where it is not. The nearest ones then
         take the part of neighbours in order; given, rows of panoramas whose poses are known, which count as
-        connected: the order is that of the others.
+        connected: the order is that of the others; refuted, pairs that carry nothing.
     """
-    pairs, count = evidence.pairs, len(evidence.rays)
+    count = len(evidence.rays)
+    pairs = [pair for pair in evidence.pairs if pair.between not in refuted]
     if places is not None:
         near = sorted(_near(pairs, places), key=lambda it: (it[1], it[0]))
         tree = _strongest_tree(pairs, count, [edge for edge, _ in near])
@@ -75,7 +79,7 @@ def find_skeleton(
     return Skeleton(
         ordered,
         frozenset(tree),
-        frozenset(tree - firm) if ordered else frozenset(),
+        frozenset(tree - firm) if ordered or given else frozenset(),
         frozenset(pair.between for pair in pairs if pair.rivalled and pair.between in tree),
         frozenset(given),
     )

@@ -18,6 +18,7 @@ from panolog.prepare.sfm.consistency.contradictions import (
     consistent_part,
     find_contradictions,
     is_trusted,
+    refuted_guesses,
 )
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, read_evidence
 from panolog.prepare.sfm.consistency.guided import Guide
@@ -32,6 +33,7 @@ _DRIFT = 0.05  # degrees more for each panorama on the way between the two
 _FARTHEST = 6.0  # degrees at most: a window further on is farther off
 _PURE = 0.8  # share of the matches of a pair that fit, for those to count that cannot be judged
 _ROUNDS = 4  # of mapping with the pairs that fit
+_GUESSES = 4  # of what connects panoramas with a scene that they are added to
 
 Kept = dict[Edge, NDArray[np.int64]]  # matches (M, 2) of the pairs that are mapped
 
@@ -80,8 +82,8 @@ class Solver:
             judged = [pair for pair in evidence.pairs if not self._given.issuperset(pair.between)]
             evidence = replace(evidence, pairs=tuple(judged))
         self._skeleton = find_skeleton(evidence, places, self._given)
-        guide = Guide(work, evidence.rays, max_error * 2 * np.pi / size[0])
-        self._evidence = _thicker(evidence, self._skeleton, self._geometries, guide)
+        self._guide = Guide(work, evidence.rays, max_error * 2 * np.pi / size[0])
+        self._evidence = self._thicker(evidence, self._skeleton.tree)
         self.cuts: list[Contradiction] = []  # for which `parts` has left panoramas out
 
     def parts(self, least: int, doubtful: bool = False) -> list[Solution]:
@@ -101,8 +103,22 @@ class Solver:
         return sorted(found, key=lambda part: -len(part.found.poses))
 
     def joined(self) -> Solution | None:
-        """What is known with those of the other panoramas that agree with it; None if there are none."""
-        found = self._part(range(len(self._ids)), cut=True)
+        """What is known with those of the other panoramas that agree with it; None if there are none.
+
+        What leads from these to it is guessed by looks. A guess that contradictions refute makes room for the
+        next one; after several, what contradicts is cut off.
+        """
+        rows, refuted = range(len(self._ids)), set[Edge]()
+        for _ in range(_GUESSES):
+            found = self.solve(rows)
+            if found is None or found.trusted:
+                break
+            refuted |= refuted_guesses(found.contradictions, found.skeleton)
+            before = self._skeleton
+            self._skeleton = find_skeleton(self._evidence, None, self._given, refuted)
+            self._evidence = self._thicker(self._evidence, self._skeleton.tree - before.tree)
+        else:
+            found = self._part(rows, cut=True)
         return found if found is not None and found.found.poses.keys() > self._given else None
 
     def _part(self, rows: Collection[int], cut: bool) -> Solution | None:
@@ -119,6 +135,19 @@ class Solver:
                 return None
             self.cuts += [it for it in found.contradictions if not set(it.between) <= set(rows)]
         return found
+
+    def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
+        """The pairs of these edges with what matches along their motion."""
+
+        def thicker(pair: Pair) -> Pair:
+            motion = self._geometries.motion(pair) if pair.between in edges else None
+            if motion is None:
+                return pair
+            matches = self._guide.along(pair.between, motion)
+            more = len(matches) >= len(pair.matches)
+            return self._geometries.mark(replace(pair, matches=matches), motion) if more else pair
+
+        return replace(evidence, pairs=tuple(map(thicker, evidence.pairs)))
 
     def _sides(self, rows: Collection[int]) -> list[set[int]]:
         """The parts of these panoramas that the skeleton connects, but for guesses: nothing judges across.
@@ -150,20 +179,6 @@ class Solver:
                 break
             kept = again
         return best
-
-
-def _thicker(evidence: Evidence, skeleton: Skeleton, geometries: Geometries, guide: Guide) -> Evidence:
-    """The pairs of the skeleton with what matches along their motion."""
-
-    def thicker(pair: Pair) -> Pair:
-        motion = geometries.motion(pair) if pair.between in skeleton.tree else None
-        if motion is None:
-            return pair
-        matches = guide.along(pair.between, motion)
-        more = len(matches) >= len(pair.matches)
-        return geometries.mark(replace(pair, matches=matches), motion) if more else pair
-
-    return replace(evidence, pairs=tuple(map(thicker, evidence.pairs)))
 
 
 def _agreeing(solution: Solution, drift: float) -> Kept:
