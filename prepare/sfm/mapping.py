@@ -60,6 +60,7 @@ def _incremental(
         known.write(work.models)
         models.read(work.models)
         options.fix_existing_frames = options.load_all_images = True
+        options.structure_less_registration_fallback = False  # it needs no points, and so finds no scale
         options.multiple_models, done = False, known.num_reg_images()
 
     def another() -> None:

@@ -10,8 +10,11 @@ import pycolmap
 
 from panolog.prepare.networks.masks import GIVEN
 from panolog.prepare.panorama_files import LayerFiles, PanoramaFile, pictures_below
+from panolog.prepare.sfm.consistency.agreement import Posed, motion_between
 from panolog.prepare.sfm.consistency.contradictions import Contradiction
-from panolog.prepare.sfm.consistency.solve import Solver
+from panolog.prepare.sfm.consistency.evidence import read_evidence
+from panolog.prepare.sfm.consistency.guided import Guide
+from panolog.prepare.sfm.consistency.solve import Solver, write_pairs
 from panolog.prepare.sfm.features import MEMORY
 from panolog.prepare.sfm.joining.known import KnownScene, read_known, with_new
 from panolog.prepare.sfm.pairs import Pairing, Pairs, best_matches, choose_pairs, match_pairs
@@ -139,10 +142,19 @@ def _join(
 def _points(work: Workspace, known: KnownScene, size: tuple[int, int]) -> pycolmap.Reconstruction:
     """The poses of the scene, and points for the features of its panoramas.
 
-    Raises SceneError: there are none.
+    These are matched along the motions that the poses say: where windows repeat, what has matched freely may
+    be one window off, and where they repeat along the way, that gives points at wrong distances.
+
+    Raises SceneError: there are no points.
     """
+    evidence = read_evidence(work, size)
+    guide = Guide(work, evidence.rays, max_error(size[0]) * 2 * np.pi / size[0])
+    poses = Posed({row: (it.rotation, it.translation) for row, it in enumerate(known.images)}, {})
+    edges = [pair.between for pair in evidence.among(poses.poses).pairs]
+    motions = {edge: motion_between(poses, edge) for edge in edges}
+    kept = {edge: guide.along(edge, motion) for edge, motion in motions.items() if motion is not None}
     try:
-        return points_of(work, known.images, size)
+        return points_of(write_pairs(work, kept, "known.db"), known.images, size)
     except (RuntimeError, ValueError) as error:
         raise SceneError(
             f"{known.scene.root}: its panoramas near the new ones show no points ({in_one_line(error, 120)})"
