@@ -114,10 +114,13 @@ def is_repetitive(skeleton: Skeleton, rows: Collection[int]) -> bool:
 def is_trusted(contradictions: Sequence[Contradiction], skeleton: Skeleton, rows: Collection[int]) -> bool:
     """Whether poses of panoramas can be used in spite of contradictions and of geometries that have rivals.
 
-    Where the order was followed by a guess, or the tree does not connect them, there may be no contradiction.
+    Where the order was followed by a guess, or the tree does not connect them, there may be no contradiction;
+    it has to connect them with poses that are known.
     """
     sides = components(skeleton.among(rows).edges, max(rows) + 1)
     guessed = len({int(sides[row]) for row in rows}) > 1
+    if guessed and skeleton.given:
+        return False
     broken = any(it.between in skeleton.tree for it in contradictions)
     guessed |= any(edge in skeleton.tree and set(edge) <= set(rows) for edge in skeleton.guessed)
     few = len(contradictions) <= (0 if guessed else max(1, _MOST * len(rows)))

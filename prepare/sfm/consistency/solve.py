@@ -5,7 +5,7 @@ judged by it: their points must be where they are seen, but for its drift. With 
 of panoramas that it has not reached, the mapper starts again, until its result contradicts none of them.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +33,7 @@ _DRIFT = 0.05  # degrees more for each panorama on the way between the two
 _FARTHEST = 6.0  # degrees at most: a window further on is farther off
 _PURE = 0.8  # share of the matches of a pair that fit, for those to count that cannot be judged
 _ROUNDS = 4  # of mapping with the pairs that fit
+_AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
 _GUESSES = 4  # of what connects panoramas with a scene that they are added to
 
 Kept = dict[Edge, NDArray[np.int64]]  # matches (M, 2) of the pairs that are mapped
@@ -76,12 +77,13 @@ class Solver:
         self._ids, evidence = work.ids(), read_evidence(work, size)
         self._geometries = Geometries(work, size, max_error, evidence)
         evidence = look_again(self._geometries.marked(evidence), self._geometries)
-        self._known, self._given = known, set[int]()
+        self._known, self._given, self._refuted = known, set[int](), set[Edge]()
         if known is not None:
             self._given = set(posed(known, self._ids).poses)
             judged = [pair for pair in evidence.pairs if not self._given.issuperset(pair.between)]
+            self._refuted = _looking_alike(judged, evidence.among(self._given).pairs, self._given)
             evidence = replace(evidence, pairs=tuple(judged))
-        self._skeleton = find_skeleton(evidence, places, self._given)
+        self._skeleton = find_skeleton(evidence, places, self._given, self._refuted)
         self._guide = Guide(work, evidence.rays, max_error * 2 * np.pi / size[0])
         self._evidence = self._thicker(evidence, self._skeleton.tree)
         self.cuts: list[Contradiction] = []  # for which `parts` has left panoramas out
@@ -108,16 +110,17 @@ class Solver:
         What leads from these to it is guessed by looks. A guess that contradictions refute makes room for the
         next one; after several, what contradicts is cut off.
         """
-        rows, refuted = range(len(self._ids)), set[Edge]()
+        rows = range(len(self._ids))
+        found = self.solve(rows)
         for _ in range(_GUESSES):
-            found = self.solve(rows)
-            if found is None or found.trusted:
+            if found is None or not (against := refuted_guesses(found.contradictions, found.skeleton)):
                 break
-            refuted |= refuted_guesses(found.contradictions, found.skeleton)
+            self._refuted |= against
             before = self._skeleton
-            self._skeleton = find_skeleton(self._evidence, None, self._given, refuted)
+            self._skeleton = find_skeleton(self._evidence, None, self._given, self._refuted)
             self._evidence = self._thicker(self._evidence, self._skeleton.tree - before.tree)
-        else:
+            found = self.solve(rows)
+        if found is not None and not found.trusted:
             found = self._part(rows, cut=True)
         return found if found is not None and found.found.poses.keys() > self._given else None
 
@@ -179,6 +182,20 @@ class Solver:
                 break
             kept = again
         return best
+
+
+def _looking_alike(pairs: Sequence[Pair], known: Sequence[Pair], given: Collection[int]) -> set[Edge]:
+    """The pairs with panoramas of known poses that cover less than these cover of each other.
+
+    They may only look alike: what connects panoramas with a scene is as near as neighbours in it.
+    Args: known, the pairs between panoramas of known poses.
+    """
+    best = dict[int, float]()
+    for pair in known:
+        for row in pair.between:
+            best[row] = max(best.get(row, 0.0), pair.coverage)
+    least = _AS_NEIGHBOURS * float(np.median(list(best.values()))) if best else 0.0
+    return {it.between for it in pairs if it.coverage < least and not set(it.between).isdisjoint(given)}
 
 
 def _agreeing(solution: Solution, drift: float) -> Kept:

@@ -12,6 +12,7 @@ from panolog.prepare.sfm.consistency.contradictions import (
     consistent_part,
     is_repetitive,
     is_trusted,
+    refuted_guesses,
 )
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, with_coverage
 from panolog.prepare.sfm.consistency.skeleton import Skeleton, find_skeleton, hops
@@ -122,7 +123,10 @@ def test_panoramas_whose_poses_are_known_need_no_pairs_and_one_edge_joins_others
     walk = {(row, row + 1): 0.8 for row in range(4, 7)}
     skeleton = find_skeleton(_evidence(walk | {(0, 5): 0.75, (3, 7): 0.7}, 8), given=range(4))
     assert skeleton.ordered and skeleton.tree == {*walk, (0, 5)}
-    assert skeleton.guessed == {(0, 5)}
+    assert skeleton.guessed == refuted_guesses([Contradiction((3, 7), 90, 1)], skeleton) == {(0, 5)}
+    assert refuted_guesses([Contradiction((5, 7), 90, 1)], skeleton) == set()
+    other = find_skeleton(_evidence(walk | {(0, 5): 0.75, (3, 7): 0.7}, 8), given=range(4), refuted={(0, 5)})
+    assert other.tree == {*walk, (3, 7)}  # the next guess
     part = consistent_part(
         range(8), [Contradiction((3, 7), 90, 1)], skeleton, _evidence(walk | {(0, 5): 0.75}, 8)
     )
