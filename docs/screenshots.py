@@ -22,7 +22,7 @@ from playwright.sync_api import Browser, Page, expect
 from panolog.export.site.write import write_site
 from panolog.orchestrator.cli.commands.export import ExportSpec, export_model
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.watch.dashboard import server
+from panolog.orchestrator.watch.dashboard import guard, server
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_file
 from panolog.scene.write import no_progress
 from tests.export.browser import SOFTWARE, serving
@@ -54,10 +54,11 @@ def take_model_picture(folder: Path, camera: str) -> None:
     with TemporaryDirectory() as temporary, chromium() as browser:
         html = Path(temporary) / "page.html"
         write_file(site_of_run(RunFolder(folder), Wanted(camera=camera)), html)
-        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page = browser.new_page(viewport={"width": 1600, "height": 900})
         page.set_default_timeout(_PATIENCE)
         page.goto(html.as_uri())
         expect(page.locator("#home")).to_be_enabled(timeout=_PATIENCE)
+        page.locator("#more").click()
         page.wait_for_timeout(5_000)  # drawn in full resolution
         page.screenshot(path=HERE / "view-3d.jpg", type="jpeg", quality=82)
 
@@ -121,7 +122,7 @@ def main() -> None:
     if sys.argv[1:2] == ["--viewers"]:
         take_viewers_picture(Path(sys.argv[2]))
         return
-    listener = server.listen("127.0.0.1", 0)
+    listener = guard.listen("127.0.0.1", 0)
     running = server.make_server(Path(sys.argv[1]), listener, None)
     thread = Thread(target=running.run, kwargs={"sockets": [listener]})
     thread.start()

@@ -143,6 +143,7 @@ class Selection:
     part: Part = "scene"
     degree: int = 3  # of the spherical harmonics, at most
     min_opacity: float = 0.0  # in [0, 1]; the sky is not subject to it
+    max_size: float | None = None  # units of the model, of the longest standard deviation; nor to this
     # lower and upper corner in the model's coordinates, of what is scene; None = everything
     crop: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
 
@@ -155,6 +156,8 @@ class Selection:
         keep = np.all([np.isfinite(values).all(1) for values in flat], axis=0)
         if self.min_opacity > 0:
             keep &= ~scene | (piece.opacities >= np.log(self.min_opacity / (1 - self.min_opacity)))
+        if self.max_size is not None:
+            keep &= ~scene | (piece.scales.max(1) <= np.log(self.max_size))
         if self.crop is not None:
             lower, upper = np.array(self.crop, np.float32)
             keep &= ~scene | ((piece.means >= lower) & (piece.means < upper)).all(1)

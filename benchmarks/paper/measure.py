@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.orchestrator.engine.driver.job import Job
-from panolog.orchestrator.engine.stages.evaluation import means
 from panolog.orchestrator.engine.stages.scenes import scene_of
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import read_info
+from panolog.orchestrator.runs.units import means
 from panolog.renderer.process import choose_device
 from panolog.renderer.render import render_panorama
 from panolog.scene.gaussians import Gaussians, logit

@@ -10,7 +10,7 @@ from typing import Any
 
 from benchmarks.paper.results import Result
 from panolog.orchestrator.runs.config import RunConfig, load_config
-from panolog.orchestrator.runs.config import flat as settings_in
+from panolog.orchestrator.runs.folder import flat as settings_in
 from panolog.workers.training.recipes import RECIPES
 
 Measured = Mapping[str, Result]  # by variant, of one scene and one seed

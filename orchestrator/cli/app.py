@@ -56,7 +56,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _PANELS: dict[str, dict[str, Any]] = {
-    "First steps": {"demo": run.demo, "doctor": run.doctor},
+    "First steps": {"demo": run.demo, "doctor": run.doctor, "models": scene.models},
     "Runs": {
         "run": run.run,
         "resume": run.resume,

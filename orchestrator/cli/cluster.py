@@ -12,21 +12,19 @@ from panolog.orchestrator.cli.console import command, print_json, progress_bar, 
 from panolog.orchestrator.cli.options import (
     AcceptOption,
     AtEndOption,
-    DeadlineOption,
     JsonOption,
-    LogOption,
-    MaxCostOption,
-    NotifyOption,
-    PricesOption,
+    followed,
+    grouped,
+    preparation,
+    run_config,
     wanted,
-    with_preparation,
-    with_run_config,
 )
 from panolog.orchestrator.cli.usage import Command, Group, argument, option
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
     from panolog.orchestrator.runs.config import RunConfig
+    from panolog.orchestrator.runs.money.limits import Wanted
     from panolog.orchestrator.runs.preparation.settings import Options
 
 app = typer.Typer(
@@ -50,22 +48,19 @@ _LOCAL = "http://127.0.0.1:8265"
 
 
 @app.command(cls=Command)
-@with_run_config
-@with_preparation
+@grouped(config=run_config, options=preparation, targets=followed, budget=wanted)
 def submit(
     source: Annotated[
         list[str],
         argument("SCENE|SOURCE...", "The scene, or folders of panoramas and videos, on the head node."),
     ],
     output: Annotated[str, option("RUN", "Folder of the new run on the head node.", "--output", "-o")],
+    *,
     config: "RunConfig",
     options: "Options",
     address: ServerOption = _LOCAL,
-    notify: NotifyOption = None,
-    log: LogOption = None,
-    prices: PricesOption = None,
-    max_cost: MaxCostOption = None,
-    deadline: DeadlineOption = None,
+    targets: tuple[list[str], list[str]],
+    budget: "Wanted",
     at_end: AtEndOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -81,27 +76,26 @@ def submit(
     sources, run = [on_head(it, "SCENE") for it in source], on_head(output, "--output")
     for what, path in {
         "--trajectory": options.sfm.get("trajectory"),
+        "--mask-model": options.mask_model,
         "--depth-model": options.depth_model,
     }.items():
         if path is not None:
             on_head(path, what)
-    budget = wanted(prices, max_cost, deadline).options()
-    words = ["run", *sources, "-o", run, *as_settings(config), *as_arguments(options), *budget]
-    words += words_elsewhere(notify or (), log or ())
+    words = ["run", *sources, "-o", run, *as_settings(config), *as_arguments(options), *budget.options()]
+    words += words_elsewhere(*targets)
     words += ["--at-end", at_end] if at_end else []
     _start(address, run, words, as_json=as_json)
 
 
 @app.command(cls=Command)
+@grouped(targets=followed, budget=wanted)
 def resume(
     run: HeadRunArg,
+    *,
     address: ServerOption = _LOCAL,
     accept_changes: AcceptOption = False,
-    notify: NotifyOption = None,
-    log: LogOption = None,
-    prices: PricesOption = None,
-    max_cost: MaxCostOption = None,
-    deadline: DeadlineOption = None,
+    targets: tuple[list[str], list[str]],
+    budget: "Wanted",
     at_end: AtEndOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -110,9 +104,9 @@ def resume(
     from panolog.orchestrator.watch.follower.plan import words_elsewhere
 
     run = on_head(run, "RUN")
-    words = ["resume", run, *wanted(prices, max_cost, deadline).options()]
+    words = ["resume", run, *budget.options()]
     words += ["--accept-changes"] * accept_changes
-    words += words_elsewhere(notify or (), log or ())
+    words += words_elsewhere(*targets)
     words += ["--at-end", at_end] if at_end else []
     _start(address, run, words, as_json=as_json)
 

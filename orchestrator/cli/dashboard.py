@@ -33,8 +33,8 @@ def dashboard(
 
     shown = _queue() if queue is None else queue.absolute()
     token = guard.token_for(host)
-    listener = server.listen(host, port)
-    url = server.address(listener, host, token)
+    listener = guard.listen(host, port)
+    url = guard.address(listener, host, token)
     say(url)
     if token:
         what = "view and stop the runs and to change the queue"

@@ -21,6 +21,10 @@ Crop = Annotated[
     str | None,
     _choice("X,Y,Z,X,Y,Z", "Lower and upper corner of what is kept, in the model's coordinates."),
 ]
+MaxSize = Annotated[
+    float | None,
+    _choice("U", "Leave out what is larger: its longest standard deviation, in the model's units.", min=1e-9),
+]
 Levels = Annotated[
     int | None,
     _choice("N", "Levels of detail of --web and --3dtiles. Default: as many as it takes.", min=1, max=8),
@@ -54,6 +58,7 @@ def export(
     without_sky: Annotated[bool, flag("The scene alone.", "--without-sky", panel=_CHOICE)] = False,
     sh: Annotated[int, _choice("0..3", "Degree of spherical harmonics.", min=0, max=3)] = 3,
     min_opacity: Annotated[float, _choice("0..1", "Leave out what is fainter.", min=0, max=0.999)] = 0.0,
+    max_size: MaxSize = None,
     crop: Crop = None,
     levels: Levels = None,
     spz_version: Annotated[int, _choice("3|4", "Version of SPZ.", min=3, max=4)] = 3,
@@ -78,7 +83,7 @@ def export(
 
         spec = ExportSpec(
             formats=tuple(name for name, given in wanted.items() if given),
-            selection=Selection(degree=sh, min_opacity=min_opacity, crop=box or None),
+            selection=Selection(degree=sh, min_opacity=min_opacity, max_size=max_size, crop=box or None),
             sky=not without_sky,
             levels=levels,
             spz=4 if spz_version == 4 else 3,

@@ -67,17 +67,9 @@ NotifyOption = Annotated[
     list[str] | None,
     _note("KIND:URL", "Notify by webhook, slack, ntfy or mail (docs/notifications.md); repeatable."),
 ]
-LogOption = Annotated[
-    list[str] | None, _note("SINK", "Curves also to mlflow, tensorboard or wandb; repeatable.")
-]
 PricesOption = Annotated[
     str | None, _limit("FILE", "Prices of machines. Default: ~/.config/panolog/prices.toml.")
 ]
-MaxCostOption = Annotated[
-    str | None,
-    _limit("AMOUNT|none", "End the training before the run costs more, and deliver what there is."),
-]
-DeadlineOption = Annotated[str | None, _limit("6h|08:00|none", "The same, so that all is done by then.")]
 AcceptOption = Annotated[
     bool,
     flag("Go on with other settings in run.json than those that the run was begun with.", "--accept-changes"),
@@ -119,7 +111,24 @@ PartialOption = Annotated[
 ]
 
 
-def wanted(prices: str | None, max_cost: str | None, deadline: str | None) -> "Wanted":
+def followed(
+    notify: NotifyOption = None,
+    log: Annotated[
+        list[str] | None, _note("SINK", "Curves also to mlflow, tensorboard or wandb; repeatable.")
+    ] = None,
+) -> tuple[list[str], list[str]]:
+    """The values of these options."""
+    return notify or [], log or []
+
+
+def wanted(
+    prices: PricesOption = None,
+    max_cost: Annotated[
+        str | None,
+        _limit("AMOUNT|none", "End the training before the run costs more, and deliver what there is."),
+    ] = None,
+    deadline: Annotated[str | None, _limit("6h|08:00|none", "The same, so that all is done by then.")] = None,
+) -> "Wanted":
     """The values of these options. Raises ConfigError if one is wrong."""
     from panolog.orchestrator.runs.money.limits import Wanted
     from panolog.orchestrator.runs.money.prices import find_prices
@@ -186,6 +195,7 @@ def preparation(
             show_default=False,
         ),
     ] = None,
+    mask_model: Annotated[Path | None, _making("M.onnx", "Mask what this network finds, as people.")] = None,
     depth_model: Annotated[Path | None, _making("M.onnx", "Estimate depth with this network.")] = None,
 ) -> "Options":
     """The options that make a scene of panoramas or a video, as far as they are not the defaults."""
@@ -196,34 +206,27 @@ def preparation(
     sfm |= {"trajectory": str(trajectory)} if trajectory is not None else {}
     sfm |= {"gps": False} if not gps else {}
     sfm |= {"partial": True} if partial else {}
-    model = None if depth_model is None else str(depth_model)
-    return Options(sfm=sfm, nadir=nadir, static=static, depth_model=model)
+    mask, depth = (None if model is None else str(model) for model in (mask_model, depth_model))
+    return Options(sfm=sfm, nadir=nadir, static=static, mask_model=mask, depth_model=depth)
 
 
-def with_run_config(command: Callable[..., None]) -> Callable[..., None]:
-    """Replaces the parameter `config` of a command by the options of `run_config`, which make its value."""
-    return _replacing(command, "config", run_config)
+def grouped(**groups: Callable[..., Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Replaces parameters of a command by the options of the functions that make their values."""
+    shared = {name: inspect.signature(make).parameters for name, make in groups.items()}
 
+    def replaced(command: Callable[..., None]) -> Callable[..., None]:
+        @wraps(command)
+        def wrapper(**options: Any) -> None:
+            made = {name: groups[name](**{one: options.pop(one) for one in shared[name]}) for name in groups}
+            command(**made, **options)
 
-def with_preparation(command: Callable[..., None]) -> Callable[..., None]:
-    """Replaces the parameter `options` of a command by those of `preparation`, which make its value."""
-    return _replacing(command, "options", preparation)
+        parameters = [
+            new.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            for name, parameter in inspect.signature(command).parameters.items()
+            for new in (shared[name].values() if name in shared else (parameter,))
+        ]
+        wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # read by typer
+        wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        return wrapper
 
-
-def _replacing(command: Callable[..., None], replaced: str, make: Callable[..., Any]) -> Callable[..., None]:
-    """Replaces a parameter of a command by those of `make`, which make its value."""
-    own, shared = inspect.signature(command).parameters, inspect.signature(make).parameters
-
-    @wraps(command)
-    def wrapper(**options: Any) -> None:
-        value = make(**{name: options.pop(name) for name in shared})
-        command(**{replaced: value}, **options)
-
-    parameters = [
-        new
-        for name, parameter in own.items()
-        for new in (shared.values() if name == replaced else (parameter,))
-    ]
-    wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # read by typer
-    wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return wrapper
+    return replaced

@@ -11,7 +11,7 @@ import typer
 
 from panolog.orchestrator.cli import run as runs
 from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
-from panolog.orchestrator.cli.options import BUDGET, JsonOption, preparation, run_config, wanted
+from panolog.orchestrator.cli.options import BUDGET, JsonOption, followed, preparation, run_config, wanted
 from panolog.orchestrator.cli.usage import Command, Group, argument, flag, option
 from panolog.scene.errors import QueueError
 
@@ -239,9 +239,9 @@ def _check(given: dict[str, Any]) -> str:
     def made(make: Callable[..., Any]) -> Any:
         return make(**{name: given[name] for name in inspect.signature(make).parameters})
 
-    config, options = made(run_config), made(preparation)
-    read_plan(given["notify"] or (), given["log"] or (), os.environ)
-    wanted(given["prices"], given["max_cost"], given["deadline"])
+    config, options, (notify, log) = made(run_config), made(preparation), made(followed)
+    read_plan(notify, log, os.environ)
+    made(wanted)
     output = Path(given["output"])
     if (output / "run.json").exists():
         raise QueueError(

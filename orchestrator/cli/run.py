@@ -25,37 +25,36 @@ from panolog.orchestrator.cli.options import (
     AnyRunArg,
     AtEndOption,
     DashboardOption,
-    DeadlineOption,
     JsonOption,
     LocalOption,
-    LogOption,
-    MaxCostOption,
     NiceOption,
-    NotifyOption,
     PricesOption,
     ResumesOption,
     SourcesArg,
     SuperviseOption,
+    followed,
+    grouped,
+    preparation,
+    run_config,
     wanted,
-    with_preparation,
-    with_run_config,
 )
 from panolog.orchestrator.cli.stores import mirrored, opened
 from panolog.orchestrator.cli.usage import argument, flag, option
 
 if TYPE_CHECKING:
     from panolog.orchestrator.runs.config import RunConfig
+    from panolog.orchestrator.runs.money.limits import Wanted
     from panolog.orchestrator.runs.preparation.settings import Options
 
 _POLL = 0.5  # seconds between two reads of a live run
 _RESUMES = 10  # of a supervisor in a row without progress
 
 
-@with_run_config
-@with_preparation
+@grouped(config=run_config, options=preparation, targets=followed, budget=wanted)
 def run(
     source: SourcesArg,
     output: Annotated[str, option("RUN", "Folder or URL of the new run.", "--output", "-o")],
+    *,
     config: "RunConfig",
     options: "Options",
     address: AddressOption = None,
@@ -63,12 +62,9 @@ def run(
     dashboard: DashboardOption = False,
     supervise: SuperviseOption = False,
     max_resumes: ResumesOption = None,
-    notify: NotifyOption = None,
-    log: LogOption = None,
+    targets: tuple[list[str], list[str]],
     local: LocalOption = None,
-    prices: PricesOption = None,
-    max_cost: MaxCostOption = None,
-    deadline: DeadlineOption = None,
+    budget: "Wanted",
     at_end: AtEndOption = None,
 ) -> None:
     """Reconstruct a scene, or panoramas and 360° videos, also several: one model of the place."""
@@ -76,41 +72,37 @@ def run(
     from panolog.orchestrator.runs.config import as_settings
     from panolog.orchestrator.runs.preparation.settings import as_arguments
 
-    driver, budget = _driver_options(address, nice, dashboard=dashboard), wanted(prices, max_cost, deadline)
+    driver = _driver_options(address, nice, dashboard=dashboard)
     code, state = 0, None
     with when_ended(at_end, _complain) as begun:
-        with mirrored(output, local) as root, _followed(root, notify, log):
+        with mirrored(output, local) as root, _followed(root, *targets):
             begun(root)
             if _supervised(max_resumes, supervise=supervise):
                 first = ["run", *source, "-o", str(root), *as_settings(config), *as_arguments(options)]
                 code = _supervise(root, first, driver, budget.options(), address, max_resumes)
             else:
-                with progress_bar("starting"):
-                    from panolog.orchestrator.cli.session import session
-
-                with _display(root, output, dashboard=dashboard) as show:
+                with _session(root, output, dashboard=dashboard) as (session, show):
                     given = source if len(source) > 1 else source[0]
                     state = session.start(given, root, config, address, show, None, nice, options, budget)
         _end(root, code, state)
 
 
+@grouped(targets=followed, budget=wanted)
 def resume(
     run: AnyRunArg,
+    *,
     address: AddressOption = None,
     nice: NiceOption = None,
     dashboard: DashboardOption = False,
     supervise: SuperviseOption = False,
     max_resumes: ResumesOption = None,
-    notify: NotifyOption = None,
-    log: LogOption = None,
+    targets: tuple[list[str], list[str]],
     local: LocalOption = None,
     force: Annotated[
         bool, flag("Take a run with a URL from a driver that may still be at work.", "--force")
     ] = False,
     accept_changes: AcceptOption = False,
-    prices: PricesOption = None,
-    max_cost: MaxCostOption = None,
-    deadline: DeadlineOption = None,
+    budget: "Wanted",
     at_end: AtEndOption = None,
     after: Annotated[str, typer.Option("--resumed-after", hidden=True)] = "",
     has_mirror: Annotated[bool, typer.Option("--has-mirror", hidden=True)] = False,
@@ -120,22 +112,19 @@ def resume(
     from panolog.orchestrator.runs.folder import RunFolder
     from panolog.orchestrator.runs.info import read_info
 
-    options, budget = _driver_options(address, nice, dashboard=dashboard), wanted(prices, max_cost, deadline)
+    options = _driver_options(address, nice, dashboard=dashboard)
     code, state = 0, None
     with when_ended(at_end, _complain) as begun:
         with mirrored(run, local, resumes=True, force=force, mirror=not has_mirror) as root:
             begun(root)
             read_info(RunFolder(root))  # fails before torch is imported
-            with _followed(root, notify, log):
+            with _followed(root, *targets):
                 if _supervised(max_resumes, supervise=supervise):
                     first = ["resume", str(root), "--has-mirror"]
                     once = budget.options() + ["--accept-changes"] * accept_changes
                     code = _supervise(root, first, options, once, address, max_resumes)
                 else:
-                    with progress_bar("starting"):
-                        from panolog.orchestrator.cli.session import session
-
-                    with _display(root, run, dashboard=dashboard) as show:
+                    with _session(root, run, dashboard=dashboard) as (session, show):
                         given = (root, address, show, None, nice, after, budget)
                         state = session.resume(*given, accept_changes=accept_changes)
         _end(root, code, state)
@@ -176,7 +165,7 @@ def demo(
     say_results(root, state)
 
 
-@with_run_config
+@grouped(config=run_config)
 def doctor(
     config: "RunConfig",
     scene: Annotated[
@@ -218,6 +207,7 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     from panolog.orchestrator.runs.storage.state import read_state
     from panolog.orchestrator.runs.store import read_milestones
     from panolog.orchestrator.watch.views.preparation import prepared_share, view_preparation, with_step
+    from panolog.orchestrator.watch.views.summary import summarize
 
     folder = RunFolder(root)
     info = read_json(folder)
@@ -228,13 +218,10 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     if running and not state.waiting:  # a full disk takes no record of it
         state = replace(state, waiting=presence.waiting(folder.presence))
     prepared = view_preparation(folder, state, running=running)
-    state = with_step(state, prepared)
+    state, done = with_step(state, prepared), prepared_share(prepared) if prepared else None
+    summary = summarize(state, running=running, root=run, prepared=done)
     if as_json:
-        from panolog.orchestrator.watch.views.summary import summarize
-
         head = {"run": run, "scene": scene, "width": width}
-        done = prepared_share(prepared) if prepared else None
-        summary = summarize(state, running=running, root=run, prepared=done)
         head |= {"preparation": prepared.model_dump(mode="json")} if prepared else {}
         head |= {"store": vars(mirror) | {"lag": mirror.lag}} if mirror else {}
         print_json(head | summary.model_dump(mode="json"))
@@ -244,7 +231,7 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     from panolog.orchestrator.watch.views.terminal import WIDE, page
 
     console = get_console()
-    shown = page(state, root=root, name=run, running=running, wide=console.width >= WIDE)
+    shown = page(summary, root=run, wide=console.width >= WIDE)
     console.print(shown, crop=False)  # a command longer than a line is whole
     if mirror:
         console.print(mirror.line, style="yellow" if mirror.late else "dim", markup=False, highlight=False)
@@ -319,12 +306,12 @@ def _complain(line: str) -> None:
 
 
 @contextmanager
-def _followed(root: Path, notify: list[str] | None, log: list[str] | None) -> Iterator[None]:
+def _followed(root: Path, notify: list[str], log: list[str]) -> Iterator[None]:
     """Follows a run while the context lasts, if that is wanted. Raises ConfigError for wrong options."""
     from panolog.orchestrator.cli.session.companion import companion_follower
     from panolog.orchestrator.watch.follower.plan import read_plan
 
-    plan, secret = read_plan(notify or (), log or (), os.environ)
+    plan, secret = read_plan(notify, log, os.environ)
     for name in secret:  # neither Ray nor a worker gets them
         os.environ.pop(name, None)
     with companion_follower(root, plan, say):
@@ -332,20 +319,32 @@ def _followed(root: Path, notify: list[str] | None, log: list[str] | None) -> It
 
 
 @contextmanager
-def _display(root: Path, name: str, *, dashboard: bool = False) -> Iterator[Any]:
+def _session(root: Path, name: str, *, dashboard: bool) -> Iterator[tuple[Any, Any]]:
+    """Yields the module that drives runs, and as `_display`. Both it and the dashboard take seconds."""
+    from panolog.orchestrator.cli.session.companion import companion_dashboard
+
+    with companion_dashboard(root, say) if dashboard else nullcontext():
+        with progress_bar("starting"):
+            from panolog.orchestrator.cli.session import session
+
+        with _display(root, name) as show:
+            yield session, show
+
+
+@contextmanager
+def _display(root: Path, name: str) -> Iterator[Any]:
     """Shows a run on stderr while the context lasts. Yields what to call with every change of its state.
 
     Args: name, of the run in commands. If the run is interrupted, says how to resume it and exits with 130.
     Raises RunError for an error that nothing foresees, once the run's history has it.
     """
-    from panolog.orchestrator.cli.session.companion import companion_dashboard
     from panolog.orchestrator.engine.driver.ending import internal
     from panolog.orchestrator.runs.folder import RunFolder
     from panolog.orchestrator.watch.views.terminal import progress
     from panolog.scene.errors import PanologError, RunError
 
     try:
-        with companion_dashboard(root, say) if dashboard else nullcontext(), progress(err(), root) as show:
+        with progress(err(), root) as show:
             yield show
     except KeyboardInterrupt as error:
         if not RunFolder(root).info.exists():

@@ -228,6 +228,25 @@ def depth(
     print_result(described.as_json(), described.lines(), as_json=as_json)
 
 
+def models(
+    model: Annotated[Path | None, argument("M.onnx", "Network to check. Default: list those known.")] = None,
+    width: Annotated[
+        int, option("W", "Of the panoramas of the trial in pixels.", "--width", min=64, max=16384)
+    ] = 2048,
+    device: NetworkDeviceOption = "auto",
+    as_json: JsonOption = False,
+) -> None:
+    """List networks for --mask-model and --depth-model, or check one; nothing is downloaded."""
+    from panolog.prepare.networks.known import check_network, list_lines, networks_as_json
+
+    if model is None:
+        print_result(networks_as_json(), list_lines(), as_json=as_json)
+        return
+    with progress_bar("trying the network"):
+        checked = check_network(model, width, device, say)
+    print_result(asdict(checked), checked.lines(), as_json=as_json)
+
+
 def _nadir_angle(text: str) -> float | Literal["auto"]:
     """The value of --nadir. Raises InputError if it is none."""
     if text == "auto":

@@ -10,7 +10,9 @@ from typing import Any, Literal, cast
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic.fields import FieldInfo
 
+from panolog.orchestrator.runs.folder import flat
 from panolog.orchestrator.runs.machines.config import DeadlinesConfig, QuarantineConfig, ScalingConfig
 from panolog.partition.cells import MOST_BLOCKS, Cells, Cuts, Grid
 from panolog.partition.plan import PartitionConfig
@@ -324,18 +326,17 @@ def validate(tree: Mapping[str, Any]) -> RunConfig:
         raise ConfigError(f"setting {key} = {given}: {message}") from error
 
 
-def keys(model: type[BaseModel] = RunConfig, prefix: str = "") -> list[str]:
-    """All settings as dotted keys."""
-    names = []
+def known_settings(model: type[BaseModel] = RunConfig, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """All settings by their dotted keys."""
     for name, info in model.model_fields.items():
-        kind = info.annotation
-        nested = isinstance(kind, type) and issubclass(kind, BaseModel)
-        names += keys(kind, f"{prefix}{name}.") if nested else [prefix + name]  # type: ignore[arg-type]
-    return names
+        if isinstance(kind := info.annotation, type) and issubclass(kind, BaseModel):
+            yield from known_settings(kind, f"{prefix}{name}.")
+        else:
+            yield prefix + name, info
 
 
 def _nearest(key: str) -> str:
-    known = keys()
+    known = [name for name, _ in known_settings()]
     near = get_close_matches(key, known, n=1, cutoff=0.6)
     if not near:  # right name, wrong group
         near = [name for name in known if name.rpartition(".")[2] == key.rpartition(".")[2]]
@@ -389,12 +390,3 @@ def as_settings(config: RunConfig) -> list[str]:
     """What the user has set, as options `--set KEY=VALUE`; the rest is left to the defaults."""
     given = flat(config.model_dump(mode="json", exclude_unset=True))
     return [word for key, value in given for word in ("--set", f"{key}={json.dumps(value)}")]
-
-
-def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The settings of a nested mapping by dotted key."""
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value

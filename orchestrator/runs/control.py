@@ -8,7 +8,6 @@ import json
 import os
 import re
 import secrets
-import stat
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -20,7 +19,7 @@ from typing import Any
 from typing_extensions import assert_never
 
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.folder import RunFolder, read_below
 from panolog.orchestrator.runs.machines.history import NodeState
 from panolog.orchestrator.runs.records import (
     NodeReleased,
@@ -141,8 +140,8 @@ def stop_requested(folder: RunFolder) -> bool:
     Raises OSError if they cannot be read.
     """
     for path in folder.control.glob("*.json"):
-        with suppress(InputError, ValueError, FileNotFoundError):
-            if _parse(_content(path)).action == Action.STOP:
+        with suppress(InputError, ValueError):
+            if _parse(read_below(path, folder.control, _MAX_BYTES)).action == Action.STOP:
                 return True
     return False
 
@@ -226,7 +225,7 @@ def _notice(text: str) -> Noticed:
 def _take_one(folder: RunFolder, name: str) -> ControlRequest | Noticed:
     path = folder.control / name
     try:
-        taken: ControlRequest | Noticed = _parse(_content(path))
+        taken: ControlRequest | Noticed = _parse(read_below(path, folder.control, _MAX_BYTES))
     except (InputError, ValueError) as error:
         taken = _notice(f"control/{name!a} is not a request: {error}")
     path.unlink(missing_ok=True)
@@ -239,23 +238,6 @@ def _parse(content: bytes) -> ControlRequest:
     if not isinstance(fields, dict) or not fields.keys() <= {"action", "block", "node"}:
         raise ValueError("it is not of the form {action, block, node}")
     return request(fields.get("action"), fields.get("block"), fields.get("node"))
-
-
-def _content(path: Path) -> bytes:
-    """The bytes of a file that may be anything. Raises ValueError if it is not a small plain file."""
-    try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError as error:
-        raise ValueError(error.strerror) from error
-    try:
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise ValueError("it is not a plain file")
-        content = os.read(handle, _MAX_BYTES + 1)
-    finally:
-        os.close(handle)
-    if len(content) > _MAX_BYTES:
-        raise ValueError(f"it has more than {_MAX_BYTES} bytes")
-    return content
 
 
 def state_of(root: Path) -> RunState:

@@ -1,19 +1,24 @@
-"""The run folder: where everything of a run lies. Imports little, so that looking at a run starts at once."""
+"""The run folder: where everything of a run lies, and how a reader that need not trust it opens its files.
+
+Imports little, so that looking at a run starts at once.
+"""
 
 import json
 import os
 import shlex
-from collections.abc import Mapping
+import stat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from panolog.orchestrator.runs import lock
 from panolog.scene.errors import InputError, RunFolderError
 from panolog.scene.files import stem_of, write_bytes
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
+INFO_BYTES = 1_000_000  # of run.json at most
 _RETENTION = 10_000_000  # bytes of retention.json at most: names of 100,000 tasks have two
 
 
@@ -153,6 +158,10 @@ class RunFolder:
         """The same of the Stage I model, which the seams of a merged model are compared with."""
         return self.shard(task).with_suffix(".coarse.ply")
 
+    def read(self, path: Path, most: int) -> bytes:
+        """The bytes of one of its files, whatever the folder holds. Raises InputError as `read_below`."""
+        return read_below(path, self.root, most)
+
     def relative(self, path: Path) -> str:
         """How records name a path."""
         return path.relative_to(self.root).as_posix()
@@ -178,12 +187,12 @@ def read_json(folder: RunFolder) -> dict[str, Any]:
 
     Raises InputError if the folder is no run or the file holds no JSON object.
     """
+    if not folder.info.exists():
+        raise RunFolderError(f"{folder.root}: is not a run folder, it has no run.json")
     try:
-        content = json.loads(folder.info.read_bytes())
-    except FileNotFoundError as error:
-        raise RunFolderError(f"{folder.root}: is not a run folder, it has no run.json") from error
-    except OSError as error:
-        raise RunFolderError(f"{folder.info}: cannot be read: {error.strerror}") from error
+        content = json.loads(folder.read(folder.info, INFO_BYTES))
+    except InputError as error:
+        raise RunFolderError(f"{folder.root}/{error}") from error
     except ValueError as error:
         raise RunFolderError(f"{folder.info}: is not JSON: {error}") from error
     if not isinstance(content, dict):
@@ -256,16 +265,73 @@ def read_object(path: Path, most: int) -> dict[str, Any]:
     Args: most, bytes that are read.
     """
     try:
-        with FileIO(
-            path, opener=lambda name, how: os.open(name, how | os.O_NOFOLLOW | os.O_NONBLOCK)
-        ) as file:
-            content = json.loads(file.read(most) or b"")
-    except (OSError, ValueError, RecursionError):
+        content = json.loads(read_below(path, path.parent, most))
+    except (OSError, InputError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
+
+
+def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of a JSON object by dotted key, such as the settings in run.json."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Writes a JSON object atomically, for people too; makes its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def require_plain(folder: RunFolder) -> None:
+    """Raises RunFolderError if what readers open by its path is a link or of another kind, and OSError."""
+    files = (folder.info, folder.database, Path(f"{folder.database}-journal"), folder.lock, folder.presence)
+    for path in filter(os.path.lexists, (*files, folder.control)):
+        mode = path.lstat().st_mode
+        if not (stat.S_ISDIR(mode) if path == folder.control else stat.S_ISREG(mode)):
+            kind = "folder" if path == folder.control else "plain file"
+            raise RunFolderError(f"{path}: is not a {kind}, so this is not the folder of a run")
+
+
+@contextmanager
+def opened(path: Path, below: Path) -> Iterator[BinaryIO]:
+    """A plain file to read, if it really is below a folder. Raises as `open_below`."""
+    with os.fdopen(open_below(path, below), "rb") as file:
+        yield file
+
+
+def open_below(path: Path, below: Path) -> int:
+    """A descriptor of a plain file that really is below a folder, whatever links are on the way.
+
+    The path is checked after the file was opened, so that it cannot be exchanged in between.
+    Raises InputError if there is no such file there.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the path
+        raise InputError(f"{path.name}: cannot be read") from error
+    try:
+        real = by_handle(handle).readlink()
+        if not (stat.S_ISREG(os.fstat(handle).st_mode) and real.is_relative_to(below.resolve())):
+            raise InputError(f"{path.name}: is not a plain file of the run")
+    except (OSError, InputError):
+        os.close(handle)
+        raise
+    return handle
+
+
+def read_below(path: Path, below: Path, most: int) -> bytes:
+    """The bytes of a plain file below a folder. Raises InputError as `open_below`, or beyond `most` bytes."""
+    with opened(path, below) as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise InputError(f"{path.name}: has more than {most:,} bytes")
+    return content
+
+
+def by_handle(handle: int) -> Path:
+    """A path that opens the file of a descriptor again, whatever has its name by now."""
+    return Path(f"/proc/self/fd/{handle}")

@@ -15,8 +15,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from panolog.orchestrator.runs.config import RESOLVED, RunConfig, flat
-from panolog.orchestrator.runs.folder import RunFolder, command_line, read_json, write_json
+from panolog.orchestrator.runs.config import RESOLVED, RunConfig
+from panolog.orchestrator.runs.folder import RunFolder, command_line, flat, read_json, write_json
 from panolog.orchestrator.runs.records import PreflightSaved, RunBegan, Stored
 from panolog.orchestrator.runs.state import replay
 from panolog.orchestrator.runs.store import read_milestones

@@ -1,8 +1,9 @@
-"""Numbers for people, and from them."""
+"""Numbers for people, and from them; means of metrics."""
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from statistics import fmean
 
 from panolog.scene.errors import ConfigError
 
@@ -41,3 +42,12 @@ def positive(name: str, environment: Mapping[str, str], default: float, hint: st
     if not 0 < value < 1e6:
         raise ConfigError(f"{name}={text}: write {hint}")
     return value
+
+
+def means(views: Iterable[Mapping[str, float | None]]) -> dict[str, float | None]:
+    """The mean of each metric over the views that have it; None where none has."""
+    values: dict[str, list[float]] = {}
+    for metrics in views:
+        for name, value in metrics.items():
+            values.setdefault(name, []).extend([] if value is None else [value])
+    return {name: fmean(numbers) if numbers else None for name, numbers in values.items()}

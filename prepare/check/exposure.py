@@ -29,6 +29,7 @@ from panolog.scene.images import CURVE, TOE, load_layers
 from panolog.scene.model import Panorama, Scene
 
 WIDTH = 1024  # pixels of the panoramas as they are measured
+_QUICK = 512  # the same where they are likely to be alike: noise is larger there, and with it all differences
 POINTS = 4000  # of each panorama, at most
 DIFFERS = 0.08  # stops rms: from here on exposures differ by more than the measurement errs
 FEWEST = 200  # observations of points that others have seen too, of a panorama that is measured
@@ -68,17 +69,29 @@ class Exposures:
         return float(np.sqrt((self.log_gain**2).mean()) / np.log(2))
 
 
-def measure_exposures(scene: Scene, rows: Sequence[int]) -> Exposures | None:
+def differing_exposures(scene: Scene, rows: Sequence[int]) -> Exposures | None:
+    """`measure_exposures`; None also where they differ by less than `DIFFERS`, which is quicker."""
+    for width in sorted({min(_QUICK, scene.width), min(WIDTH, scene.width)}):
+        found = measure_exposures(scene, rows, width)
+        if found is None or found.spread < DIFFERS:
+            return None
+    return found
+
+
+def measure_exposures(scene: Scene, rows: Sequence[int], width: int = WIDTH) -> Exposures | None:
     """The exposures of some panoramas of a scene.
 
     None if most of them have seen too few common points, unless all have EXIF that says their exposures. A
     panorama that cannot be decoded counts as one that has seen nothing.
+
+    Args: width of the panoramas as they are measured, pixels, at most.
     """
+    width = min(width, scene.width)
     views, points, values = list[NDArray[np.int64]](), list[NDArray[np.int64]](), list[Array]()
     seen = [_seen(scene, row) for row in rows]
     far = _farthest(scene, seen, rows)
     with ThreadPoolExecutor(initializer=cv2.setNumThreads, initargs=(1,)) as threads:
-        sampled = threads.map(lambda row, some: _samples(scene, row, some, far), rows, seen)
+        sampled = threads.map(lambda row, some: _samples(scene, row, some, far, width), rows, seen)
         for number, (found, colors) in enumerate(sampled):
             views.append(np.full(len(found), number))
             points.append(found)
@@ -115,13 +128,15 @@ def _seen(scene: Scene, row: int) -> NDArray[np.int64]:
     return seen[:: max(1, len(seen) // POINTS)]
 
 
-def _samples(scene: Scene, row: int, seen: NDArray[np.int64], far: Array) -> tuple[NDArray[np.int64], Array]:
+def _samples(
+    scene: Scene, row: int, seen: NDArray[np.int64], far: Array, width: int
+) -> tuple[NDArray[np.int64], Array]:
     """Rows (M,) of points that a panorama has seen, and the logarithms (M, 3) of what it shows there.
 
     A sample is a mean over about the same piece of the surface in all panoramas, `_PIECE` pixels for the
     farthest: what a single pixel shows depends on the distance where there is a pattern.
     """
-    panorama, width = scene.panoramas[row], min(WIDTH, scene.width)
+    panorama = scene.panoramas[row]
     try:
         stack, mask = _blurred(panorama, width), load_layers(panorama, row, width).mask
     except SceneError:

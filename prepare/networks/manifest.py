@@ -11,11 +11,13 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
+from panolog.prepare.networks.tiles import Tiles
 from panolog.scene.errors import ConfigError, in_one_line
 
 MAX_BYTES = 65_536  # of a manifest
 MAX_DEPTH = 8  # of its nesting
 MAX_HEIGHT = 4_096  # rows of the input; each takes hundreds of bytes per column in the network
+MAX_TILED = 8_192  # columns of a panorama that views are as fine as; maps of these take 40 bytes per pixel
 Three = tuple[float, float, float]
 Kind = TypeVar("Kind", bound=BaseModel)
 
@@ -29,8 +31,12 @@ class ManifestPart(BaseModel):
 class Input(ManifestPart):
     """The image that the network takes: value = (byte / divisor - mean) / std, channel by channel."""
 
-    name: str = Field(min_length=1, description="of the network's input")
-    width: int = Field(ge=8, le=4 * MAX_HEIGHT, description="columns; 2 * height, and with wrap more")
+    name: str | None = Field(
+        default=None, min_length=1, description="of the network's input; none = it has only one"
+    )
+    width: int = Field(
+        ge=8, le=4 * MAX_HEIGHT, description="columns; 2 * height, with wrap more, with tiles height"
+    )
     height: int = Field(ge=4, le=MAX_HEIGHT, description="rows")
     layout: Literal["NCHW", "NHWC"] = Field(description="order of the axes: batch, channel, height, width")
     channels: Literal["RGB", "BGR"] = Field(description="order of the channels")
@@ -39,18 +45,32 @@ class Input(ManifestPart):
     std: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
         default=(1, 1, 1), description="divided by at last, in the order of `channels`"
     )
-    seam: Literal["turn", "wrap", "none"] = Field(
+    seam: Literal["turn", "wrap", "tiles", "none"] = Field(
         default="turn",
         description="turn = estimate twice, the second time turned by 180 degrees, and blend, at twice the"
-        " cost; wrap = give it more columns, which repeat the other side, and blend those; none = the network"
-        " itself knows that a panorama is round",
+        " cost; wrap = give it more columns, which repeat the other side, and blend those; tiles = give it"
+        " square perspective views that cover the sphere; none = the network itself knows that a panorama is"
+        " round",
     )
     wrap: int = Field(default=0, ge=0, description="repeated columns on each side, with seam: wrap")
+    fov: float | None = Field(
+        default=None, ge=40, le=120, description="degrees that each view shows across, with seam: tiles"
+    )
 
     @model_validator(mode="after")
     def _fits(self) -> "Input":
         if (self.seam == "wrap") != (self.wrap > 0):
             raise ValueError("wrap is the number of repeated columns, above 0 with seam: wrap and only there")
+        if (self.seam == "tiles") != (self.fov is not None):
+            raise ValueError("fov is the angle of a view in degrees, given with seam: tiles and only there")
+        if self.fov is not None:
+            if self.width != self.height:
+                raise ValueError(f"with seam: tiles, width must be height = {self.height}, not {self.width}")
+            if (wide := Tiles(self.width, self.fov).width) > MAX_TILED:
+                raise ValueError(
+                    f"views are as fine as a panorama of {wide} columns, more than {MAX_TILED}; raise the fov"
+                )
+            return self
         if self.width != 2 * self.height + 2 * self.wrap:
             raise ValueError(
                 f"width must be 2 * height + 2 * wrap = {2 * self.height + 2 * self.wrap}, not {self.width}"
@@ -102,9 +122,11 @@ class Ignore(Threshold):
 
 
 class Classes(ManifestPart):
-    """A segmentation: scores of each class on the channel axis, the greatest wins."""
+    """A segmentation: scores of each class on the channel axis, the greatest wins; or just the winners."""
 
-    output: str = Field(min_length=1, description="name of the output: one channel for each class")
+    output: str = Field(
+        min_length=1, description="name of the output: a channel for each class, or one with the index of it"
+    )
     ignore: tuple[Annotated[int, Field(ge=0, lt=65_536)], ...] = Field(
         min_length=1, description="indices of the classes to be masked: people, cars, ..."
     )
@@ -118,6 +140,12 @@ class DepthManifest(ManifestPart):
     depth: Depth
     sky: Sky | None = None
     confidence: Confidence | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> "DepthManifest":
+        if self.input.seam == "tiles":
+            raise ValueError("seam: tiles is for masks; depth is estimated of whole panoramas")
+        return self
 
 
 class MaskManifest(ManifestPart):
@@ -155,7 +183,7 @@ def manifest_path(model: Path) -> Path:
             return path
     raise ConfigError(
         f"{model}: there is no manifest {candidates[0].name} next to it, which says what the model expects "
-        "and means; docs/depth-and-masks.md shows one"
+        "and means; docs/depth-and-masks.md shows one, and `panolog models` writes those that it knows"
     )
 
 
@@ -173,6 +201,15 @@ def read_manifest(path: Path, kind: type[Kind]) -> Kind:
             raise ConfigError(f"{path}: there is no field {field}") from error
         message = first["msg"].removeprefix("Value error, ")
         raise ConfigError(f"{path}: {field}: {message}") from error
+
+
+def manifest_task(path: Path) -> Literal["mask", "depth"]:
+    """What a manifest is for. Raises ConfigError: it cannot be read, or is for nothing that there is."""
+    tree = _read(path)
+    task = tree.get("task") if isinstance(tree, dict) else None
+    if task not in {"mask", "depth"}:
+        raise ConfigError(f"{path}: task: must be mask or depth")
+    return "mask" if task == "mask" else "depth"
 
 
 def _read(path: Path) -> Any:

@@ -44,7 +44,7 @@ class Network:
         self._errors: tuple[type[Exception], ...] = _errors(runtime)
         self._session = self._open(runtime, device)
         self.device = next(name for name, it in DEVICES.items() if it == self._session.get_providers()[0])
-        self._dtype, self.batch = self._check_input()
+        self._input, self._dtype, self.batch = self._check_input()
         self._check_outputs()
 
     def run(self, images: NDArray[np.uint8]) -> dict[str, Floats]:
@@ -54,7 +54,7 @@ class Network:
         Returns each output as float32, its first axis N. Raises RunError if the network fails on them.
         """
         try:
-            found = self._session.run(self._outputs, {self._given.name: self._tensor(images)})
+            found = self._session.run(self._outputs, {self._input: self._tensor(images)})
         except self._errors as error:
             raise RunError(
                 f"{self.model}: the network failed ({in_one_line(error, _LONGEST)}); try a smaller batch"
@@ -111,15 +111,14 @@ class Network:
                 f"{self.model}: onnxruntime cannot open it with {wanted[0]}: {in_one_line(error, _LONGEST)}"
             ) from error
 
-    def _check_input(self) -> tuple[Any, int]:
-        """(dtype, batch size or 0 where it is free) of the input, if it is what the manifest says."""
+    def _check_input(self) -> tuple[str, Any, int]:
+        """(name, dtype, batch size or 0 where it is free) of the input, if it is what the manifest says."""
         inputs = {node.name: node for node in self._session.get_inputs()}
-        node = inputs.get(self._given.name)
+        node = inputs.get(self._given.name or next(iter(inputs), ""))
         if node is None or len(inputs) > 1:
             has = ", ".join(inputs) or "none"
-            raise ConfigError(
-                f"{self.model}: the manifest's input.name is {self._given.name}; the model has {has}"
-            )
+            wants = f"input.name is {self._given.name}" if self._given.name else "input is the only one"
+            raise ConfigError(f"{self.model}: the manifest's {wants}; the model has {has}")
         if node.type not in _TYPES:
             raise ConfigError(f"{self.model}: its input {node.name} is a {node.type}; export it with float32")
         wide, tall = self._given.width, self._given.height
@@ -133,7 +132,7 @@ class Network:
                 f"{self.model}: its input {node.name} has the shape {shape}, but the manifest says "
                 f"{self._given.layout} with {tall} x {wide}"
             )
-        return _TYPES[node.type], node.shape[0] if isinstance(node.shape[0], int) else 0
+        return node.name, _TYPES[node.type], node.shape[0] if isinstance(node.shape[0], int) else 0
 
     def _check_outputs(self) -> None:
         has = [node.name for node in self._session.get_outputs()]
@@ -177,16 +176,18 @@ def providers(device: str, available: Sequence[str], *, tensorrt: bool) -> list[
     return [DEVICES[name] for name in usable if DEVICES[name] in available]
 
 
+def sha256(path: Path) -> bytes:
+    """The SHA-256 of a file of any size."""
+    found = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK):
+            found.update(chunk)
+    return found.digest()
+
+
 def digest(*files: Path) -> str:
     """sha256 over the bytes of files, in hexadecimal."""
-    total = hashlib.sha256()
-    for path in files:
-        one = hashlib.sha256()
-        with path.open("rb") as file:
-            while chunk := file.read(_CHUNK):
-                one.update(chunk)
-        total.update(one.digest())
-    return total.hexdigest()
+    return hashlib.sha256(b"".join(sha256(path) for path in files)).hexdigest()
 
 
 def model_digest(model: Path, manifest: Path) -> str:
@@ -194,6 +195,25 @@ def model_digest(model: Path, manifest: Path) -> str:
     # Models of more than 2 GiB keep their weights in a file of their own.
     weights = model.with_name(f"{model.name}.data")
     return digest(model, manifest, *([weights] if weights.is_file() else []))
+
+
+def describe_ends(model: Path) -> tuple[list[str], list[str]]:
+    """The inputs and the outputs of an ONNX file, each as its name, type and shape.
+
+    Raises ConfigError: it is none; DeviceError: onnxruntime is not installed.
+    """
+    runtime = _runtime()
+    options = runtime.SessionOptions()
+    options.log_severity_level = _FATAL
+    try:
+        session = runtime.InferenceSession(str(model), options, providers=[DEVICES["cpu"]])
+    except _errors(runtime) as error:
+        raise ConfigError(f"{model}: onnxruntime cannot open it: {in_one_line(error, _LONGEST)}") from error
+
+    def words(nodes: Any) -> list[str]:
+        return [f"{it.name} ({it.type} {' x '.join(map(str, it.shape))})" for it in nodes]
+
+    return words(session.get_inputs()), words(session.get_outputs())
 
 
 def _runtime() -> Any:

@@ -19,7 +19,9 @@ LIMIT_S = 300
 RECORDS = '#!/bin/bash\necho "${0##*/} $* token ${#RAY_AUTH_TOKEN} $RAY_AUTH_MODE" >> "$CALLS"\n'
 RUNS = RECORDS + "exec sleep 600\n"
 # What the script starts in the background may record its call after the driver's.
-AFTER_OTHERS = "".join(f'until grep --quiet "^{call}" "$CALLS"; do sleep 0.05; done\n' for call in ("srun", "ray start"))
+AFTER_OTHERS = "".join(
+    f'until grep --quiet "^{call}" "$CALLS"; do sleep 0.05; done\n' for call in ("srun", "ray start")
+)
 DRIVER = RECORDS.replace("\n", "\ntrap 'exit 130' TERM\n", 1) + "sleep 600 & wait\n"
 
 

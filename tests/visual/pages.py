@@ -170,7 +170,7 @@ SHOTS = (
     Shot("compare", lambda site: site.compare_url, _compared),
     _run("finished", _camera_around),
     _run("live", _failed_block),
-    _run("failed", _drawn, "desk-light", "desk-dark", "phone-light"),
+    _run("failed", _drawn, "desk-light", "phone-light"),
     _run("waiting", _drawn, "desk-dark", "phone-light"),
     _run("preparing", _prepared, "desk-light", "phone-light"),
     Shot("confirm", lambda site: site.run_url("live"), _confirm, ("desk-dark", "phone-light"), whole=False),

@@ -26,7 +26,7 @@ from panolog.scene.model import Scene
 PREVIEW_WIDTH = 1024  # pixels, at most
 MOST = 300_000  # scene Gaussians of a snapshot: 17 MB
 WHOLE = "gaussians"  # in a snapshot: how many the model has, with those that are left out
-EARLY = (10, 30, 100, 300)  # iterations with a preview: in minutes one sees whether poses and pictures fit
+EARLY = (1, 10, 30, 100, 300)  # iterations with a preview: in minutes one sees whether poses and pictures fit
 SHARE = 0.01  # of the time of a task that its previews by time may take
 _GROWTH = 0.05  # of a task's time until the next one: days of training have a few dozen more than a minute
 _LOG = logging.getLogger(__name__)

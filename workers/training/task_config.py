@@ -38,7 +38,7 @@ class PreviewConfig(Group):
     seconds: float = Field(
         default=5.0,
         gt=0,
-        description="seconds between two at first, besides those of iterations 10, 30, 100, 300; more later,"
+        description="seconds between two at first, besides those of iterations 1, 10, 30, 100, 300; more later,"
         " or where they would take over 1 % of the time",
     )
 

@@ -1,6 +1,7 @@
-// A box of which the model is shown, as `panolog export --crop` takes it: axes are those of the model.
+// What of the model is shown, as `panolog export` takes it: a box, whose axes are those of the model, and what is neither
+// too faint nor too large to be of a surface.
 
-import { at, button, copy } from "./dom.js";
+import { at } from "./dom.js";
 import { shifted } from "./flight.js";
 import { line, visible } from "./overlay.js";
 import { around, corners, placed, shown } from "./world.js";
@@ -9,6 +10,9 @@ import { around, corners, placed, shown } from "./world.js";
 
 const MARGIN = 20; // steps around the cameras within which the box is moved
 const PARTS = 1000; // of a slider
+const FAINTEST = 0.9; // opacity at the end of its slider
+const LARGEST = 20; // steps: size at the end of its slider, where nothing is left out
+const RANGE = 1000; // times the size at its beginning
 const NEAR = 0.1; // of a step: what is nearer is behind the view; lines far outside of the picture take long
 const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((from) =>
   [1, 2, 4].filter((bit) => !(from & bit)).map((bit) => /** @type {const} */ ([from, from | bit])),
@@ -26,6 +30,9 @@ export function into(box, { rotation, origin }) {
   return matrix;
 }
 
+/** As the command line has it. @param {number} value */
+const rounded = (value) => Number(value.toPrecision(4));
+
 export class Crop {
   /**
    * @param {import("./stage.js").Stage} stage  with its model @param {import("./page.js").Frame} frame
@@ -37,13 +44,13 @@ export class Crop {
     this._near = step * NEAR;
     /** All of the model. */
     this.whole = around(corners(boxOf(stage.bounds)).map((corner) => placed(frame, corner)));
+    /** Called after each change. */
+    this.onChanged = () => {};
     this._reach = reach(this.whole, around(cameras.map((camera) => placed(frame, camera))), MARGIN * step);
     /** What is kept. @type {Box} */
     this.box = { lower: [...this.whole.lower], upper: [...this.whole.upper] };
     this._sliders = ["lower", "upper"].flatMap((side) => [0, 1, 2].map((axis) => this._slider(side, axis)));
     stage.onDrawn.push(() => this._draw());
-    button("whole").addEventListener("click", () => this.reset());
-    button("copy").addEventListener("click", () => copy(at("option")));
     this._show();
   }
 
@@ -53,8 +60,9 @@ export class Crop {
     return [0, 1, 2].some((i) => this.box.lower[i] > lower[i] || this.box.upper[i] < upper[i]);
   }
 
-  /** For the command line. */
+  /** For the command line, "" if nothing is left out. */
   get option() {
+    if (!this.cuts) return "";
     return `--crop=${[...this.box.lower, ...this.box.upper].map((value) => Number(value.toPrecision(6))).join(",")}`;
   }
 
@@ -97,10 +105,8 @@ export class Crop {
   }
 
   _show() {
-    at("option").textContent = this.option;
-    at("kept").hidden = !this.cuts;
-    button("copy").disabled = button("whole").disabled = !this.cuts;
     this._stage.keep(this.cuts ? into(this.box, this._frame) : null);
+    this.onChanged();
   }
 
   /** Draws the edges of the box while something is left out. */
@@ -116,6 +122,51 @@ export class Crop {
     }).map((corner) => shown(this._frame, corner));
     const ends = EDGES.map(([from, to]) => visible(this._stage, points[from], points[to], this._near));
     edges.replaceChildren(...ends.flatMap((one) => (one ? [line(one)] : [])));
+  }
+}
+
+export class Floaters {
+  /** @param {import("./stage.js").Stage} stage  with its model @param {number} step  world units */
+  constructor(stage, step) {
+    this._stage = stage;
+    this._largest = LARGEST * step;
+    /** Called after each change. */
+    this.onChanged = () => {};
+    this._faint = this._slider("fainter", 0);
+    this._large = this._slider("larger", PARTS);
+    this._changed();
+  }
+
+  /** For the command line, "" if nothing is left out. */
+  get option() {
+    const given = [this.opacity && `--min-opacity=${this.opacity}`, this.size && `--max-size=${this.size}`];
+    return given.filter(Boolean).join(" ");
+  }
+
+  /** Shows all of the model again. */
+  reset() {
+    this._faint.value = "0";
+    this._large.value = String(PARTS);
+    this._changed();
+  }
+
+  /** @param {string} name @param {number} value */
+  _slider(name, value) {
+    const slider = /** @type {HTMLInputElement} */ (at(name));
+    slider.max = String(PARTS);
+    slider.value = String(value);
+    slider.addEventListener("input", () => this._changed());
+    return slider;
+  }
+
+  _changed() {
+    const part = Number(this._large.value) / PARTS;
+    /** What is fainter is left out. */
+    this.opacity = rounded((FAINTEST * Number(this._faint.value)) / PARTS);
+    /** World units: that of which the longest standard deviation is more is left out; 0 for none. */
+    this.size = part < 1 ? rounded(this._largest * RANGE ** (part - 1)) : 0;
+    this._stage.limit(this.opacity, this.size);
+    this.onChanged();
   }
 }
 

@@ -61,6 +61,8 @@ export class Stage {
     this._depths.setValue([0, 0, 0, 0]);
     this._kept = device.scope.resolve("uKept");
     this._kept.setValue(ALL);
+    this._limits = device.scope.resolve("uLimits");
+    this._limits.setValue([0, 0]);
     this._step = 1;
     /** What is around the view, and not of the model. @type {pc.Entity[]} */
     this.backdrops = [];
@@ -242,6 +244,12 @@ export class Stage {
   /** @param {Float32Array | null} matrix  from the world to [0, 1] of what is shown of the model; null for all of it */
   keep(matrix) {
     this._kept.setValue(matrix ?? ALL);
+    this.draw();
+  }
+
+  /** @param {number} opacity  what is fainter is left out @param {number} size  and what is larger; 0 for none */
+  limit(opacity, size) {
+    this._limits.setValue([opacity, size]);
     this.draw();
   }
 

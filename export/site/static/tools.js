@@ -1,7 +1,7 @@
-// What is made of the view: a picture, the whole screen, a crop and a camera path.
+// What is made of the view: a picture, the whole screen, what an export keeps, and a camera path.
 
-import { Crop } from "./crop.js";
-import { at, button, download, press } from "./dom.js";
+import { Crop, Floaters } from "./crop.js";
+import { at, button, copy, download, press } from "./dom.js";
 import { Path } from "./path.js";
 
 /** @typedef {import("./page.js").Page} Page @typedef {import("./stage.js").Stage} Stage */
@@ -24,9 +24,23 @@ function offerFullScreen() {
   document.addEventListener("fullscreenchange", () => press("full", document.fullscreenElement !== null));
 }
 
+/** Shows with which options an export keeps what is shown. @param {(Crop | Floaters)[]} parts */
+function offerOption(parts) {
+  const show = () => {
+    const option = parts.flatMap((part) => part.option || []).join(" ");
+    at("option").textContent = option;
+    at("kept").hidden = !option;
+    button("copy").disabled = button("whole").disabled = !option;
+  };
+  for (const part of parts) part.onChanged = show;
+  button("whole").addEventListener("click", () => parts.forEach((part) => part.reset()));
+  button("copy").addEventListener("click", () => copy(at("option")));
+  show();
+}
+
 /**
  * @param {Stage} stage  with its model @param {import("./flight.js").Flight} flight @param {Page} page
- * @returns {{ crop: Crop, path: Path } | null}  null where the coordinates of the model are not known
+ * @returns {{ crop: Crop, floaters: Floaters, path: Path } | null}  null where the coordinates of the model are not known
  */
 export function offerTools(stage, flight, page) {
   button("picture").addEventListener("click", () => savePicture(stage, page.title));
@@ -34,5 +48,8 @@ export function offerTools(stage, flight, page) {
   at("edit").hidden = !page.frame;
   if (!page.frame) return null;
   const cameras = page.cameras.map(({ position }) => position);
-  return { crop: new Crop(stage, page.frame, cameras, flight.step), path: new Path(flight, page.frame) };
+  const crop = new Crop(stage, page.frame, cameras, flight.step),
+    floaters = new Floaters(stage, flight.step);
+  offerOption([crop, floaters]);
+  return { crop, floaters, path: new Path(flight, page.frame) };
 }

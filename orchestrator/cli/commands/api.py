@@ -10,10 +10,10 @@ from typing import Any
 
 from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.engine.scheduling.pool import Pool
-from panolog.orchestrator.engine.stages.evaluation import means
 from panolog.orchestrator.engine.stages.scenes import divided
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore
+from panolog.orchestrator.runs.units import means
 from panolog.renderer.process import choose_device
 from panolog.scene.files import StrPath
 from panolog.scene.gaussians import Gaussians

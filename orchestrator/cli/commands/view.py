@@ -1,10 +1,10 @@
 """`panolog view`: the page of a model, served on a loopback address while someone looks at it."""
 
 import signal
-from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -123,7 +123,7 @@ class SiteServer(ThreadingHTTPServer):
         if site.scene is not None:
             description, self._names = described(description)
         self._description = description
-        self._copies: OrderedDict[int, bytes] = OrderedDict()
+        self._copy = lru_cache(maxsize=_CACHED)(partial(photograph, patience=STORE_S))
         self._lock = Lock()
         try:
             super().__init__(("127.0.0.1", port), _Handler)
@@ -143,17 +143,9 @@ class SiteServer(ThreadingHTTPServer):
         """A small copy of the photograph of a camera. One is made at a time."""
         if number >= len(self._names):
             return None
-        with self._lock:
-            copy = self._copies.pop(number, None)
-            if copy is None:
-                try:
-                    copy = photograph(scene, self._names[number], patience=STORE_S)
-                except (InputError, StoreLostError):
-                    return None
-            self._copies[number] = copy
-            while len(self._copies) > _CACHED:
-                self._copies.popitem(last=False)
-        return copy
+        with self._lock, suppress(InputError, StoreLostError):
+            return self._copy(scene, self._names[number])
+        return None
 
 
 class _Handler(BaseHTTPRequestHandler):

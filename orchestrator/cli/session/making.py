@@ -34,6 +34,7 @@ from panolog.orchestrator.runs.records import Noticed, Preparing
 from panolog.orchestrator.watch.views.mask_picture import write_mask_picture
 from panolog.prepare.networks.depth_maps import BATCH
 from panolog.prepare.networks.masks import GIVEN, MaskJob, find_static, make_masks
+from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.networks.static_regions import FEWEST, StaticRegion
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.scene.errors import SceneError
@@ -184,18 +185,22 @@ class Preparation:
     def _mask(self, pictures: Sequence[PanoramaFile]) -> None:
         """Masks the panoramas of each source by what is the same in it: cameras have their own operators."""
         nadir, given = self.settings.nadir or None, (self.folder.preparation / GIVEN).is_dir()
+        model = self.settings.mask_model
+        movers = MoverNetwork(Path(model)) if model else None
         of_source = {it.source: [one for one in pictures if one.source == it.source] for it in pictures}
         regions = self._static(of_source)
-        if not (regions or nadir or given):
+        if not (regions or nadir or given or movers):
             return
         shares = list[float]()
         for turn, (label, own) in enumerate(of_source.items()):
             show = part_of(partial(self.progress(Step.MASKS), "masks"), turn, len(of_source))
-            shares += [mask.ignored for mask in make_masks(own, MaskJob(nadir, regions.get(label)), show)]
+            job = MaskJob(nadir, regions.get(label), movers)
+            shares += [mask.ignored for mask in make_masks(own, job, show)]
         parts = [f"{nadir:g}° around straight down"] if nadir else []
         parts += (
             ["what is the same in all panoramas" + " of a source" * (len(of_source) > 1)] if regions else []
         )
+        parts += [f"what {Path(model).name} finds"] if model else []
         parts += ["the masks of the source"] if given else []
         self._lines.append(f"{sum(shares) / len(shares):.1%} of the sphere: {', '.join(parts)}")
 

@@ -19,6 +19,7 @@ from panolog.orchestrator.runs.preparation.settings import (
     read_settings,
 )
 from panolog.prepare.networks.depth_maps import plan_depth
+from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.scene.errors import ConfigError, RunFolderError, SceneError
 from panolog.scene.model import Scene
@@ -99,8 +100,11 @@ def settings_of(source: Path | Sequence[Path], options: Options) -> Settings | N
             if len(sources) > 1:
                 raise ConfigError(f"{path}: is a scene already, which is run by itself; give it alone")
             return None
+    # opens the networks: nothing of them is to be wrong hours later
+    if options.mask_model is not None:
+        MoverNetwork(Path(options.mask_model))
     if options.depth_model is not None:
-        plan_depth((), Path(options.depth_model))  # opens it: nothing of it is to be wrong hours later
+        plan_depth((), Path(options.depth_model))
     sfm, trajectory = dict(options.sfm), options.sfm.get("trajectory")
     if trajectory is not None:
         from panolog.prepare.sfm.trajectory import check_times, read_trajectory  # loading it is slow
@@ -119,6 +123,7 @@ def settings_of(source: Path | Sequence[Path], options: Options) -> Settings | N
         sfm=sfm,
         nadir=(0.0 if masked else NADIR) if options.nadir is None else options.nadir,
         static=not masked if options.static is None else options.static,
+        mask_model=options.mask_model and str(Path(options.mask_model).resolve()),
         depth_model=options.depth_model and str(Path(options.depth_model).resolve()),
     )
 

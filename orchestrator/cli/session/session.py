@@ -47,10 +47,9 @@ from panolog.orchestrator.runs.records import (
     Preparing,
     Record,
     RunBegan,
-    RunContinued,
-    RunWaiting,
 )
-from panolog.orchestrator.runs.retention.clean import remove_models
+from panolog.orchestrator.runs.retention.clean import remove_all
+from panolog.orchestrator.runs.retention.survey import models_of_parts
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import report_or_notice
@@ -62,6 +61,7 @@ from panolog.scene.files import remove_partial
 from panolog.scene.model import Scene
 from panolog.workers.tasks import NOTHING_HELD_OUT
 
+_FAR = "the scene is far from its origin: add {} to the coordinates of the run for the scene's"
 _LOG = logging.getLogger(__name__)
 
 
@@ -111,7 +111,7 @@ def start(
             with end_recorded(begin.journal):
                 begin.take_over(info.config, budget)
                 info = begin.prepare(info, new.settings)
-                with begin.workers() as workers:
+                with begin.workers(lambda: begin.measure(info)) as workers:
                     config = begin.preflight(workers, info)
                     undo.pop_all()  # from here on it is a run
                     return begin.drive(workers, config)
@@ -156,7 +156,7 @@ def resume(
             if after:
                 journal.record([Noticed(None, f"resumed by the supervisor after: {after}")])
             info = begin.prepare(info, settings)
-            with begin.workers() as workers:
+            with begin.workers(ignore if prepared else lambda: begin.measure(info)) as workers:
                 config = info.config
                 if prepared:
                     _device(config.device, workers, begin.warn, local=address is None)
@@ -198,7 +198,6 @@ class _Beginning:
     pool: Pool | None
     nice: int | None
     made: Scene | None = None  # None until it is prepared
-    _since: float = 0.0  # Clock.monotonic() of the latest reason to wait
 
     @property
     def scene(self) -> Scene:
@@ -240,29 +239,31 @@ class _Beginning:
         self.journal.record([*lost_with_driver(state), began, *said, *control.begin(self.folder)])
 
     @contextmanager
-    def workers(self) -> Iterator[Pool]:
+    def workers(self, meanwhile: Callable[[], None]) -> Iterator[Pool]:
         """The pool that was given, else that of `_workers`: Ray's also exports the state as metrics."""
         exports = self.pool is None and not _works_without_ray(self.address, self.nice)
         if exports:
-            self.journal.record([Preparing("connecting to the cluster" if self.address else "starting Ray")])
-        with _workers(self.address, self.folder.root, self.pool, self.nice) as workers:
+            self._does("connecting to the cluster" if self.address else "starting Ray")
+        with _workers(self.address, self.folder.root, self.pool, self.nice, meanwhile) as workers:
             if exports:
                 from panolog.orchestrator.engine.cluster.run_metrics import RunMetrics
 
                 self.journal.on_change = RunMetrics(self.folder.root, self.journal.on_change).show
             yield workers
 
+    def measure(self, info: RunInfo) -> None:
+        """Measures how panoramas were captured, if Stage I is to learn that. Raises as `Measuring`."""
+        measured = Measuring(self.scene, info.config, self._does, self.warn).found()
+        self.journal.until_done(lambda: save_measured(self.folder, measured, self.scene))
+
     def preflight(self, workers: Pool, info: RunInfo) -> RunConfig:
         """The resolved settings of a run, once they are in run.json. Raises InputError if it does not fit."""
         folder, root = self.folder, self.folder.root
-        measuring = Measuring(
-            self.scene, info.config, lambda what: self.journal.record([Preparing(what)]), self.warn
-        )
-        measured = measuring.found()  # how panoramas were captured, if Stage I is to learn that
-        self.journal.until_done(lambda: save_measured(folder, measured, self.scene))
-        self.journal.record([Preparing("calibrating")])
+        self._does("calibrating")
         prices, local = prices_of(self.journal.state), self.address is None
-        found = _examine(workers, self.scene, info.config, root, self.warn, prices, self._waits, local=local)
+        found = _examine(
+            workers, self.scene, info.config, root, self.warn, prices, self.journal.explain, local=local
+        )
         found.require()
         info = info.model_copy(update={"config": found.config})
         self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
@@ -272,16 +273,14 @@ class _Beginning:
         done = PreflightSaved(folder.relative(folder.preflight), seconds, settings)
         if budget := self.journal.state.money.budget:
             require_enough(seconds, budget, workers.nodes())
-        lines = [*look_at_layers(self.scene).lines, *([] if self.scene.test else [NOTHING_HELD_OUT])]
+        lines = [_FAR.format(self.scene.offset)] if any(self.scene.offset) else []
+        lines += [*look_at_layers(self.scene).lines, *([] if self.scene.test else [NOTHING_HELD_OUT])]
         layers = [Noticed(None, line) for line in lines]
-        self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), *layers, done])
+        self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *layers, done])
         return found.config
 
-    def _waits(self, why: str) -> None:
-        """For a machine, or "" once there is one."""
-        now = self.journal.clock.monotonic()
-        self._since = now if why else self._since
-        self.journal.record([RunWaiting(why) if why else RunContinued(now - self._since)])
+    def _does(self, what: str) -> None:
+        self.journal.record([Preparing(what)])
 
     def warn(self, line: str) -> None:
         """Something the user should read once."""
@@ -290,7 +289,7 @@ class _Beginning:
     def drive(self, workers: Pool, config: RunConfig) -> RunState:
         """Runs all tasks, and writes the report."""
         folder = self.folder
-        self.journal.record([Preparing("starting workers")])
+        self._does("starting workers")
 
         def draw(plan: Plan, means: NDArray[np.float32]) -> None:
             if not installed("matplotlib"):
@@ -323,7 +322,7 @@ def estimate_run(
     Args: config, with a width. Raises InputError as `start`, except if the run does not fit: that is the
     problem of the preflight.
     """
-    with _workers(address, scene.root, None) as pool:
+    with _workers(address, scene.root, None, None, ignore) as pool:
         return _examine(pool, scene, config, Path.cwd(), ignore, prices, local=address is None)
 
 
@@ -343,15 +342,18 @@ def _examine(
 
 
 @contextmanager
-def _workers(address: str | None, root: Path, pool: Pool | None, nice: int | None = None) -> Iterator[Pool]:
-    """The pool that is given, else Ray's; where Ray is not installed, one of this machine without it."""
+def _workers(
+    address: str | None, root: Path, pool: Pool | None, nice: int | None, meanwhile: Callable[[], None]
+) -> Iterator[Pool]:
+    """The pool that is given, else Ray's, or one without Ray; `meanwhile` is called while it starts."""
     if pool is not None or _works_without_ray(address, nice):
         with local_pool() if pool is None else nullcontext(pool) as here:
+            meanwhile()
             yield here
         return
     from panolog.orchestrator.engine.cluster.connection import connect  # other pools need no Ray
 
-    with connect(address, root, nice) as ray_pool:
+    with connect(address, root, nice, meanwhile) as ray_pool:
         yield ray_pool
 
 
@@ -373,18 +375,10 @@ def _report(folder: RunFolder, journal: Journal) -> None:
 def _retained(folder: RunFolder, journal: Journal, config: RunConfig) -> RunState:
     """The state of a run that is done, once the models that its settings do not keep are removed."""
     if not config.retention.models and (
-        notice := journal.until_done(lambda: remove_models(folder, journal.state))
+        notice := journal.until_done(lambda: remove_all(folder, models_of_parts(folder, journal.state)))
     ):
         journal.record([notice])
     return journal.state
-
-
-def _moved(scene: Scene) -> list[Record]:
-    """A notice, if the world of the run is not that of the scene's model."""
-    message = (
-        f"the scene is far from its origin: add {scene.offset} to the coordinates of the run for the scene's"
-    )
-    return [Noticed(None, message)] if any(scene.offset) else []
 
 
 def _device(wanted: str, pool: Pool, warn: Callable[[str], None], *, local: bool) -> str:

@@ -6,7 +6,8 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from tempfile import mkdtemp
@@ -16,10 +17,11 @@ import ray
 
 from panolog.orchestrator.engine.cluster import cleaner as ray_cleaner
 from panolog.orchestrator.engine.cluster.files import FileSharing, key_of
-from panolog.orchestrator.engine.cluster.pool import RayPool
+from panolog.orchestrator.engine.cluster.pool import RayPool, imported
 from panolog.orchestrator.engine.scheduling.pool import first_line
 from panolog.orchestrator.runs import log
 from panolog.orchestrator.runs.machines.machine import cores, memory
+from panolog.orchestrator.runs.state import ignore
 from panolog.scene.errors import ClusterError, ConfigError
 
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
@@ -29,12 +31,15 @@ _STORE = 2**31  # bytes of shared memory for the object store, at most; beyond i
 
 
 @contextmanager
-def connect(address: str | None, root: Path, nice: int | None = None) -> Iterator[RayPool]:
+def connect(
+    address: str | None, root: Path, nice: int | None = None, meanwhile: Callable[[], None] = ignore
+) -> Iterator[RayPool]:
     """Ray for as long as the context lasts: a cluster's at `address`, or one of its own on this machine.
 
     Args: root, the folder of the run; nice, by how much workers are nicer than this process (setpriority(2),
-    0 to 19), by default RAY_worker_niceness, else 0. Raises InputError if there is no cluster at the address,
-    or for `nice` with one: its workers have the priority that its nodes gave them.
+    0 to 19), by default RAY_worker_niceness, else 0; meanwhile, called while Ray starts.
+    Raises InputError if there is no cluster at the address, or for `nice` with one: its workers have the
+    priority that its nodes gave them.
     """
     if address and nice is not None:
         raise ConfigError(
@@ -42,10 +47,15 @@ def connect(address: str | None, root: Path, nice: int | None = None) -> Iterato
             " RAY_worker_niceness had when its nodes were started; leave the option out"
         )
     before = signal.getsignal(signal.SIGTERM)
-    with redirect_stdout(sys.stderr), _joined(address) if address else _own(nice):  # Ray prints what is lost
+    with (
+        redirect_stdout(sys.stderr),
+        _joined(address) if address else _own(nice, meanwhile),
+    ):  # Ray prints what is lost
         # Ray has installed its own handler of SIGTERM: make it a Ctrl-C, so that the run records its end.
         unset = before in (None, signal.SIG_DFL)
         signal.signal(signal.SIGTERM, signal.default_int_handler if unset else before)
+        if address:
+            meanwhile()
         sharing = FileSharing(root) if address else None
         pool = RayPool(sharing, key_of(root))
         try:
@@ -81,24 +91,29 @@ def _join(address: str) -> None:
 
 
 @contextmanager
-def _own(nice: int | None) -> Iterator[None]:
+def _own(nice: int | None, meanwhile: Callable[[], None]) -> Iterator[None]:
     """A session of this machine, with a process that clears up, also if this one is killed."""
+    nice = _niceness() if nice is None else nice
     folder = mkdtemp(prefix="panolog-ray-", dir=_TMP)
     command = [sys.executable, "-m", ray_cleaner.__name__, folder]
     cleaner = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
     others = set(psutil.Process().children(recursive=True))  # such as the follower of a run, which lives on
     try:
-        _start(folder, nice)
-        yield
+        with ThreadPoolExecutor(1) as thread:  # Ray's processes end with the thread that has started them
+            starting = thread.submit(_start, folder, nice)
+            try:
+                meanwhile()
+                starting.result()
+                yield
+            finally:
+                wait([starting])
+                _shut_down(others)
     finally:
-        try:
-            _shut_down(others)
-        finally:
-            cleaner.communicate(b"ended")
+        cleaner.communicate(b"ended")
 
 
-def _start(folder: str, nice: int | None) -> None:
-    """Starts Ray; again if its 30 s were too short on a busy machine, at most `_STARTS` times.
+def _start(folder: str, nice: int) -> None:
+    """Starts Ray, and a worker; `_STARTS` times at most, as 30 s may be too short on a busy machine.
 
     Raises ClusterError if it does not start.
     """
@@ -115,10 +130,11 @@ def _start(folder: str, nice: int | None) -> None:
                     " repeat the command: nothing is lost"
                 ) from error
         else:
+            ray.remote(imported).remote()
             return
 
 
-def _init(folder: str, nice: int | None) -> None:
+def _init(folder: str, nice: int) -> None:
     ray.init(
         address="local",  # also if RAY_ADDRESS is set
         num_cpus=cores(),
@@ -127,7 +143,7 @@ def _init(folder: str, nice: int | None) -> None:
         logging_level=logging.ERROR,
         object_store_memory=min(_STORE, memory() // 4),
         _temp_dir=folder,
-        _system_config={"worker_niceness": _niceness() if nice is None else nice},
+        _system_config={"worker_niceness": nice},
     )
 
 

@@ -256,6 +256,10 @@ def _environment(placement: Placement, *, pin: bool) -> dict[str, Any] | None:
     return {"env_vars": names} if names else None
 
 
+def imported() -> None:
+    """Does nothing: a worker that has run it has imported what tasks need, which takes seconds."""
+
+
 def _run(
     spec: TaskSpec, where: Placement, code: str
 ) -> Iterator[Hello | Event | Calibration | Usage | Large]:

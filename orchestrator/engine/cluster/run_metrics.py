@@ -12,18 +12,21 @@ from pathlib import Path
 from ray.util.metrics import Counter, Gauge
 
 from panolog.orchestrator.runs.records import Record, Stored, TaskFailed, Transferred
-from panolog.orchestrator.runs.state import OnChange, RunState, Status, TaskState, ignore
-from panolog.workers.tasks import TaskId
+from panolog.orchestrator.runs.state import OnChange, RunState, Status, ignore
 
-GAUGES = {
-    "panolog_iteration": "Iterations that a task has done.",
-    "panolog_iterations": "Iterations of a task in all.",
-    "panolog_iterations_per_second": "Recent speed of a task that runs.",
-    "panolog_loss": "Training loss, mean since the last report.",
-    "panolog_psnr_db": "PSNR over the training views, mean since the last report.",
-    "panolog_gaussians": "Gaussians of a task.",
-    "panolog_memory_bytes": "Memory of a task that runs: of the device on CUDA, of the process on the CPU.",
+GAUGES = {  # by name, the field of `Progressed` and what it is
+    "panolog_iteration": ("iteration", "Iterations that a task has done."),
+    "panolog_iterations": ("iterations", "Iterations of a task in all."),
+    "panolog_iterations_per_second": ("rate", "Recent speed of a task that runs."),
+    "panolog_loss": ("loss", "Training loss, mean since the last report."),
+    "panolog_psnr_db": ("psnr", "PSNR over the training views, mean since the last report."),
+    "panolog_gaussians": ("gaussians", "Gaussians of a task."),
+    "panolog_memory_bytes": (
+        "memory",
+        "Memory of a task that runs: of the device on CUDA, of the process on the CPU.",
+    ),
 }
+_OF_WORKERS = ("rate", "memory")  # fields of no interest once a task does not run
 COUNTERS = {
     "panolog_retries_total": "Attempts that failed and are repeated.",
     "panolog_moved_bytes_total": "Bytes that a task has sent to or received from other machines.",
@@ -47,38 +50,23 @@ class MetricSample:
 def gauges(state: RunState) -> Iterator[MetricSample]:
     """Where every task stands that has reported something."""
     for task in state.tasks.values():
-        for metric, value in _standing(task).items():
-            if value is not None:
+        for metric, (name, _) in GAUGES.items():
+            value = getattr(task.progress, name, None)
+            if value is not None and (task.status == Status.RUNNING or name not in _OF_WORKERS):
                 yield MetricSample(metric, str(task.id), task.node, value)
-
-
-def _standing(task: TaskState) -> dict[str, float | None]:
-    progress = task.progress
-    if progress is None:
-        return {}
-    values: dict[str, float | None] = {
-        "panolog_iteration": progress.iteration,
-        "panolog_iterations": progress.iterations,
-        "panolog_loss": progress.loss,
-        "panolog_psnr_db": progress.psnr,
-        "panolog_gaussians": progress.gaussians,
-    }
-    if task.status == Status.RUNNING:
-        values |= {"panolog_iterations_per_second": progress.rate, "panolog_memory_bytes": progress.memory}
-    return values
 
 
 def counts(state: RunState, record: Record) -> Iterator[MetricSample]:
     """What a record adds to the counters; `state` is after it."""
-    values: dict[str, int] = {}
     match record:
         case TaskFailed(final=False):
-            values = {"panolog_retries_total": 1}
+            metric, value = "panolog_retries_total", 1
         case Transferred():
-            values = {"panolog_moved_bytes_total": record.received + record.sent}
-    for metric, value in values.items():
-        if value and isinstance(record.task, TaskId):  # Ray refuses to add nothing
-            yield MetricSample(metric, str(record.task), state.task(record.task).node, value)
+            metric, value = "panolog_moved_bytes_total", record.received + record.sent
+        case _:
+            return
+    if value:  # Ray refuses to add nothing
+        yield MetricSample(metric, str(record.task), state.task(record.task).node, value)
 
 
 class RunMetrics:
@@ -88,7 +76,7 @@ class RunMetrics:
         """Args: on_change, called after each state that is shown."""
         self._on_change = on_change
         self._run = str(run.absolute())
-        self._gauges = {name: Gauge(name, text, TAGS) for name, text in GAUGES.items()}
+        self._gauges = {name: Gauge(name, text, TAGS) for name, (_, text) in GAUGES.items()}
         self._counters = {name: Counter(name, text, TAGS) for name, text in COUNTERS.items()}
         self._exported = -_INTERVAL
 

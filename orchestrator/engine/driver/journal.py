@@ -124,6 +124,8 @@ class Journal:
         self.patience: Patience | None = None  # without one every error is raised at once
         self.clock = clock or Steady()
         self._backlog = Backlog(database, self.clock)
+        self.why = ""  # nothing can run, see `explain`
+        self._idle = 0.0  # Clock.monotonic() of that
         self._since: float | None = None  # Clock.monotonic() from which on the disk has taken nothing
 
     def record(self, records: Sequence[Record]) -> None:
@@ -135,6 +137,15 @@ class Journal:
         if stored:
             self.state = apply(self.state, stored)
         self.on_change(self.state, stored)
+
+    def explain(self, why: str) -> None:
+        """Records that nothing can run, and why, or with "" that something does; if that is new."""
+        if why == self.why:
+            return
+        now = self.clock.monotonic()
+        self._idle = self._idle if self.why else now
+        self.why = why
+        self.record([RunWaiting(why) if why else RunContinued(now - self._idle)])
 
     def show_step(self, step: str) -> None:
         """Shows what the driver does before its first task; in the database is only that it has begun."""

@@ -14,7 +14,7 @@ from panolog.orchestrator.engine.scheduling.scaling import IDLE_S, Growth, Work
 from panolog.orchestrator.runs.clock import Clock
 from panolog.orchestrator.runs.machines.nodes import Node
 from panolog.orchestrator.runs.money.prices import of_record, price_by
-from panolog.orchestrator.runs.records import NodeLeaving, Noticed, Record, RunContinued, RunWaiting
+from panolog.orchestrator.runs.records import NodeLeaving, Noticed
 
 _NAMED = 6  # paused blocks that are named one by one
 
@@ -28,8 +28,6 @@ class Machines:
         self._config = job.config
         self._clock = clock
         self._expected = Expected(clock, basis_of(job.folder, job.scene, job.config).joined)
-        self._waits = ""  # why nothing runs, as it was recorded last
-        self._since = 0.0  # Clock.monotonic() of that
 
     @property
     def _cuda(self) -> bool:
@@ -71,7 +69,7 @@ class Machines:
         every, busy = [*nodes, *come.nodes], [*running, *come.fill]
         placed = placement.place(waiting, every, busy, cuda=self._cuda)
         idle = not placed and not running
-        self._explain(self._why(growth, waits=bool(waiting)) if idle else "")
+        self._journal.explain(self._why(growth, waits=bool(waiting)) if idle else "")
         return placed
 
     @property
@@ -82,7 +80,7 @@ class Machines:
     @property
     def expecting(self) -> bool:
         """Whether machines have been requested that are not there yet, or one is needed."""
-        return bool(self._expected.since or self._waits)
+        return bool(self._expected.since or self._journal.why)
 
     def _grow(self, growth: Growth, work: Work, running: Sequence[Running], nodes: Sequence[Node]) -> Coming:
         """Requests what a stage should have besides, and returns what is coming."""
@@ -120,16 +118,6 @@ class Machines:
         texts = {group.name: group.text() for group in growth.groups}
         names = ", ".join(f"{len(times)} of {texts[name]}" for name, times in since.items())
         return f"waiting for machines: {names}, requested from Ray's autoscaler at {when}{growth.report}"
-
-    def _explain(self, why: str) -> None:
-        """Records that nothing runs, and why, or that something does again."""
-        if why == self._waits:
-            return
-        now = self._clock.monotonic()
-        self._since = self._since if self._waits else now
-        self._waits = why
-        record: Record = RunWaiting(why) if why else RunContinued(now - self._since)
-        self._journal.record([record])
 
     def _review_leaving(self, there: Sequence[Node], able: Sequence[Node]) -> bool:
         records = leaving.changes(self._journal.state, there, self._pool.notices())

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import cv2
@@ -16,6 +15,7 @@ import numpy as np
 
 from panolog.orchestrator.runs.folder import RunFolder, command_line, write_json
 from panolog.orchestrator.runs.records import MeasuresSaved
+from panolog.orchestrator.runs.units import means
 from panolog.scene.errors import RunError
 from panolog.scene.files import write_bytes
 from panolog.scene.images import load_view
@@ -145,12 +145,3 @@ def _save_pictures(folder: Path, pictures: Mapping[str, bytes]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in pictures.items():
         write_bytes(folder / name, content)
-
-
-def means(views: Iterable[Mapping[str, float | None]]) -> Metrics:
-    """The mean of each metric over the views that have it; None where none has."""
-    values: dict[str, list[float]] = {}
-    for metrics in views:
-        for name, value in metrics.items():
-            values.setdefault(name, []).extend([] if value is None else [value])
-    return {name: fmean(numbers) if numbers else None for name, numbers in values.items()}

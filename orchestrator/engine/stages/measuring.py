@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import command_line
 from panolog.prepare.check.bundle import MENDS, adjust
-from panolog.prepare.check.exposure import DIFFERS, describe, measure_exposures
+from panolog.prepare.check.exposure import describe, differing_exposures, measure_exposures
 from panolog.prepare.check.misplaced import find_misplaced
 from panolog.prepare.check.residuals import describe as describe_residuals
 from panolog.prepare.check.residuals import read_tracks
@@ -84,8 +84,8 @@ class Measuring:
         if learn is False:
             return None
         self._doing("measuring exposures")
-        found = measure_exposures(self._scene, rows)
-        if found is None or (learn == "auto" and found.spread < DIFFERS):
+        measure = differing_exposures if learn == "auto" else measure_exposures
+        if (found := measure(self._scene, rows)) is None:
             return None
         names = [self._scene.panoramas[row].name for row in rows]
         self._warn(f"{describe(names, found)}; Stage I learns them")

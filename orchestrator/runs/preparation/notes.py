@@ -4,7 +4,7 @@ What is read may be damaged or made to do harm: it is bounded, and what is not o
 missing.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.orchestrator.runs.preparation.settings import MOST_BYTES, Step
+from panolog.scene.errors import InputError
 
 _LINES, _LINE = 100, 500  # that a result keeps, characters of each
 _Count = Annotated[int, Field(ge=0, lt=2**53)]
@@ -99,33 +100,19 @@ def shortened(lines: Sequence[str]) -> tuple[str, ...]:
     return tuple(kept)
 
 
-def read_plain(path: Path) -> bytes:
-    """The bytes of a file of a folder that is trusted. Raises OSError if there is none."""
-    with path.open("rb") as file:
-        return file.read(MOST_BYTES + 1)
+def read_progress(folder: RunFolder) -> StepProgress | None:
+    """What is done now; None if that is not known."""
+    return _read(folder, progress_path(folder), StepProgress)
 
 
-def read_progress(folder: RunFolder, read: Callable[[Path], bytes] = read_plain) -> StepProgress | None:
-    """What is done now; None if that is not known. Args: read, returns the bytes of a file."""
-    return _read(progress_path(folder), StepProgress, read)
-
-
-def read_result(
-    folder: RunFolder, step: Step, read: Callable[[Path], bytes] = read_plain
-) -> StepResult | None:
+def read_result(folder: RunFolder, step: Step) -> StepResult | None:
     """The result of a step; None if it is not done."""
-    found = _read(result_path(folder, step), StepResult, read)
+    found = _read(folder, result_path(folder, step), StepResult)
     return found if found is not None and found.step is step else None
 
 
-def _read(path: Path, kind: type[_Note], read: Callable[[Path], bytes]) -> _Note | None:
+def _read(folder: RunFolder, path: Path, kind: type[_Note]) -> _Note | None:
     try:
-        content = read(path)
-    except OSError:
-        return None
-    if len(content) > MOST_BYTES:
-        return None
-    try:
-        return kind.model_validate_json(content)
-    except ValidationError:
+        return kind.model_validate_json(folder.read(path, MOST_BYTES))
+    except (InputError, ValidationError):
         return None

@@ -1,6 +1,5 @@
 """RUN/prepare/settings.json: of what a run makes its scene, and how. Written before the first step begins."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -8,7 +7,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.scene.errors import RunFolderError
+from panolog.scene.errors import InputError, RunFolderError
 from panolog.workers.tasks import StrEnum
 
 NADIR = (
@@ -44,6 +43,7 @@ class Options(BaseModel):
         default=None, ge=0, le=90, description="degrees around straight down; 0 = none"
     )
     static: bool | None = Field(default=None, description="mask what is the same in all panoramas")
+    mask_model: str | None = Field(default=None, description="ONNX network; its manifest is next to it")
     depth_model: str | None = Field(default=None, description="ONNX network; its manifest is next to it")
 
     @field_validator("sfm")
@@ -77,7 +77,8 @@ class Settings(Options):
 
     def steps(self) -> tuple[Step, ...]:
         """Those that there are, in order."""
-        wanted = {Step.MASKS: bool(self.nadir or self.static), Step.DEPTH: self.depth_model is not None}
+        masks = bool(self.nadir or self.static or self.mask_model)
+        wanted = {Step.MASKS: masks, Step.DEPTH: self.depth_model is not None}
         return tuple(step for step in Step if wanted.get(step, True))
 
     def of(self, step: Step) -> dict[str, Any]:
@@ -86,7 +87,8 @@ class Settings(Options):
             case Step.SFM:
                 return {"source": self.source, **({"others": self.others} if self.others else {}), **self.sfm}
             case Step.MASKS:
-                return {"nadir": self.nadir, "static": self.static}
+                network = {"model": self.mask_model} if self.mask_model else {}
+                return {"nadir": self.nadir, "static": self.static, **network}
             case Step.DEPTH:
                 return {"model": self.depth_model}
         return {}
@@ -107,27 +109,14 @@ def read_settings(folder: RunFolder) -> Settings | None:
     Raises RunFolderError if they cannot be read or are of another format.
     """
     path = settings_path(folder)
-    try:
-        with path.open("rb") as file:
-            content = file.read(MOST_BYTES + 1)
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except OSError as error:
-        raise RunFolderError(f"{path}: cannot be read: {error.strerror}") from error
-    settings = parse_settings(content)
-    if settings is None:
-        raise RunFolderError(f"{path}: is not of this PanoLOG's format; start a new run")
-    return settings
-
-
-def parse_settings(content: bytes) -> Settings | None:
-    """The settings from the bytes of their file; None if they are of another format."""
-    if len(content) > MOST_BYTES:
+    if not path.exists():
         return None
     try:
-        return Settings.model_validate(json.loads(content))
-    except (ValidationError, ValueError, RecursionError):
-        return None
+        return Settings.model_validate_json(folder.read(path, MOST_BYTES))
+    except InputError as error:
+        raise RunFolderError(f"{path.parent}/{error}") from error
+    except ValidationError as error:
+        raise RunFolderError(f"{path}: is not of this PanoLOG's format; start a new run") from error
 
 
 def as_arguments(options: Options) -> Iterator[str]:
@@ -148,5 +137,6 @@ def as_arguments(options: Options) -> Iterator[str]:
         yield from ("--nadir", str(options.nadir))
     if options.static is not None:
         yield "--static" if options.static else "--no-static"
-    if options.depth_model is not None:
-        yield from ("--depth-model", options.depth_model)
+    for what, model in {"--mask-model": options.mask_model, "--depth-model": options.depth_model}.items():
+        if model is not None:
+            yield from (what, model)

@@ -15,11 +15,9 @@ from panolog.orchestrator.runs.retention.survey import (
     Removal,
     Survey,
     Wanted,
-    models_of_parts,
     remove,
     survey,
 )
-from panolog.orchestrator.runs.state import RunState
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.runs.units import DURATION, gib, seconds_of
 from panolog.scene.errors import ConfigError, PanologError, RunLockedError, in_one_line
@@ -89,7 +87,9 @@ def _of_run(root: Path, wanted: Wanted, *, dry: bool) -> Survey:
             return found
         with lock.hold(RunFolder(root).lock):
             found = survey(root, wanted, time.time(), ours=True)  # it may have gone on before
-            remove_all(RunFolder(root), found.removals)
+            if notice := remove_all(RunFolder(root), found.removals):
+                with closing(Database(RunFolder(root).database)) as database:
+                    database.append([notice])
         return found
     except RunLockedError:
         return Survey(root, skipped="a driver is at work on it")
@@ -97,36 +97,18 @@ def _of_run(root: Path, wanted: Wanted, *, dry: bool) -> Survey:
         return Survey(root, skipped=in_one_line(error), failed=True)
 
 
-def remove_all(folder: RunFolder, removals: Sequence[Removal]) -> None:
-    """Removes what was found of a run. The caller has its lock.
+def remove_all(folder: RunFolder, removals: Sequence[Removal]) -> Noticed | None:
+    """Removes what was found of a run, whose lock the caller has. Returns what its history should say.
 
     Models are named in RUN/retention.json before they are removed, so that a reader of a model that is
-    missing knows why, and in the run's history afterwards.
+    missing knows why. Raises OSError if that is impossible.
     """
-    _name_models(folder, removals)
-    for removal in removals:
-        remove(removal)
-    if notice := _notice(removals):
-        with closing(Database(folder.database)) as database:
-            database.append([notice])
-
-
-def remove_models(folder: RunFolder, state: RunState) -> Noticed | None:
-    """Removes the models of parts of a run that is done, by its driver. Returns what its history should say.
-
-    Raises OSError if that is impossible.
-    """
-    removals = models_of_parts(folder, state)
-    _name_models(folder, removals)
-    for removal in removals:
-        remove(removal)
-    return _notice(removals)
-
-
-def _name_models(folder: RunFolder, removals: Sequence[Removal]) -> None:
     names = {str(it.task) for it in removals if it.kind == Kind.MODELS}
     if names:
         write_json(folder.retention, {"removed_models": sorted(names | removed_models(folder))})
+    for removal in removals:
+        remove(removal)
+    return _notice(removals)
 
 
 def _notice(removals: Sequence[Removal]) -> Noticed | None:

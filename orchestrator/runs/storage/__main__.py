@@ -16,7 +16,7 @@ from panolog.orchestrator.runs.storage.fetch import bring
 from panolog.orchestrator.runs.storage.layout import Manifest, current
 from panolog.orchestrator.runs.storage.lease import Lease, take
 from panolog.orchestrator.runs.storage.mirror import Mirror
-from panolog.orchestrator.runs.storage.plan import MirrorPlan, plan_from_json
+from panolog.orchestrator.runs.storage.plan import MIRROR_PLAN, MirrorPlan
 from panolog.orchestrator.runs.units import gib
 from panolog.scene.errors import (
     InputError,
@@ -37,7 +37,7 @@ def main() -> None:
     line = sys.stdin.readline()
     if not line.endswith("\n"):  # its parent has ended before
         return
-    plan = plan_from_json(line)
+    plan = MIRROR_PLAN.validate_json(line)
     ended, stop = threading.Event(), threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})  # blocked where another one was killed

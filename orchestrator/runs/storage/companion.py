@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from panolog.orchestrator.runs.machines.children import ENDS, Companion, start_companion
-from panolog.orchestrator.runs.storage.plan import MirrorPlan, to_json
+from panolog.orchestrator.runs.storage.plan import MIRROR_PLAN, MirrorPlan
 from panolog.scene.errors import RunError, StoreError
 
 _AGAIN_S, _LONGEST_S = 10.0, 600.0  # before a mirror that was killed is started again: first, at most
@@ -132,4 +132,4 @@ def _started(plan: MirrorPlan, *, again: bool = False) -> Companion:
     """The process of a mirror. Args: again, in place of one that was killed."""
     if again:
         plan = replace(plan, again=True, force=False)
-    return start_companion("panolog.orchestrator.runs.storage", to_json(plan))
+    return start_companion("panolog.orchestrator.runs.storage", MIRROR_PLAN.dump_json(plan).decode())

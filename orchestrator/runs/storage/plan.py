@@ -1,11 +1,12 @@
 """Where a run in a store is on this machine, and what its mirror gets: on stdin, without a secret."""
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+
+from pydantic import TypeAdapter
 
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.storage.state import read_state
@@ -33,6 +34,9 @@ class MirrorPlan:
     patience: float = (
         60 * _PATIENCE_MIN
     )  # seconds without progress after the end of the run, before it gives up
+
+
+MIRROR_PLAN = TypeAdapter(MirrorPlan)  # from and to the line of JSON that the mirror gets
 
 
 def plan_of(
@@ -67,15 +71,6 @@ def local_folder(url: str, environment: Mapping[str, str]) -> Path:
     """The folder on this machine of a run in a store: always the same for the same URL."""
     name = f"{parse_url(url).name[:40]}-{sha256(url.encode()).hexdigest()[:12]}"
     return cache_folder(environment).with_name("runs") / name
-
-
-def to_json(plan: MirrorPlan) -> str:
-    return json.dumps({**vars(plan), "root": str(plan.root)})
-
-
-def plan_from_json(text: str) -> MirrorPlan:
-    content = json.loads(text)
-    return MirrorPlan(**content | {"root": Path(content["root"])})
 
 
 def shown(root: Path) -> str:

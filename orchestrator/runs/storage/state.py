@@ -1,11 +1,11 @@
 """RUN/store/state.json: how far a run in an object store has been copied out, for all that show it."""
 
-import json
 import time
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from panolog.orchestrator.runs.folder import read_object
 from panolog.orchestrator.runs.units import duration, gib
@@ -56,11 +56,14 @@ class MirrorState:
         return bool(self.problem) or (not self.complete and self.lag > _LATE_S)
 
 
+_FILE = TypeAdapter(MirrorState)
+
+
 def write_state(path: Path, state: MirrorState) -> None:
     """Leaves the state. A full disk changes nothing: the driver reports that."""
     with suppress(OSError):
         path.parent.mkdir(exist_ok=True)
-        write_bytes(path, json.dumps(asdict(state) | {"time": time.time()}).encode())
+        write_bytes(path, _FILE.dump_json(replace(state, time=time.time())))
 
 
 def read_state(path: Path, *, running: bool = False) -> MirrorState | None:
@@ -68,24 +71,10 @@ def read_state(path: Path, *, running: bool = False) -> MirrorState | None:
 
     Args: running, whether a driver is at work: then a mirror that is silent is a problem.
     """
-    content = read_object(path, _MOST)
-    kinds = {name: str(field.type) for name, field in MirrorState.__dataclass_fields__.items()}
     try:
-        given = {name: _plain(content[name], kind) for name, kind in kinds.items() if name in content}
-        state = MirrorState(**given)
-    except (ValueError, TypeError, OverflowError):  # the URL is missing, or a value is of another type
+        state = _FILE.validate_python(read_object(path, _MOST))
+    except ValidationError:  # the URL is missing, or a value is of another type
         return None
     if running and not state.complete and time.time() - state.time > _SILENT_S:
-        return MirrorState(**(asdict(state) | {"problem": "the mirror has ended; resume the run"}))
+        return replace(state, problem="the mirror has ended; resume the run")
     return state
-
-
-def _plain(value: Any, kind: str) -> Any:
-    """A value of the file as its field's type. Raises TypeError for any other."""
-    if "float" in kind:
-        return float(value)
-    if "int" in kind:
-        return int(value)
-    if not isinstance(value, bool if "bool" in kind else str):
-        raise TypeError(kind)
-    return value

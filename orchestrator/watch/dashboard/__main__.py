@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from threading import Thread
 
-from panolog.orchestrator.watch.dashboard import server
+from panolog.orchestrator.watch.dashboard import guard
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 
 _HOST = "127.0.0.1"
@@ -24,11 +24,13 @@ def _end_with_input() -> None:
 
 
 def main(run: Path) -> None:
-    """Serves until standard input ends."""
-    listener = server.listen(_HOST, 0)
-    url = server.address(listener, _HOST, None)
+    """Serves until standard input ends. Who opens the URL at once waits for the rest of the imports."""
+    listener = guard.listen(_HOST, 0)
+    url = guard.address(listener, _HOST, None)
     print(f"{url}runs/{RunEntry(run, '.').id}", flush=True)
     Thread(target=_end_with_input, daemon=True).start()
+    from panolog.orchestrator.watch.dashboard import server  # noqa: PLC0415
+
     server.serve(run, listener, None)
 
 

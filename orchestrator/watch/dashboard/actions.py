@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs.folder import command_line
 from panolog.orchestrator.runs.info import read_info
-from panolog.orchestrator.runs.preparation.settings import MOST_BYTES, parse_settings, settings_path
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, read_below
+from panolog.orchestrator.runs.preparation.settings import read_settings
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.dashboard.messages import Actions
 from panolog.orchestrator.watch.views.history import History
 from panolog.scene.errors import InputError
@@ -109,16 +109,15 @@ def _resume(entry: RunEntry) -> ResumedDriver:
 def _makes_its_scene(entry: RunEntry) -> bool:
     """Whether the run was given panoramas or a video."""
     try:
-        content = read_below(settings_path(entry.folder), entry.folder.root, MOST_BYTES)
+        return read_settings(entry.folder) is not None
     except InputError:
         return False
-    return parse_settings(content) is not None
 
 
 def _last_line(entry: RunEntry) -> str:
     """The last line of a driver's output."""
     try:
-        text = read_below(entry.folder.root / _LOG, entry.folder.root, _TAIL).decode(errors="replace")
+        text = entry.folder.read(entry.folder.root / _LOG, _TAIL).decode(errors="replace")
     except InputError:
         return f"see {_LOG}"
     lines = text.split("\n")

@@ -55,14 +55,17 @@ A POST needs `X-PanoLOG: 1` and the content type application/json.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import Response, StreamingResponse
 from pydantic import Field
 
-from panolog.orchestrator.watch.dashboard import maps, pictures, stream
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.watch.dashboard import pictures, stream
 from panolog.orchestrator.watch.dashboard.dependencies import (
     Body,
     ComparedRuns,
@@ -75,8 +78,6 @@ from panolog.orchestrator.watch.dashboard.dependencies import (
     respond,
     respond_json,
 )
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, read_below
-from panolog.orchestrator.watch.dashboard.messages import CameraView
 from panolog.orchestrator.watch.dashboard.queues.panel import QueueAction
 from panolog.orchestrator.watch.dashboard.responses import (
     json_response,
@@ -90,13 +91,25 @@ from panolog.orchestrator.watch.views.comparison.compare import compare
 from panolog.orchestrator.watch.views.comparison.curves import curves_of
 from panolog.orchestrator.watch.views.comparison.reading import ReadRun, UnreadRun
 from panolog.orchestrator.watch.views.comparison.schema import Comparison
-from panolog.orchestrator.watch.views.exposures import MOST_BYTES, ExposureCurve, exposure_curve
+from panolog.orchestrator.watch.views.exposures import exposure_curve
 from panolog.orchestrator.watch.views.pages.encoding import encode
+from panolog.orchestrator.watch.views.pages.findings import read_findings
+from panolog.orchestrator.watch.views.plan_page import (
+    BlockCameras,
+    CameraView,
+    cameras_of,
+    map_of,
+    plan_of,
+    scores_of,
+    view_camera,
+)
 from panolog.scene.errors import InputError
 from panolog.scene.stores.outline import local_folder, made_here
 from panolog.scene.stores.url import is_url
+from panolog.workers.tasks import COARSE
 
 router = APIRouter()
+_one_map = Lock()  # one is made at a time
 _EventId = Annotated[int, Field(ge=0, lt=2**63)]
 
 
@@ -132,8 +145,7 @@ async def get_run(request: Request, registry: Registry, run: Run) -> Response:
 @router.get("/api/runs/{id}/map")
 async def get_map(request: Request, run: Run) -> Response:
     """Its plan from above."""
-    cache: maps.MapCache = request.app.state.maps
-    return await respond(request, 404, lambda: json_response(request, cache.map_of(run.entry)))
+    return await respond(request, 404, lambda: json_response(request, encoded_map(run.entry.folder)))
 
 
 @router.get("/api/runs/{id}/camera/{row}")
@@ -145,37 +157,53 @@ async def get_camera(request: Request, run: Run, row: int) -> Response:
 @router.get("/api/runs/{id}/camera/{row}/panorama")
 async def get_panorama(request: Request, run: Run, row: int) -> Response:
     """Its picture."""
-    return await respond(request, 404, _panorama, request.app.state.panoramas, run, row)
+    return await respond(request, 404, _panorama, run, row)
 
 
 @router.get("/api/runs/{id}/block/{number}")
 async def get_block(request: Request, run: Run, number: int) -> Response:
     """The cameras of a block of its plan."""
-    return await respond_json(request, maps.cameras_of, run.entry, number, status=404)
+    return await respond_json(request, _block, run, number, status=404)
 
 
-def _exposure_curve(entry: RunEntry) -> ExposureCurve | None:
-    return exposure_curve(entry.folder, lambda path: read_below(path, entry.folder.root, MOST_BYTES))
+def encoded_map(folder: RunFolder) -> bytes:
+    """The map from above, as JSON, kept as long as it stays as it is; pages draw the status of blocks.
+
+    Raises InputError if there is no plan yet or it cannot be read.
+    """
+    outlined = (folder.outline_points, folder.outline_fixes)
+    files = (folder.known_plan, folder.model(COARSE), *outlined, folder.seams)
+    stats = [path.stat() for path in files if path.exists()]
+    with _one_map:
+        return _encoded(folder, tuple((stat.st_mtime_ns, stat.st_size) for stat in stats))
+
+
+@lru_cache(maxsize=4)  # of about a megabyte each
+def _encoded(folder: RunFolder, _: tuple[tuple[int, int], ...]) -> bytes:
+    return encode(map_of(folder))
+
+
+def _block(run: Watch, number: int) -> BlockCameras | None:
+    return cameras_of(plan_of(run.entry.folder), number)
 
 
 def _camera_view(run: Watch, row: int) -> CameraView | None:
-    found = maps.scored_camera_of(run.entry, row)
-    if found is None:
+    plan, why = plan_of(run.entry.folder), None
+    if row not in plan.rows:
         return None
-    camera, scores = found
+    k = plan.rows.index(row)
     try:
-        pictures.open_panorama(scene_of(run), camera.name).close()
-        why = None
+        pictures.open_panorama(scene_of(run), plan.names[k]).close()
     except InputError as error:
         why = str(error)
-    return CameraView(**camera.model_dump(exclude={"center"}), scores=scores, no_picture=why)
+    return view_camera(plan, k, scores_of(run.entry.folder, plan), why)
 
 
-def _panorama(cache: pictures.PanoramaCache, run: Watch, row: int) -> Response:
-    camera = maps.camera_of(run.entry, row)
-    if camera is None:
+def _panorama(run: Watch, row: int) -> Response:
+    plan = plan_of(run.entry.folder)
+    if row not in plan.rows:
         raise InputError("the plan of this run has no such panorama")
-    return cache.small(scene_of(run), camera.name)
+    return pictures.panorama(scene_of(run), plan.names[plan.rows.index(row)])
 
 
 def scene_of(run: Watch) -> Path:
@@ -259,13 +287,13 @@ async def get_preparation_picture(request: Request, run: Run, name: str) -> Resp
 @router.get("/api/runs/{id}/exposure")
 async def get_exposure(request: Request, run: Run) -> Response:
     """How bright each training panorama is."""
-    return await respond_json(request, _exposure_curve, run.entry, status=404)
+    return await respond_json(request, exposure_curve, run.entry.folder, status=404)
 
 
 @router.get("/api/runs/{id}/findings")
 async def get_findings(request: Request, run: Run) -> Response:
     """What was measured."""
-    return await respond_json(request, pictures.findings, run.entry, status=404)
+    return await respond_json(request, read_findings, run.entry.folder, status=404)
 
 
 @router.get("/api/runs/{id}/findings/{name}")
@@ -307,7 +335,10 @@ async def get_compared_curves(request: Request, runs: ComparedRuns) -> Response:
 def _comparison(runs: Sequence[Watch | UnreadRun]) -> Comparison:
     """The comparison with the URLs of its pictures."""
     found = [read_watch(run) for run in runs]
-    numbers = {run.id: pictures.numbers(run.folder.database) for run in found if isinstance(run, ReadRun)}
+    views = {
+        run.id: pictures.views(run.folder.database)["views"] for run in found if isinstance(run, ReadRun)
+    }
+    numbers = {id: {view["name"]: view["number"] for view in every} for id, every in views.items()}
 
     def url(run: ReadRun, view: str) -> str | None:
         number = numbers[run.id].get(view)
@@ -317,13 +348,16 @@ def _comparison(runs: Sequence[Watch | UnreadRun]) -> Comparison:
 
 
 @router.get("/api/stream")
-async def get_stream(registry: Registry, run: str | None = None, changes: bool = False) -> Response:
+async def get_stream(
+    request: Request, registry: Registry, run: str | None = None, changes: bool = False
+) -> Response:
     """The list or a run, again whenever it has changed."""
     if run is None:
         messages = stream.runs(registry)
     else:
         watch, topic = await find_run(registry, run)
-        messages = stream.run(registry, watch, topic, changes=changes)
+        begin = request.app.state.pages.begin
+        messages = stream.run(registry, watch, topic, begin, changes=changes)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     return StreamingResponse(messages, 200, headers, "text/event-stream")
 

@@ -8,11 +8,10 @@ from fastapi import Depends, HTTPException, Query, Request
 from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from panolog.orchestrator.watch.dashboard.discovery import read_below
 from panolog.orchestrator.watch.dashboard.registry import RunRegistry, Topic
 from panolog.orchestrator.watch.dashboard.responses import json_response
 from panolog.orchestrator.watch.dashboard.watch import UNREADABLE, Watch, error_line
-from panolog.orchestrator.watch.views.comparison.measured import MOST_BYTES, parse_measured
+from panolog.orchestrator.watch.views.comparison.measured import read_measured
 from panolog.orchestrator.watch.views.comparison.reading import ReadRun, UnreadRun
 from panolog.orchestrator.watch.views.comparison.schema import MOST
 from panolog.orchestrator.watch.views.pages.encoding import encode
@@ -88,8 +87,7 @@ def read_watch(run: Watch | UnreadRun) -> ReadRun | UnreadRun:
         return UnreadRun(entry.id, entry.name, snapshot.row.error or "it cannot be read")
     folder, measured, problem = entry.folder, None, ""
     try:
-        if folder.metrics.exists():
-            measured = parse_measured(folder.metrics, read_below(folder.metrics, folder.root, MOST_BYTES))
+        measured = read_measured(folder)
     except UNREADABLE as error:
         problem = error_line(error, folder.root)
     return ReadRun(entry.id, entry.name, folder, snapshot.page, state, measured, problem)

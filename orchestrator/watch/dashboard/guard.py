@@ -13,13 +13,14 @@ import hashlib
 import ipaddress
 import os
 import secrets
+import socket
 from collections.abc import Callable
 from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import HTTPConnection
 from starlette.responses import HTMLResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -28,6 +29,7 @@ from panolog.orchestrator.watch.views.pages.shell import LIVE_IMPORTS
 from panolog.scene.errors import InputError
 from panolog.scene.files import user_folder
 
+_SEND_TIMEOUT_MS = 60_000  # after which a client that reads nothing is disconnected
 _LOCAL = {"localhost", "127.0.0.1", "[::1]"}
 _SAFE = {"GET", "HEAD"}
 _OWN_HEADER = "x-panolog"  # a header that no other site can send without being allowed to
@@ -132,15 +134,20 @@ class Guard:
 
     def _intercept(self, scope: Scope) -> Response | None:
         """The response in place of the requested one; None if the request may pass."""
-        headers, token = Headers(scope=scope), self._access.token
+        request, token = HTTPConnection(scope), self._access.token
+        headers = request.headers
         if token is None:
             host = headers.get("host", "").lower()
             name = host if host.endswith("]") else host.rpartition(":")[0] or host
             if name not in _LOCAL:
                 return _refuse("this dashboard can be reached as localhost only")
-        elif (given := _token_of(scope)) is not None and _same(given, token):
+        elif (
+            scope["path"] == "/"
+            and scope["method"] in _SAFE
+            and _same(request.query_params.get("token"), token)
+        ):
             return self._set_cookie(token)
-        elif not (self._has_token(headers, token) or self._granted(scope["path"])):
+        elif not (self._has_token(request, token) or self._granted(scope["path"])):
             return _refuse("open the address with the token that `panolog dashboard` has printed")
         if scope["method"] not in _SAFE and not _is_ours(headers):
             return _refuse("this request came from another site")
@@ -153,28 +160,15 @@ class Guard:
         )
         return answer
 
-    def _has_token(self, headers: Headers, token: str) -> bool:
-        kind, _, bearer = headers.get("authorization", "").partition(" ")
-        if kind.lower() == "bearer" and _same(bearer.strip(), token):
-            return True
-        try:
-            morsel = SimpleCookie(headers.get("cookie", "")).get(self._access.cookie)
-        except CookieError:
-            return False
-        return morsel is not None and _same(morsel.value, token)
+    def _has_token(self, request: HTTPConnection, token: str) -> bool:
+        kind, _, bearer = request.headers.get("authorization", "").partition(" ")
+        bearer = bearer.strip() if kind.lower() == "bearer" else ""
+        return _same(bearer, token) or _same(request.cookies.get(self._access.cookie), token)
 
 
-def _token_of(scope: Scope) -> str | None:
-    """The token in the query, which only the first page accepts."""
-    if scope["path"] != "/" or scope["method"] not in _SAFE:
-        return None
-    values: list[str] = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
-    return values[0] if values else None
-
-
-def _same(given: str, token: str) -> bool:
+def _same(given: str | None, token: str) -> bool:
     """Compares in constant time."""
-    return secrets.compare_digest(given.encode(), token.encode())
+    return secrets.compare_digest((given or "").encode(errors="replace"), token.encode())
 
 
 def _is_ours(headers: Headers) -> bool:
@@ -190,3 +184,31 @@ def _is_ours(headers: Headers) -> bool:
 
 def _refuse(line: str) -> Response:
     return Response(encode({"error": line}), 403, {"Cache-Control": "no-store"}, "application/json")
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket; port 0 for a free one. Raises InputError if the address cannot be used."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    # With the protocol: only then does asyncio know that it is TCP and turn Nagle's algorithm off.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener.setsockopt(
+        socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _SEND_TIMEOUT_MS
+    )  # connections inherit it
+    try:
+        listener.bind((host, port))
+    except (OSError, OverflowError) as error:
+        listener.close()
+        why = getattr(error, "strerror", None) or str(error)
+        raise InputError(
+            f"{host}:{port}: cannot listen there: {why}; choose another --host or --port"
+        ) from error
+    listener.listen(socket.SOMAXCONN)
+    return listener
+
+
+def address(listener: socket.socket, host: str, token: str | None) -> str:
+    """The URL to open."""
+    name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
+    name = f"[{name}]" if ":" in name else name
+    return f"http://{name}:{listener.getsockname()[1]}/" + (f"?token={token}" if token else "")

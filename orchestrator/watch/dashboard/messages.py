@@ -10,9 +10,9 @@ from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.views.comparison.schema import Comparison, CurvesOfRuns
 from panolog.orchestrator.watch.views.exposures import ExposureCurve
 from panolog.orchestrator.watch.views.pages.findings import Findings
+from panolog.orchestrator.watch.views.plan_page import BlockCameras, CameraView
 from panolog.orchestrator.watch.views.run_view import LiveView, RunView
 from panolog.orchestrator.watch.views.summary import STAGES, SummaryHead, TaskView, Text, ViewModel
-from panolog.partition.plan_json import Reason
 
 
 class Actions(ViewModel):
@@ -225,35 +225,6 @@ class HeldOutViews(ViewModel):
     """GET …/views."""
 
     views: tuple[HeldOutView, ...]
-
-
-class CameraView(ViewModel):
-    """GET …/camera/{row}: a training panorama of the plan.
-
-    `scores` has one for each block, `assigned` why it trains which of them.
-    """
-
-    row: int
-    name: Text
-    block: int  # that it is in
-    scores: tuple[float, ...]
-    assigned: dict[int, Reason]
-    no_picture: Text | None  # why its panorama cannot be shown
-
-
-class BlockCamera(ViewModel):
-    """A camera that trains a block, and which criterion chose it."""
-
-    row: int
-    name: Text
-    reason: Reason
-
-
-class BlockCameras(ViewModel):
-    """GET …/block/{number}: the cameras that train a block."""
-
-    block: int
-    cameras: tuple[BlockCamera, ...]
 
 
 class Series(ViewModel):

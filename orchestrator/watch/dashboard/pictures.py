@@ -7,7 +7,7 @@ stores only scenes are read that this machine has read before.
 
 import os
 import re
-from collections import OrderedDict
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
@@ -16,10 +16,10 @@ from typing import Any, BinaryIO
 from fastapi import HTTPException
 from fastapi.responses import Response
 
-from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below, opened, read_below
+from panolog.orchestrator.runs.folder import RunFolder, open_below, opened
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.views import queries
-from panolog.orchestrator.watch.views.pages.findings import Findings, finding_pictures, read_findings
+from panolog.orchestrator.watch.views.pages.findings import finding_pictures, read_findings
 from panolog.orchestrator.watch.views.preparation import picture_path
 from panolog.orchestrator.watch.views.site.photographs import STORE_S, require_size, small_copy
 from panolog.scene.errors import InputError, StoreLostError
@@ -28,13 +28,12 @@ from panolog.scene.read import check_names, image_folder, model_folder
 from panolog.scene.stores.outline import made_here, whole
 
 _SIZE = 50_000_000  # bytes of a JPEG at most
-_MEASURED = 200_000_000  # bytes of a file of what was measured at most
 _COVER = 320  # pixels of the width of a run's picture in the list
 _REDUCED = 1024  # pixels of the width of a panorama's copy
-_CACHED = 64  # copies, of some hundred kilobytes each
 _PREVIEW_PATH = re.compile(r"(coarse|(district|blocks|round|repair)/\d{3,9})/previews/\d{6,12}\.jpg")
 _JPEG = b"\xff\xd8\xff"
 _PNG = b"\x89PNG\r\n\x1a\n"
+_one = Lock()  # one copy is made at a time
 _VIEWS = 2_000  # held-out panoramas in the list at most
 
 
@@ -56,7 +55,7 @@ def _removed(folder: RunFolder, event: dict[str, Any]) -> bool:
 
 def views(database: Path) -> dict[str, Any]:
     """The held-out panoramas by name, each with its latest metrics."""
-    events = queries.views(database, _VIEWS)
+    events = queries.views(database, _VIEWS) if database.exists() else []
     latest = {str(event.get("view")): event for event in reversed(events)}
     return {
         "views": [
@@ -66,21 +65,15 @@ def views(database: Path) -> dict[str, Any]:
     }
 
 
-def numbers(database: Path) -> dict[str, int]:
-    """The number of the latest comparison of each held-out panorama: see `view`."""
-    events = queries.views(database, _VIEWS) if database.exists() else []
-    return {str(event.get("view")): event["id"] for event in reversed(events)}
-
-
 def preview(entry: RunEntry, number: int) -> Response:
-    """A preview by the id of its event. Raises InputError if its file is not below the run or no JPEG."""
-    return _jpeg(entry, entry.folder.root / str(_event(entry, number, "PreviewSaved")["path"]))
+    """A preview by the id of its event. Raises InputError if its file is not below the run or no picture."""
+    return _own(entry, entry.folder.root / str(_event(entry, number, "PreviewSaved")["path"]))
 
 
 def view(entry: RunEntry, number: int) -> Response:
     """A comparison by the id of its event. Raises InputError and ValueError as `preview`."""
     name = str(_event(entry, number, "ViewEvaluated")["view"])
-    return _jpeg(entry, entry.folder.picture(name))
+    return _own(entry, entry.folder.picture(name))
 
 
 def cover(entry: RunEntry, number: int) -> Response:
@@ -92,7 +85,7 @@ def cover(entry: RunEntry, number: int) -> Response:
         else entry.folder.root / str(_event(entry, number, "PreviewSaved")["path"])
     )
     with opened(path, entry.folder.root) as file:
-        return _response(small_copy(file, path.name, _COVER, rendered=True))
+        return _response(small_copy(file, path.name, _COVER, "render"))
 
 
 def of_preparation(entry: RunEntry, name: str) -> Response:
@@ -100,21 +93,15 @@ def of_preparation(entry: RunEntry, name: str) -> Response:
     return _own(entry, picture_path(entry.folder, name))
 
 
-def findings(entry: RunEntry) -> Findings:
-    """What was measured of a run. Raises InputError if a file is damaged or not below the run."""
-    folder = entry.folder
-    return read_findings(folder, lambda path: read_below(path, folder.root, _MEASURED))
-
-
 def of_findings(entry: RunEntry, name: str) -> Response:
-    """A picture of the findings. Raises InputError as `preview` and `findings`."""
-    return _own(entry, finding_pictures(entry.folder, findings(entry)).get(name))
+    """A picture of the findings. Raises InputError as `preview` and `read_findings`."""
+    return _own(entry, finding_pictures(entry.folder, read_findings(entry.folder)).get(name))
 
 
 def _own(entry: RunEntry, path: Path | None) -> Response:
     if path is None:
         raise HTTPException(404, "there is no such picture")
-    data = read_below(path, entry.folder.root, _SIZE)
+    data = entry.folder.read(path, _SIZE)
     for kind, begin in (("jpeg", _JPEG), ("png", _PNG)):
         if data.startswith(begin):
             return Response(data, 200, {"Cache-Control": "private, max-age=60"}, f"image/{kind}")
@@ -126,13 +113,6 @@ def _event(entry: RunEntry, number: int, kind: str) -> dict[str, Any]:
     if event is None:
         raise HTTPException(404, "there is no such picture")
     return event
-
-
-def _jpeg(entry: RunEntry, path: Path) -> Response:
-    data = read_below(path, entry.folder.root, _SIZE)
-    if not data.startswith(_JPEG):
-        raise InputError(f"{path.name}: is not a JPEG")
-    return _response(data)
 
 
 def open_panorama(scene: Path, name: str) -> BinaryIO:
@@ -151,26 +131,21 @@ def open_panorama(scene: Path, name: str) -> BinaryIO:
         raise InputError(f"{name} is missing in {folder}, or a link that leads out of the scene") from error
 
 
-class PanoramaCache:
-    """Small copies of panoramas, the last requested ones; one is made at a time."""
+def panorama(scene: Path, name: str, width: int = _REDUCED) -> Response:
+    """A JPEG of a panorama of a scene, of at most `width` pixels. One is made at a time.
 
-    def __init__(self) -> None:
-        self._copies: OrderedDict[tuple[int, ...], bytes] = OrderedDict()
-        self._lock = Lock()
+    Raises InputError as `open_panorama`, or if it cannot be decoded.
+    """
+    with open_panorama(scene, name) as file, _one:
+        known = os.fstat(file.fileno())
+        version = (known.st_dev, known.st_ino, known.st_mtime_ns, known.st_size)
+        return _response(_small(scene, name, width, version))
 
-    def small(self, scene: Path, name: str, width: int = _REDUCED) -> Response:
-        """A JPEG of a panorama, of at most `width` pixels.
 
-        Raises InputError as `open_panorama`, or if it cannot be decoded.
-        """
-        with open_panorama(scene, name) as file, self._lock:
-            known = os.fstat(file.fileno())
-            key = (known.st_dev, known.st_ino, known.st_mtime_ns, known.st_size, width)
-            copy = self._copies.pop(key, None) or small_copy(_whole(file, scene, name), name, width)
-            self._copies[key] = copy
-            while len(self._copies) > _CACHED:
-                self._copies.popitem(last=False)
-        return _response(copy)
+@lru_cache(maxsize=64)  # of some hundred kilobytes each
+def _small(scene: Path, name: str, width: int, _: tuple[int, ...]) -> bytes:
+    with open_panorama(scene, name) as file:
+        return small_copy(_whole(file, scene, name), name, width)
 
 
 def _whole(file: BinaryIO, scene: Path, name: str) -> BinaryIO:

@@ -8,7 +8,8 @@ from fastapi import Request
 from fastapi.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, by_handle, open_below
+from panolog.orchestrator.runs.folder import by_handle, open_below
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 
 _UNCOMPRESSED = 1_000  # bytes up to which compression is not worth its time
 # A report may come from another person's run: its scripts must not reach the dashboard.

@@ -21,11 +21,9 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from panolog.orchestrator.watch.dashboard.api import router
 from panolog.orchestrator.watch.dashboard.guard import Access, Guard
-from panolog.orchestrator.watch.dashboard.maps import MapCache
 from panolog.orchestrator.watch.dashboard.models.downloads import Downloads
 from panolog.orchestrator.watch.dashboard.models.pages import ModelPages
 from panolog.orchestrator.watch.dashboard.models.routes import router as model_router
-from panolog.orchestrator.watch.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.watch.dashboard.registry import RunRegistry
 from panolog.orchestrator.watch.views.pages.encoding import encode
 from panolog.orchestrator.watch.views.pages.shell import (
@@ -37,9 +35,7 @@ from panolog.orchestrator.watch.views.pages.shell import (
     live_page,
     plotly,
 )
-from panolog.scene.errors import InputError
 
-_SEND_TIMEOUT_MS = 60_000  # after which a client that reads nothing is disconnected
 _REQUEST_TIMEOUT_S = 15.0  # in which a connection must have sent a request
 _MAX_CONNECTIONS = 1_000
 _SHUTDOWN_S = 4  # for open answers and the last messages of streams when the server ends
@@ -61,7 +57,6 @@ def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
     app.state.registry, app.state.pages, app.state.downloads = registry, pages, downloads
-    app.state.maps, app.state.panoramas = MapCache(), PanoramaCache()
     app.include_router(router)
     app.include_router(model_router)
     app.add_api_route("/", _index)
@@ -121,34 +116,6 @@ def _error(_: Request, error: Exception) -> Response:
         if line == HTTPStatus(status).phrase:
             line = line.lower()
     return Response(encode({"error": line}), status, headers, "application/json")
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """A listening socket; port 0 for a free one. Raises InputError if the address cannot be used."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # With the protocol: only then does asyncio know that it is TCP and turn Nagle's algorithm off.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    listener.setsockopt(
-        socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _SEND_TIMEOUT_MS
-    )  # connections inherit it
-    try:
-        listener.bind((host, port))
-    except (OSError, OverflowError) as error:
-        listener.close()
-        why = getattr(error, "strerror", None) or str(error)
-        raise InputError(
-            f"{host}:{port}: cannot listen there: {why}; choose another --host or --port"
-        ) from error
-    listener.listen(socket.SOMAXCONN)
-    return listener
-
-
-def address(listener: socket.socket, host: str, token: str | None) -> str:
-    """The URL to open."""
-    name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
-    name = f"[{name}]" if ":" in name else name
-    return f"http://{name}:{listener.getsockname()[1]}/" + (f"?token={token}" if token else "")
 
 
 class TimeoutProtocol(H11Protocol):

@@ -5,7 +5,7 @@ the moment when it can read. The kernel ends connections whose client has stoppe
 """
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
 
 from panolog.orchestrator.watch.dashboard.registry import RunRegistry, Topic
@@ -34,8 +34,13 @@ async def runs(registry: RunRegistry) -> AsyncIterator[bytes]:
                 yield b": ping\n\n"
 
 
-async def run(registry: RunRegistry, watch: Watch, topic: Topic, *, changes: bool) -> AsyncIterator[bytes]:
-    """One run, whenever it has changed, and its new records."""
+async def run(
+    registry: RunRegistry, watch: Watch, topic: Topic, begin: Callable[[], Awaitable[None]], *, changes: bool
+) -> AsyncIterator[bytes]:
+    """One run, whenever it has changed, and its new records.
+
+    Args: begin, called when its first task trains: what shows its model will be wanted soon.
+    """
     with topic.subscribed():
         await topic.refresh()
         sent, last = -1, watch.snapshot.last
@@ -53,7 +58,9 @@ async def run(registry: RunRegistry, watch: Watch, topic: Topic, *, changes: boo
                 yield message("changes", changes_since)
             else:
                 yield message("run", snapshot.data)
-            sent = snapshot.version
+            sent, page = snapshot.version, snapshot.page
+            if page is not None and watch.running and page.summary.tasks and not page.result.in_3d:
+                await begin()
             if events is not None:
                 yield message("events", events)
             last = max(last, snapshot.last)

@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.runs import lock, presence, reading
-from panolog.orchestrator.runs.folder import RunFolder, shown_model
-from panolog.orchestrator.runs.preparation.settings import MOST_BYTES
-from panolog.orchestrator.runs.records import Progressed, RunBegan, RunEnded, Stored
+from panolog.orchestrator.runs.folder import INFO_BYTES, RunFolder, shown_model
+from panolog.orchestrator.runs.records import RunBegan, RunEnded, Stored
 from panolog.orchestrator.runs.storage.state import read_state
 from panolog.orchestrator.runs.store import as_event, read_milestones, read_news
 from panolog.orchestrator.watch.dashboard import actions
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, read_below, require_plain
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry, require_plain
 from panolog.orchestrator.watch.dashboard.messages import Actions, Results, RunChanges, RunPage, RunRow
 from panolog.orchestrator.watch.views import queries
-from panolog.orchestrator.watch.views.history import History
+from panolog.orchestrator.watch.views.history import History, without_older_progress
 from panolog.orchestrator.watch.views.pages.encoding import encode
 from panolog.orchestrator.watch.views.pages.findings import findings_version
 from panolog.orchestrator.watch.views.preparation import stamp_of, version_of, view_preparation, with_step
@@ -43,7 +42,6 @@ UNREADABLE = (
 _BATCH = 5_000  # records that are applied one by one; after more the state is read anew
 _RECENT = 2_000  # records that are kept for clients that are a little behind
 _UNUSED_S = 60.0  # after which only the row of a run without clients is kept
-_INFO = 1_000_000  # bytes of run.json at most
 _MESSAGE = 200  # records in a message
 _ERROR = 300  # characters of an error at most
 _CHANGING = RunChanges.model_fields.keys() - {"summary", "tasks"}
@@ -88,9 +86,7 @@ class Snapshot:
 
 def latest_events(records: Sequence[Stored]) -> list[dict[str, Any]]:
     """Records for the pages, newest first: of progress only the latest of each task."""
-    latest = {stored.record.task: stored.id for stored in records if isinstance(stored.record, Progressed)}
-    kept = [s for s in records if not isinstance(s.record, Progressed) or latest[s.record.task] == s.id]
-    return [as_event(stored) for stored in kept[: -_MESSAGE - 1 : -1]]
+    return [as_event(stored) for stored in without_older_progress(records)[: -_MESSAGE - 1 : -1]]
 
 
 class Watch:
@@ -180,7 +176,7 @@ class Watch:
         entry, folder = self.entry, self.entry.folder
         require_plain(entry)
         running = lock.held(folder.lock)  # before the records, so that all that an ended driver wrote is read
-        raw = read_below(folder.info, folder.root, _INFO)
+        raw = folder.read(folder.info, INFO_BYTES)
         stamp = _database_stamp(folder.database)
         tasks = self._read_records(stamp)
         available = actions.available_actions(entry, self.history, self.resumed, running=running)
@@ -243,18 +239,13 @@ class Watch:
     ) -> RunPage:
         entry, folder = self.entry, self.entry.folder
         usages = queries.usages(folder.database) if running and folder.database.exists() else {}
-        root = folder.root
-
-        def read(path: Path) -> bytes:
-            return read_below(path, root, MOST_BYTES)
-
-        prepared = view_preparation(folder, self.history.state, running=running, read=read)
+        prepared = view_preparation(folder, self.history.state, running=running)
         history = replace(self.history, state=with_step(self.history.state, prepared))
         view = view_run(
             history,
             info,
             running=running,
-            root=root,
+            root=folder.root,
             usages=usages,
             waiting=waiting,
             preparation=prepared,

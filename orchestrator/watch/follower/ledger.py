@@ -4,11 +4,10 @@ A ledger of another run, as of one whose folder was used before, counts as none.
 """
 
 import json
-import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from panolog.orchestrator.runs.folder import read_object
 from panolog.scene.files import write_bytes
 
 _MOST = 16 * 2**20  # bytes of a file
@@ -21,7 +20,7 @@ class Ledger:
         """Reads the file; one that is damaged counts as none. Args: run, `notifications.run_id`."""
         self._path = path
         self._run = run
-        content = _read(path)
+        content = read_object(path, _MOST)
         self._values = content if content.get("run") == run else {}
 
     @property
@@ -46,13 +45,3 @@ class Ledger:
             write_bytes(self._path, content)
         except FileNotFoundError:  # a driver that begins has removed the temporary file
             write_bytes(self._path, content)
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-        with os.fdopen(handle, "rb") as file:
-            content = json.loads(file.read(_MOST))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return content if isinstance(content, dict) else {}

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from panolog.orchestrator.runs.folder import RunFolder, read_json
+from panolog.orchestrator.runs.folder import RunFolder, flat, read_json
 from panolog.orchestrator.watch.follower.board import Board, News
 from panolog.orchestrator.watch.follower.curves import points
 from panolog.orchestrator.watch.follower.ledger import Ledger
@@ -106,16 +106,10 @@ class Logger(threading.Thread):
 def settings_of(folder: RunFolder) -> dict[str, Value]:
     """The settings of a run by their names such as "sky.count". Raises InputError if run.json is none."""
     content = read_json(folder)
-    found: dict[str, Value] = {}
-
-    def flatten(name: str, value: Any) -> None:
-        if isinstance(value, Mapping):
-            for key, inner in value.items():
-                flatten(f"{name}.{key}" if name else str(key), inner)
-        else:
-            found[name] = value if isinstance(value, str | int | float | bool) else str(value)
-
-    flatten("", content.get("config", {}))
+    found: dict[str, Value] = {
+        name: value if isinstance(value, str | int | float | bool) else str(value)
+        for name, value in flat(content.get("config", {}))
+    }
     for key, value in content.get("versions", {}).items():
         found[f"versions.{key}"] = str(value)
     found["scene"] = str(content.get("scene", {}).get("path", ""))

@@ -1,12 +1,13 @@
 """What a follower is to do, as the command line says it and as its process gets it: on stdin."""
 
-import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import urlsplit
+
+from pydantic import TypeAdapter
 
 from panolog.orchestrator.runs.units import positive
 from panolog.orchestrator.watch.follower.references import References
@@ -76,18 +77,17 @@ def words_elsewhere(notify: Sequence[str], log: Sequence[str]) -> list[str]:
     ]
 
 
+_LINE = TypeAdapter(tuple[Path, int, FollowerPlan])
+
+
 def to_json(plan: FollowerPlan, root: Path) -> str:
     """A plan for the follower of the run at `root`, in one line."""
-    return json.dumps({"root": str(root.absolute()), "parent": os.getpid(), "plan": asdict(plan)})
+    return _LINE.dump_json((root.absolute(), os.getpid(), plan)).decode()
 
 
 def from_json(text: str) -> tuple[Path, int, FollowerPlan]:
     """The run folder, the process that it belongs to, and the plan."""
-    content = json.loads(text)
-    plan = content["plan"]
-    targets = tuple(Target(**fields) for fields in plan["targets"])
-    sinks = tuple(SinkChoice(**fields) for fields in plan["sinks"])
-    return Path(content["root"]), content["parent"], FollowerPlan(targets, sinks, plan["stalled"])
+    return _LINE.validate_json(text)
 
 
 def _once(choices: Sequence[SinkChoice]) -> tuple[SinkChoice, ...]:

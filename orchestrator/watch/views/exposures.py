@@ -1,7 +1,5 @@
 """RUN/exposure.json as a curve: how bright each training panorama is, in their order."""
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -10,7 +8,7 @@ from pydantic import BaseModel, Field, ValidationError
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.watch.views.summary import Text, ViewModel
 
-MOST_BYTES = 20_000_000  # of the file: 50,000 panoramas and more
+_MOST = 20_000_000  # of the file: 50,000 panoramas and more
 _POINTS = 600  # of the curve
 _Gain = Annotated[float, Field(gt=0, lt=1e6)]
 
@@ -35,13 +33,10 @@ class ExposureCurve(ViewModel):
     blue: tuple[float, ...]
 
 
-def exposure_curve(folder: RunFolder, read: Callable[[Path], bytes]) -> ExposureCurve | None:
-    """The curve; None if the file is of another format. Args: read, returns a file's bytes.
-
-    Raises what `read` raises where there is none.
-    """
+def exposure_curve(folder: RunFolder) -> ExposureCurve | None:
+    """The curve; None if the file is of another format. Raises InputError where there is none."""
     try:
-        found = _Content.model_validate_json(read(folder.exposure)).panoramas
+        found = _Content.model_validate_json(folder.read(folder.exposure, _MOST)).panoramas
     except ValidationError:
         return None
     if not found:

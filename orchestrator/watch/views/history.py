@@ -1,20 +1,14 @@
 """A run's state with what pages show beyond it: when stages began and ended, and where tasks run."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from panolog.orchestrator.runs.money.records import BudgetReached, BudgetSet
 from panolog.orchestrator.runs.records import (
-    Delivered,
-    EvaluationSaved,
-    MeasuresSaved,
-    Merged,
-    ModelSaved,
-    PlanSaved,
     PreflightSaved,
     Preparing,
     Progressed,
-    ScoresSaved,
+    Result,
     Stored,
     TaskFailed,
     TaskStarted,
@@ -23,16 +17,6 @@ from panolog.orchestrator.runs.records import (
 from panolog.orchestrator.runs.state import RunState, apply, replay
 from panolog.workers.tasks import Stage, TaskId
 
-_RESULTS = (
-    PreflightSaved,
-    ModelSaved,
-    ScoresSaved,
-    PlanSaved,
-    Merged,
-    MeasuresSaved,
-    EvaluationSaved,
-    Delivered,
-)
 # What follows the training, also one that a limit has ended.
 _FOLLOWING = (Stage.MERGE, Stage.MEASURE, Stage.EVAL, Stage.DELIVER)
 
@@ -67,11 +51,7 @@ class History:
     def add(self, records: Iterable[Stored]) -> set[str]:
         """Adds later records, in order. Returns the tasks that they are about."""
         stored = list(records)
-        progress = {s.record.task: s.id for s in stored if isinstance(s.record, Progressed)}
-        newest = (
-            s for s in stored if not isinstance(s.record, Progressed) or progress[s.record.task] == s.id
-        )
-        self.state = apply(self.state, newest)
+        self.state = apply(self.state, without_older_progress(stored))
         for item in stored:
             self._note(item)
             self.last = item.id
@@ -85,7 +65,7 @@ class History:
         elif isinstance(record, Preparing):
             if self.spans.keys() <= {Stage.PREPARE}:  # else it is a new driver of a run that is past it
                 self._note_preparing(record.task.stage, stored.time)
-        elif isinstance(record, _RESULTS) or (isinstance(record, TaskFailed) and record.final):
+        elif isinstance(record, PreflightSaved | Result) or (isinstance(record, TaskFailed) and record.final):
             span = self.spans.get(record.task.stage) or Span(self._latest_end() or stored.time)
             self.spans[record.task.stage] = replace(span, ended=stored.time)
         elif isinstance(record, BudgetReached):
@@ -110,3 +90,9 @@ class History:
         """When a limit has ended a stage early; None of one that it has not, or that follows."""
         span = self.spans.get(stage)
         return None if span is None or stage in _FOLLOWING else self.limited
+
+
+def without_older_progress(records: Sequence[Stored]) -> list[Stored]:
+    """Records, of progress only the latest of each task."""
+    latest = {stored.record.task: stored.id for stored in records if isinstance(stored.record, Progressed)}
+    return [s for s in records if not isinstance(s.record, Progressed) or latest[s.record.task] == s.id]

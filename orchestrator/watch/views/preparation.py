@@ -1,19 +1,18 @@
 """How far a run is that makes its scene, and what its steps have made: for status, dashboard and report."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.preparation import notes
-from panolog.orchestrator.runs.preparation.notes import Counts, StepProgress, StepResult, read_plain
-from panolog.orchestrator.runs.preparation.settings import Settings, Step, parse_settings, settings_path
+from panolog.orchestrator.runs.preparation.notes import Counts, StepProgress, StepResult
+from panolog.orchestrator.runs.preparation.settings import Step, read_settings, settings_path
 from panolog.orchestrator.runs.state import RunState
 from panolog.orchestrator.watch.views.summary import Text, ViewModel
 from panolog.scene.errors import InputError
 
-Read = Callable[[Path], bytes]  # the bytes of a file; raises OSError or InputError if there is none to read
 STEPS = {Step.MASKS: "masks", Step.SFM: "poses and points", Step.DEPTH: "depth", Step.CHECK: "check"}
 _LINES = 12  # of a step that are shown
 _BEFORE_MASKS = ("frames", "stitching", "metadata", "sizes")  # parts of finding poses
@@ -81,25 +80,19 @@ def stamp_of(folder: RunFolder) -> tuple[object, ...]:
     return tuple(_state(path) for path in files)
 
 
-def view_preparation(
-    folder: RunFolder, state: RunState, *, running: bool, read: Read = read_plain
-) -> PreparationView | None:
+def view_preparation(folder: RunFolder, state: RunState, *, running: bool) -> PreparationView | None:
     """The view of a run's preparation; None of a run that was given a scene, or if that cannot be read.
 
-    Args: running, whether a driver works on the run; read, how its files are read.
+    Args: running, whether a driver works on the run.
     """
-    settings = _settings(folder, read)
+    try:
+        settings = read_settings(folder)
+    except InputError:
+        return None
     if settings is None:
         return None
-
-    def safely(path: Path) -> bytes:
-        try:
-            return read(path)
-        except InputError as error:
-            raise OSError(str(error)) from error
-
-    progress = notes.read_progress(folder, safely)
-    results = {step: notes.read_result(folder, step, safely) for step in settings.steps()}
+    progress = notes.read_progress(folder)
+    results = {step: notes.read_result(folder, step) for step in settings.steps()}
     active = running and state.preparing and not state.prepared
     made = results.get(Step.SFM)
     counts = made.counts if made else None
@@ -141,13 +134,6 @@ def with_step(state: RunState, view: PreparationView | None) -> RunState:
     return replace(
         state, step=str(StepProgress(step=Step(step.name), what=step.what, done=step.done, total=step.total))
     )
-
-
-def _settings(folder: RunFolder, read: Read) -> Settings | None:
-    try:
-        return parse_settings(read(settings_path(folder)))
-    except (OSError, InputError):
-        return None
 
 
 def _step(step: Step, result: StepResult | None, progress: StepProgress | None, active: bool) -> StepView:

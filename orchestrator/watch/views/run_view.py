@@ -7,9 +7,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
-from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
-from panolog.orchestrator.runs.config import RunConfig, flat, keys
+from panolog.orchestrator.runs.config import known_settings
+from panolog.orchestrator.runs.folder import flat
+from panolog.orchestrator.runs.machines.gpus import GpuUsage
 from panolog.orchestrator.runs.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.watch.views.history import History, Span
 from panolog.orchestrator.watch.views.preparation import PreparationView, prepared_share
@@ -47,15 +49,6 @@ class StageView(ViewModel):
     done: int
 
 
-class GpuUsageView(ViewModel):
-    """What a GPU does; `utilization` 0 to 1."""
-
-    name: Text
-    utilization: float | None
-    memory_used: int | None
-    memory_total: int | None
-
-
 class UsageView(ViewModel):
     """What a machine does, measured at `time` in epoch seconds: `cpu` 0 to 1, the disk that the run uses."""
 
@@ -65,7 +58,7 @@ class UsageView(ViewModel):
     memory_total: int
     disk_used: int
     disk_total: int
-    gpus: tuple[GpuUsageView, ...]
+    gpus: tuple[GpuUsage, ...]
 
 
 class NodeView(ViewModel):
@@ -288,7 +281,9 @@ def _settings(info: Mapping[str, Any]) -> tuple[SettingView, ...]:
     """
     values, given = dict(flat(info.get("config") or {})), info.get("given")
     preset = RECIPES.get(values.get("recipe", "paper"), {})
-    fields = {key: (preset.get(key, default), text) for key, (default, text) in map(_field, keys())}
+    fields = {
+        key: (preset.get(key, _default(field)), field.description or "") for key, field in known_settings()
+    }
 
     def changed(key: str) -> bool:
         if key not in fields:
@@ -309,14 +304,7 @@ def _settings(info: Mapping[str, Any]) -> tuple[SettingView, ...]:
     return tuple(sorted(views, key=lambda view: not view.changed))
 
 
-def _field(key: str) -> tuple[str, tuple[Any, str]]:
-    """A setting with its own default, as run.json would have it, and its description."""
-    model: type[BaseModel] = RunConfig
-    *groups, name = key.split(".")
-    for group in groups:
-        kind = model.model_fields[group].annotation
-        assert isinstance(kind, type)
-        model = kind
-    info = model.model_fields[name]
-    default = info.get_default(call_default_factory=True, validated_data={})
-    return key, (list(default) if isinstance(default, tuple) else default, info.description or "")
+def _default(field: FieldInfo) -> Any:
+    """The own default of a setting, as run.json would have it."""
+    default = field.get_default(call_default_factory=True, validated_data={})
+    return list(default) if isinstance(default, tuple) else default

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, SkipValidation
 from panolog.orchestrator.runs.folder import command_line
 from panolog.orchestrator.runs.machines.history import Leave, NodeState, why_leaving
 from panolog.orchestrator.runs.money.account import MoneyView, view_money
-from panolog.orchestrator.runs.records import Leaving, task_name
+from panolog.orchestrator.runs.records import BlockPlan, Leaving, task_name
 from panolog.orchestrator.runs.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.watch.views.timing import (
     elapsed,
@@ -87,15 +87,6 @@ class TaskView(ViewModel):
     reasons: tuple[Text, ...]
 
 
-class BlockView(ViewModel):
-    """A block of the plan; without `train` it keeps its Stage I Gaussians."""
-
-    block: int
-    cameras: int
-    gaussians: int
-    train: bool
-
-
 class ModelView(ViewModel):
     """The merged model."""
 
@@ -171,7 +162,7 @@ class Summary(SummaryHead):
     """The state of a run: what `panolog status --json` prints."""
 
     tasks: tuple[TaskView, ...]
-    blocks: tuple[BlockView, ...]
+    blocks: tuple[BlockPlan, ...]
 
 
 def summarize(
@@ -227,10 +218,7 @@ def summarize(
         leaving=tuple(_leaving(node) for node in state.leaving() if running),
         money=view_money(state, end, running=running),
         tasks=tuple(_task_view(task, end) for task in tasks_of(state)),
-        blocks=tuple(
-            BlockView(block=b.block, cameras=b.cameras, gaussians=b.gaussians, train=b.train)
-            for b in state.plan or ()
-        ),
+        blocks=state.plan or (),
     )
 
 

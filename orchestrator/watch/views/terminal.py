@@ -39,19 +39,18 @@ from panolog.orchestrator.runs.records import (
     UnpauseRequested,
     task_name,
 )
-from panolog.orchestrator.runs.state import OnChange, RunState, Status, TaskState, at_rest
+from panolog.orchestrator.runs.state import OnChange, RunState, Status
 from panolog.orchestrator.runs.units import duration, gib
 from panolog.orchestrator.watch.views.preparation import prepared_share, view_preparation
 from panolog.orchestrator.watch.views.summary import (
     METRICS,
     STAGES,
     Summary,
+    TaskView,
     metric_text,
-    reason_of,
     summarize,
     task_label,
 )
-from panolog.orchestrator.watch.views.timing import eta_of, seconds_of, tasks_of
 from panolog.workers.tasks import NOTHING_HELD_OUT, Stage, TaskId
 
 WIDE = 120  # columns from which on a table has all its columns
@@ -68,24 +67,12 @@ _REQUESTS: dict[type[Record], str] = {
 }
 
 
-def table(state: RunState, *, root: Path, running: bool, wide: bool, name: str = "") -> RenderableType:
-    """The whole run for a terminal; `wide` also shows memory and PSNR.
-
-    Args: root, the run folder; running, whether a driver works on it; name, of the run in
-    commands, if that is not its folder.
-    """
-    now = time.time()
-    preparation = view_preparation(RunFolder(root), state, running=running)
-    prepared = None if preparation is None else prepared_share(preparation)
-    summary = summarize(state, running=running, now=now, root=root, prepared=prepared)
-    head = headline(state, summary, name or root)
-    rows = _rows(wide=wide)
-    if not running:
-        state = at_rest(state)
-        now = state.ended or now
-    stages: dict[Stage, list[TaskState]] = {}
-    for task in tasks_of(state):
-        stages.setdefault(task.id.stage, []).append(task)
+def table(summary: Summary, *, root: Path | str, wide: bool) -> RenderableType:
+    """The whole run for a terminal; `wide` also shows memory and PSNR. Args: root, the run in commands."""
+    now, rows = time.time(), _rows(wide=wide)
+    stages: dict[Stage, list[TaskView]] = {}
+    for task in summary.tasks:
+        stages.setdefault(TaskId.parse(task.name).stage, []).append(task)
     for stage, tasks in stages.items():
         one_by_one = tasks
         if stage.in_shards:
@@ -95,14 +82,14 @@ def table(state: RunState, *, root: Path, running: bool, wide: bool, name: str =
         if one_by_one != tasks:
             rows.add_row(*_stage_row(stage, tasks, wide=wide))
         for task in one_by_one:
-            rows.add_row(*_task_row(task, now, wide=wide))
+            rows.add_row(*_task_row(task, stage, wide=wide))
     shown = [rows] if stages else []
     waits = [Text(summary.waiting, style="yellow")] if summary.waiting not in ("", summary.label) else []
     waits += _leaving(summary, now)
-    waits += _quarantined(summary, now, name or root)
+    waits += _quarantined(summary, now, root)
     money = summary.money.line() if summary.money else ""
     waits += [Text(money, style="dim")] if money else []
-    return Group(head, *waits, *_gaussians(summary), *shown, *_failures(state))
+    return Group(_headline(summary, root), *waits, *_gaussians(summary), *shown, *_failures(summary))
 
 
 def _rows(*, wide: bool) -> Table:
@@ -126,13 +113,13 @@ def _gaussians(summary: Summary) -> Iterator[Text]:
         yield Text(", ".join(parts), style="dim")
 
 
-def _failures(state: RunState) -> Iterator[Text]:
+def _failures(summary: Summary) -> Iterator[Text]:
     """The last failure of each task that is not done, unless the headline says it."""
-    failed = [task for task in tasks_of(state) if task.reasons and task.status != Status.DONE]
-    failed = [task for task in failed if task.reasons[-1] not in state.reason]
+    failed = [task for task in summary.tasks if task.reasons and task.status != Status.DONE]
+    failed = [task for task in failed if task.reasons[-1] not in (summary.reason or "")]
     for task in failed[:_MOST]:
         yield Text(
-            f"{task_label(str(task.id))}: {task.reasons[-1]}",
+            f"{task_label(task.name)}: {task.reasons[-1]}",
             style="red" if task.status == Status.FAILED else "yellow",
         )
 
@@ -145,7 +132,7 @@ def _leaving(summary: Summary, now: float) -> Iterator[Text]:
 
 
 def _quarantined(summary: Summary, now: float, root: Path | str) -> Iterator[Text]:
-    """The machines in quarantine, and how to release the first. Args: now, epoch seconds; root, as `page`."""
+    """The machines in quarantine, and how to release the first. Args: as of `table`, and `_leaving`."""
     for node in summary.quarantined[:_MOST]:
         name = f"{node.host} ({node.node[:8]})"
         left = duration(max(0.0, node.until - now))
@@ -159,19 +146,17 @@ def _to_copy(line: str) -> Text:
     return Text(line, style="yellow", no_wrap=True, overflow="ignore")
 
 
-def page(state: RunState, *, root: Path, running: bool, wide: bool, name: str = "") -> RenderableType:
+def page(summary: Summary, *, root: Path | str, wide: bool) -> RenderableType:
     """`table`, and of a run that does not proceed why, and what resumes it."""
-    lines = []
-    if reason := reason_of(state, running=running):
-        lines.append(Text(reason, style="red"))
-    if not running and state.outcome != "done":
-        more = ("--max-cost", "none", "--deadline", "none") if state.outcome == "limited" else ()
-        lines.append(_to_copy(f"`{command_line('resume', name or root, *more)}` resumes it"))
-    return Group(table(state, root=root, running=running, wide=wide, name=name), *lines)
+    lines = [Text(summary.reason, style="red")] if summary.reason else []
+    if summary.resume:
+        more = " --max-cost none --deadline none" if summary.status == "limited" else ""
+        lines.append(_to_copy(f"`{summary.resume}{more}` resumes it"))
+    return Group(table(summary, root=root, wide=wide), *lines)
 
 
-def headline(state: RunState, summary: Summary, root: Path | str) -> Text:
-    """The state of the run in one line. Args: root, the run folder in commands."""
+def _headline(summary: Summary, root: Path | str) -> Text:
+    """The state of the run in one line."""
     stage = "" if summary.label == "preparing" else STAGES.get(summary.stage)
     text = Text(summary.label + (f" · {stage}" if stage else ""), style="bold")
     if summary.step:
@@ -181,13 +166,13 @@ def headline(state: RunState, summary: Summary, root: Path | str) -> Text:
         text.append(f" · {duration(summary.seconds)} elapsed")
     if summary.eta is not None:
         text.append(f" · about {duration(summary.eta)} left")
-    retries = sum(task.retries for task in state.tasks.values())
+    retries = sum(task.retries for task in summary.tasks)
     if retries:
         text.append(f" · {retries} retries", style="yellow")
     if held := summary.paused:
         unpause = command_line("unpause", root, held[0])
         text.append(f" · {len(held)} paused: `{unpause}` resumes block {held[0]}", style="yellow")
-    if moves := sum(task.moves for task in state.tasks.values()):
+    if moves := sum(task.moves for task in summary.tasks):
         text.append(f" · {moves} moved from machines that left", style="dim")
     moved = summary.moved.received + summary.moved.sent
     if moved:
@@ -195,22 +180,20 @@ def headline(state: RunState, summary: Summary, root: Path | str) -> Text:
     return text
 
 
-def _task_row(task: TaskState, now: float, *, wide: bool) -> Iterator[RenderableType]:
-    progress = task.progress
-    yield Text(task_label(str(task.id)), style=_COLOURS.get(task.status, "dim"))
-    done = progress.iteration if progress else int(task.status == Status.DONE)
-    total = progress.iterations if progress else 1
-    yield _bar(done, total, task.status, wide=wide)
-    views = "" if task.id.stage.trains else " views"
-    yield f"{progress.iteration:,}/{progress.iterations:,}{views}" if progress else ""
-    yield f"{progress.rate:.1f} it/s" if progress and task.status == Status.RUNNING else task.status
-    eta, seconds = eta_of(task, now), seconds_of(task, now)
-    yield f"{duration(eta)} left" if eta is not None else duration(seconds) if seconds else ""
-    yield f"{progress.loss:.4f}" if progress and progress.loss is not None else ""
-    yield f"{progress.gaussians:,}" if progress and progress.gaussians is not None else ""
+def _task_row(task: TaskView, stage: Stage, *, wide: bool) -> Iterator[RenderableType]:
+    yield Text(task_label(task.name), style=_COLOURS.get(task.status, "dim"))
+    begun = task.iteration is not None and task.iterations is not None
+    done = task.iteration if task.iteration is not None else int(task.status == Status.DONE)
+    yield _bar(done, task.iterations if task.iterations is not None else 1, task.status, wide=wide)
+    yield f"{task.iteration:,}/{task.iterations:,}{' views' * (not stage.trains)}" if begun else ""
+    yield f"{task.rate:.1f} it/s" if begun and task.status == Status.RUNNING else task.status
+    taken = duration(task.seconds) if task.seconds else ""
+    yield taken if task.eta is None else f"{duration(task.eta)} left"
+    yield "" if task.loss is None else f"{task.loss:.4f}"
+    yield "" if task.gaussians is None else f"{task.gaussians:,}"
     if wide:
-        yield f"{progress.psnr:.2f} dB" if progress and progress.psnr is not None else ""
-        yield gib(progress.memory) if progress and progress.memory is not None else ""
+        yield "" if task.psnr is None else f"{task.psnr:.2f} dB"
+        yield "" if task.memory is None else gib(task.memory)
 
 
 def _bar(done: int, total: int, status: Status, *, wide: bool) -> ProgressBar:
@@ -218,7 +201,7 @@ def _bar(done: int, total: int, status: Status, *, wide: bool) -> ProgressBar:
     return ProgressBar(total, done, width, complete_style=colour, finished_style=colour)
 
 
-def _stage_row(stage: Stage, tasks: Sequence[TaskState], *, wide: bool) -> list[RenderableType]:
+def _stage_row(stage: Stage, tasks: Sequence[TaskView], *, wide: bool) -> list[RenderableType]:
     """One row for all known tasks of a stage."""
     statuses = [task.status for task in tasks]
     done, total = statuses.count(Status.DONE), len(statuses)
@@ -242,8 +225,10 @@ def progress(console: Console, root: Path) -> Iterator[OnChange]:
     latest = RunState()
 
     def render() -> RenderableType:  # called from a thread of the display
-        running, wide = latest.outcome is None, console.width >= WIDE
-        return table(latest, root=root, running=running, wide=wide)
+        running = latest.outcome is None
+        made = view_preparation(RunFolder(root), latest, running=running)
+        summary = summarize(latest, running=running, prepared=prepared_share(made) if made else None)
+        return table(summary, root=root, wide=console.width >= WIDE)
 
     def show(state: RunState, news: Sequence[Stored]) -> None:
         nonlocal latest

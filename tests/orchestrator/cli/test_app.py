@@ -33,7 +33,8 @@ def calibrated(monkeypatch: pytest.MonkeyPatch, memory: int) -> None:
     """A machine with so many bytes of memory instead of this one, and a calibration that is made up."""
 
     @contextmanager
-    def connect(*_: object) -> Iterator[FakePool]:
+    def connect(_: object, __: object, ___: object, meanwhile: Callable[[], None]) -> Iterator[FakePool]:
+        meanwhile()
         yield FakePool(says, [Node("node", "host", 2, memory)])
 
     monkeypatch.setattr("panolog.orchestrator.engine.cluster.connection.connect", connect)

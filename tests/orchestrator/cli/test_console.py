@@ -24,6 +24,7 @@ from panolog.orchestrator.runs import log
 from panolog.orchestrator.runs.records import Outcome, Record, RunBegan, RunEnded, TaskFailed, TaskStarted
 from panolog.orchestrator.runs.state import replay
 from panolog.orchestrator.runs.store import Database
+from panolog.orchestrator.watch.views.summary import summarize
 from panolog.orchestrator.watch.views.terminal import page, progress
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.cli.program import call
@@ -107,7 +108,7 @@ def test_the_reason_of_a_failed_run_is_printed_once(terminal: bool, tmp_path: Pa
     shown, status = StringIO(), StringIO()
     with progress(Console(file=shown, force_terminal=terminal, width=120), tmp_path) as show:
         show(replay(stored), stored)
-    found = page(replay(stored), root=tmp_path, running=False, wide=True)
+    found = page(summarize(replay(stored), running=False), root=tmp_path, wide=True)
     Console(file=status, width=120).print(found)
     assert [output.getvalue().count("no memory") for output in (shown, status)] == [0, 1]
 

@@ -1,6 +1,7 @@
 """`panolog export`, and exported files in `eval` and `render`."""
 
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -128,7 +129,14 @@ def test_choices(run: RunFolder, tmp_path: Path, kind: str) -> None:
     scene = len(whole) - whole.sky
     x = float(whole.means[:scene, 0].median())
     crop = ("--crop", f"{x},-1e9,-1e9,1e9,1e9,1e9")
-    for options, count in (((), scene), (crop, int((whole.means[:scene, 0] >= x).sum()))):
+    sizes = whole.scales[:scene].max(dim=1).values
+    size = float(sizes.median().exp())
+    cases = (
+        ((), scene),
+        (crop, int((whole.means[:scene, 0] >= x).sum())),
+        (("--max-size", size * 1.001), int((sizes <= math.log(size * 1.001)).sum())),
+    )
+    for options, count in cases:
         export(run.point_cloud, "-o", file, "--without-sky", *options)
         assert not (tmp_path / "model-sky.spz").exists()
         assert len(read_model(file) if kind == "spz" else read_ply(file)) == count

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.runs.storage.plan import local_folder, plan_from_json, plan_of, to_json
+from panolog.orchestrator.runs.storage.plan import MIRROR_PLAN, local_folder, plan_of
 from panolog.scene.errors import ConfigError
 from panolog.scene.stores.cache import FOLDER
 from tests.orchestrator.cli.program import call
@@ -52,7 +52,7 @@ def test_the_local_folder_of_a_url_is_always_the_same(tmp_path: Path) -> None:
     plan = plan_of("file:///place/run/", None, environment, resumes=False)
     assert plan is not None
     assert (plan.root, plan.url) == (first, "file:///place/run")
-    assert plan_from_json(to_json(plan)) == plan
+    assert MIRROR_PLAN.validate_json(MIRROR_PLAN.dump_json(plan)) == plan
 
 
 def test_wrong_variables_are_one_line(tmp_path: Path) -> None:

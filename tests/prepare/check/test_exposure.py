@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from panolog.prepare.check.exposure import describe, measure_exposures
+from panolog.prepare.check import exposure
+from panolog.prepare.check.exposure import Exposures, describe, differing_exposures, measure_exposures
 from panolog.prepare.video.stamp import stamped
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
@@ -105,3 +106,23 @@ def test_the_exposure_of_a_walk_goes_on_as_it_went(street: Scene, tmp_path: Path
         found = stops_of(apart(taken(street, tmp_path, bent, name=name), [LONE]))
         errors[kind] = abs(found - bent)[LONE]
     assert errors["frames"] < 0.6 * errors["stills"]
+
+
+def test_exposures_that_differ_are_measured_at_full_width(
+    street: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = list[int]()
+
+    def measure(scene: Scene, rows: Sequence[int], width: int) -> Exposures | None:
+        measured.append(width)
+        return measure_exposures(scene, rows, width)
+
+    monkeypatch.setattr(exposure, "measure_exposures", measure)
+    monkeypatch.setattr(exposure, "_QUICK", 128)
+    scene = taken(street, tmp_path, STOPS)
+    found, expected = differing_exposures(scene, ROWS), measure_exposures(scene, ROWS)
+    assert found is not None and expected is not None
+    assert np.array_equal(found.log_gain, expected.log_gain)
+    monkeypatch.setattr(exposure, "DIFFERS", 1.0)
+    assert differing_exposures(scene, ROWS) is None
+    assert measured == [128, 256, 128]

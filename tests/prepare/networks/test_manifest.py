@@ -92,6 +92,32 @@ def test_a_mask_manifest_has_one_head(tmp_path: Path) -> None:
     assert found.head == found.classes
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seam": "tiles", "width": 32}, "input: fov is the angle of a view in degrees"),
+        ({"fov": 90}, "input: fov is the angle of a view in degrees"),
+        ({"seam": "tiles", "fov": 90}, "input: with seam: tiles, width must be height = 32, not 64"),
+        ({"seam": "tiles", "fov": 20, "width": 32}, "input.fov: Input should be greater than or equal to 40"),
+        (
+            {"seam": "tiles", "fov": 90, "width": 4096, "height": 4096},
+            "12868 columns, more than 8192; raise",
+        ),
+    ],
+)
+def test_views_are_square_and_have_an_angle(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    classes = {"output": "c", "ignore": [1]}
+    tree = {"task": "mask", "input": INPUT | changes, "classes": classes}
+    with pytest.raises(InputError, match=message):
+        read_manifest(write(tmp_path / "m.yaml", tree), MaskManifest)
+
+
+def test_depth_is_not_estimated_of_views(tmp_path: Path) -> None:
+    tree = {"task": "depth", "input": INPUT | {"seam": "tiles", "width": 32, "fov": 90}, "depth": DEPTH}
+    with pytest.raises(InputError, match="manifest: seam: tiles is for masks"):
+        read_manifest(write(tmp_path / "m.yaml", tree), DepthManifest)
+
+
 def test_the_manifest_lies_beside_the_model(tmp_path: Path) -> None:
     model = tmp_path / "M.onnx"
     with pytest.raises(InputError, match=r"M\.onnx: there is no such model"):

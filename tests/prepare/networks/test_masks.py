@@ -146,6 +146,15 @@ def test_movers_by_class(scene: Path, ignore: list[int], layout: str) -> None:
     )
 
 
+def test_movers_by_the_index_of_the_class(scene: Path) -> None:
+    """As networks give it whose last operation is the choice of the greatest score."""
+    winner = helper.make_node("ArgMax", ["image"], ["index"], axis=1, keepdims=0)
+    nodes = [winner, helper.make_node("Cast", ["index"], ["found"], to=onnx.TensorProto.FLOAT)]
+    masked(scene, movers(scene, nodes, classes={"output": "found", "ignore": [1]}))
+    image = load_resized(scene / "images" / NAMES[0], WIDTH)
+    np.testing.assert_array_equal(pixels(scene / "masks" / NAMES[0]) == 0, image.argmax(axis=2) == 1)
+
+
 @pytest.mark.parametrize("above", ["ignore", "keep"])
 def test_movers_by_threshold_and_everything_else(scene: Path, above: str) -> None:
     own = put_striped(scene / "masks" / NAMES[0])

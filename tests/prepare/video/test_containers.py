@@ -99,8 +99,7 @@ def test_the_same_frames_at_the_same_times(container: str, encoding: Encoding, t
     assert times == pytest.approx([time / 1000 for time in TIMES], abs=1e-9)
 
 
-@pytest.mark.parametrize("container", ["mp4", "mkv"])
-@pytest.mark.parametrize("encoding", [H264, H265_10], ids=["H.264", "H.265"])
+@pytest.mark.parametrize(("container", "encoding"), [("mp4", H264), ("mkv", H265_10)], ids=["mp4", "mkv"])
 def test_seeking_finds_the_frames_of_reading_in_order(
     container: str, encoding: Encoding, tmp_path: Path
 ) -> None:

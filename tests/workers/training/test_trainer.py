@@ -65,7 +65,7 @@ def test_stage_one_reports_its_events(coarse: TrainSpec, events: list[Event]) ->
     assert progress[-1].iteration == progress[-1].iterations == 24
     assert progress[-1].gaussians == len(trained(events)) and progress[-1].rates["sh0"] == 2.5e-3
     previews = [event for event in events if isinstance(event, Preview)]
-    assert [event.iteration for event in previews] == [8, 10, 16, 24]
+    assert [event.iteration for event in previews] == [1, 8, 10, 16, 24]
     assert previews[0].view == "pano_0.png" and previews[0].jpeg[:2] == b"\xff\xd8"
     picture = cv2.imdecode(np.frombuffer(previews[0].jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None and picture.shape[:2] == (WIDTH, WIDTH)  # above the photograph

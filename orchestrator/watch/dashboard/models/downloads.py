@@ -7,7 +7,8 @@ from typing import Literal
 
 from fastapi.responses import Response
 
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below
+from panolog.orchestrator.runs.folder import open_below
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.dashboard.models.making import Maker, Turns, reading
 from panolog.orchestrator.watch.dashboard.responses import Download, file_name
 from panolog.scene.errors import InputError
@@ -17,6 +18,7 @@ Kind = Literal["sog", "spz", "ply", "html"]
 ENDINGS: dict[Kind, str] = {"sog": ".sog", "spz": ".spz", "ply": "-upright.ply", "html": ".html"}
 _CACHED = 4  # files
 
+_NICE = 10  # than this process: a large model takes minutes, and the run may train on this machine
 _Made = tuple[str, Kind, int, int]  # the run, the kind, and which model of it
 
 
@@ -27,7 +29,7 @@ class Downloads:
         self._folder = TemporaryDirectory(prefix="panolog-downloads-")
         self._files: OrderedDict[_Made, Path] = OrderedDict()
         self._number = 0
-        self._turns, self._maker = Turns("files"), Maker()
+        self._turns, self._maker = Turns("files"), Maker(_NICE)
 
     async def make(self, entry: RunEntry, kind: Kind) -> None:
         """Makes a file, unless it is there.

@@ -17,8 +17,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO
 
-from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, by_handle, open_below
+from panolog.orchestrator.runs.folder import RunFolder, by_handle, open_below
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.scene.errors import InputError, PanologError, in_one_line
 from panolog.scene.files import Locate
 
@@ -50,8 +50,21 @@ class Turns:
 class Maker:
     """The process, as long as there is one. For one request at a time."""
 
-    def __init__(self) -> None:
+    def __init__(self, nice: int = 0) -> None:
+        """Args: nice, by how much it is nicer than this process (setpriority(2))."""
+        self._nice, self._starting = nice, asyncio.Lock()
         self._process: asyncio.subprocess.Process | None = None
+
+    async def start(self) -> None:
+        """Starts the process, unless it is there: its imports take seconds, and may be over by a request."""
+        async with self._starting:
+            if self._process is None:
+                self._process = await asyncio.create_subprocess_exec(
+                    *(sys.executable, "-m", __name__, str(_IDLE_S), str(self._nice)),
+                    stdin=asyncio.subprocess.PIPE,
+                    stdout=asyncio.subprocess.PIPE,
+                    stderr=asyncio.subprocess.DEVNULL,
+                )
 
     async def make(self, module: str, arguments: Sequence[str], what: str) -> float:
         """Calls `main` of a module with arguments, there; returns the seconds of CPU that it took.
@@ -85,15 +98,10 @@ class Maker:
     async def _answer(self, request: bytes) -> bytes:
         """The line that the process answers with, a new one if it has ended meanwhile; b"" if it dies."""
         while True:
-            process, new = self._process, self._process is None
-            if process is None:
-                process = self._process = await asyncio.create_subprocess_exec(
-                    *(sys.executable, "-m", __name__, str(_IDLE_S)),
-                    stdin=asyncio.subprocess.PIPE,
-                    stdout=asyncio.subprocess.PIPE,
-                    stderr=asyncio.subprocess.DEVNULL,
-                )
-            assert process.stdin is not None and process.stdout is not None
+            new = self._process is None
+            await self.start()
+            process = self._process
+            assert process is not None and process.stdin is not None and process.stdout is not None
             process.stdin.write(request)
             if answer := await process.stdout.readline():
                 return answer
@@ -129,13 +137,17 @@ def reading(entry: RunEntry) -> Iterator[tuple[RunFolder, Locate]]:
             os.close(handle)
 
 
-def _work(requests: IO[bytes], answers: IO[bytes], idle: float) -> None:
+def _work(requests: IO[bytes], answers: IO[bytes], idle: float, nice: int) -> None:
     """Does what is requested until there are no more requests, or none comes in `idle` seconds."""
     import torch  # noqa: PLC0415
 
     torch.set_num_threads(1)
-    import_module("panolog.orchestrator.watch.views.site.build")  # is no part of what a request takes
-    os.nice(10)  # the run may be training on this machine
+    for needed in (
+        "watch.views.site.build",
+        "watch.dashboard.models.pages",
+    ):  # no part of a request
+        import_module(f"panolog.orchestrator.{needed}")
+    os.nice(nice)
     while select.select([requests], [], [], idle)[0] and (line := requests.readline()):
         module, *arguments = json.loads(line)
         began, wrong = time.process_time(), None
@@ -155,5 +167,5 @@ if __name__ == "__main__":
         os.fdopen(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as requests,  # as `select` sees it
     ):
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what is printed is no answer
-        _work(requests, own, float(sys.argv[1]))
+        _work(requests, own, float(sys.argv[1]), int(sys.argv[2]))
     os._exit(0)  # torch takes long to end, and nothing is left to do

@@ -24,11 +24,11 @@ from fastapi.responses import Response
 from panolog.export.site.page import described, photograph_number
 from panolog.export.site.write import media_type
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.folder import shown_model
+from panolog.orchestrator.runs.folder import open_below, read_below, shown_model
 from panolog.orchestrator.runs.machines.machine import cores
-from panolog.orchestrator.watch.dashboard.discovery import RunEntry, open_below, read_below
+from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.dashboard.models.making import Maker, Turns, reading
-from panolog.orchestrator.watch.dashboard.pictures import PanoramaCache
+from panolog.orchestrator.watch.dashboard.pictures import panorama
 from panolog.orchestrator.watch.dashboard.responses import Download
 from panolog.orchestrator.watch.views.site.photographs import WIDE
 from panolog.scene.errors import InputError
@@ -96,6 +96,10 @@ class ModelPages:
         self._sources: dict[str, _Source] = {}  # by key: of those that were made for this server
         self._turns, self._maker = Turns("3D views"), Maker()
 
+    async def begin(self) -> None:
+        """Prepares for a page that may soon be requested."""
+        await self._maker.start()
+
     async def make(self, entry: RunEntry, task: str | None, scene: Path | None) -> str:
         """Makes the page of the current model of a run, or of one of its tasks, and returns its key.
 
@@ -135,7 +139,7 @@ class ModelPages:
         match = _PATH.fullmatch(path)
         return match is not None and match[1] in self._sites
 
-    def file(self, key: str, path: str, policy: str, panoramas: PanoramaCache) -> Response:
+    def file(self, key: str, path: str, policy: str) -> Response:
         """A file of a page, or a photograph. Raises InputError if there is none, or the page was removed."""
         site = self._sites.get(key)
         if site is None:
@@ -147,7 +151,7 @@ class ModelPages:
         if site.scene is not None and (number := photograph_number(path)) is not None:
             if number >= len(site.names):
                 raise InputError("there is no such photograph")
-            answer = panoramas.small(site.scene, site.names[number], WIDE)
+            answer = panorama(site.scene, site.names[number], WIDE)
             answer.headers.update(headers)
             return answer
         path = path or "index.html"

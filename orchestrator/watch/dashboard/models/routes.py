@@ -9,7 +9,6 @@ from fastapi import APIRouter, HTTPException, Request
 from fastapi.responses import Response
 
 from panolog.export.site.write import DESCRIPTION
-from panolog.orchestrator.watch.dashboard import maps
 from panolog.orchestrator.watch.dashboard.api import scene_of
 from panolog.orchestrator.watch.dashboard.dependencies import (
     Body,
@@ -25,6 +24,7 @@ from panolog.orchestrator.watch.dashboard.registry import RunRegistry
 from panolog.orchestrator.watch.dashboard.responses import json_response
 from panolog.orchestrator.watch.dashboard.watch import Watch, error_line
 from panolog.orchestrator.watch.views.pages.encoding import encode
+from panolog.orchestrator.watch.views.plan_page import plan_of
 from panolog.scene.errors import InputError
 
 router = APIRouter()
@@ -51,7 +51,7 @@ async def post_viewer(request: Request, registry: Registry, id: str) -> Response
     pages: ModelPages = request.app.state.pages
     with _refusals(registry):
         if body.camera is not None:
-            await registry.call(maps.require_camera, watch.entry, body.camera)
+            await registry.call(_require_camera, watch, body.camera)
         key = await pages.make(watch.entry, body.task, _scene_folder(watch))
     start = "" if body.camera is None else f"#camera={quote(body.camera, safe='')}"
     return json_response(request, encode({"url": f"/models/{key}/{start}"}))
@@ -82,7 +82,7 @@ async def get_model_page(request: Request, key: str, path: str) -> Response:
     if path == DESCRIPTION:
         await pages.renew(key)
     policy = page_policy(request.headers.get("host", ""), key)
-    return await respond(request, 404, pages.file, key, path, policy, request.app.state.panoramas)
+    return await respond(request, 404, pages.file, key, path, policy)
 
 
 @contextmanager
@@ -92,6 +92,12 @@ def _refusals(registry: RunRegistry) -> Iterator[None]:
         yield
     except (InputError, OSError) as error:
         raise HTTPException(409, error_line(error, registry.root)) from error
+
+
+def _require_camera(run: Watch, name: str) -> None:
+    """Raises InputError if the plan has no panorama of that name, or cannot be read."""
+    if name not in plan_of(run.entry.folder).names:
+        raise InputError("the plan of this run has no such panorama")
 
 
 def _scene_folder(run: Watch) -> Path | None:

@@ -2,16 +2,16 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from statistics import fmean
 from typing import Any
 
+from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.units import means
 from panolog.orchestrator.watch.views.comparison.schema import METRICS, MeasuredView
-from panolog.scene.errors import RunFolderError
+from panolog.scene.errors import InputError, RunFolderError
 
-MOST_BYTES = 16_000_000  # of metrics.json: of 70,000 panoramas; hostile JSON may need 20 times the memory
+_MOST = 16_000_000  # of metrics.json: of 70,000 panoramas; hostile JSON may need 20 times the memory
 _VIEWS = 70_000
 
 Values = Mapping[str, float | None]  # metrics by name
@@ -31,14 +31,18 @@ class Measured:
         return self.head.width, self.head.crop_bottom or 0.0
 
 
-def parse_measured(path: Path, raw: bytes | None = None) -> Measured:
-    """The content of metrics.json; a value that is no finite number counts as not measured.
+def read_measured(folder: RunFolder) -> Measured | None:
+    """The content of metrics.json, if there is one; a value that is no finite number counts as not measured.
 
-    Args: path of the file; raw, its bytes if they are read already.
-    Raises RunFolderError if it is no JSON object, OSError if it cannot be read.
+    Raises InputError if it is no JSON object, or cannot be read.
     """
+    path = folder.metrics
+    if not path.exists():
+        return None
     try:
-        content = json.loads(path.read_bytes() if raw is None else raw)
+        content = json.loads(folder.read(path, _MOST))
+    except InputError as error:
+        raise RunFolderError(f"{path.parent}/{error}") from error
     except (ValueError, RecursionError) as error:
         raise RunFolderError(f"{path}: is not JSON: {error}") from error
     if not isinstance(content, dict):
@@ -56,16 +60,6 @@ def parse_measured(path: Path, raw: bytes | None = None) -> Measured:
     )
     mean = means(views.values()) if views else _values(content.get("mean"))
     return Measured(head, views, mean)
-
-
-def means(views: Iterable[Values]) -> dict[str, float | None]:
-    """The mean of each metric over the views that have it; None where none has."""
-    found: dict[str, list[float]] = {name: [] for name in METRICS}
-    for values in views:
-        for name in METRICS:
-            if (value := values.get(name)) is not None:
-                found[name].append(value)
-    return {name: fmean(numbers) if numbers else None for name, numbers in found.items()}
 
 
 def finite(value: float | None) -> float | None:

@@ -1,21 +1,19 @@
 """The runs of a comparison as they are read from their folders. Imports no torch."""
 
-import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from panolog.orchestrator.runs import lock, presence
-from panolog.orchestrator.runs.folder import RunFolder, head_of, read_json
+from panolog.orchestrator.runs.folder import RunFolder, head_of, read_json, require_plain
 from panolog.orchestrator.runs.state import RunState
 from panolog.orchestrator.runs.store import read_milestones
-from panolog.orchestrator.watch.views.comparison.measured import MOST_BYTES, Measured, parse_measured
+from panolog.orchestrator.watch.views.comparison.measured import Measured, read_measured
 from panolog.orchestrator.watch.views.comparison.schema import MOST
 from panolog.orchestrator.watch.views.history import History
 from panolog.orchestrator.watch.views.run_view import RunView, view_run
 from panolog.scene.errors import InputError, RunFolderError
 
-_INFO = 1_000_000  # bytes of run.json at most
 # What values of another type than expected make a view of a run raise.
 DAMAGED = (ValueError, TypeError, KeyError, AttributeError, ArithmeticError, RecursionError)
 
@@ -72,10 +70,7 @@ def names_of(places: Sequence[Path]) -> list[str]:
 def read_run(root: Path, name: str) -> ReadRun:
     """A run, live or ended. Raises InputError if the folder is no run or its files are damaged."""
     folder = RunFolder(root)
-    for path in (folder.database, folder.lock, folder.presence):
-        _require_plain(path)
-    _require_plain(folder.info, _INFO)
-    _require_plain(folder.metrics, MOST_BYTES)
+    require_plain(folder)
     try:
         info = read_json(folder)
         head_of(folder, info)
@@ -83,7 +78,7 @@ def read_run(root: Path, name: str) -> ReadRun:
         history = History.of(read_milestones(folder.database) if folder.database.exists() else ())
         waiting = presence.waiting(folder.presence) if running else ""
         view = view_run(history, info, running=running, root=root, waiting=waiting)
-        measured = parse_measured(folder.metrics) if folder.metrics.exists() else None
+        measured = read_measured(folder)
     except DAMAGED as error:
         why = f"{type(error).__name__}: {error}"
         raise RunFolderError(f"{root}: cannot be read as a run of this PanoLOG: {why:.200}") from error
@@ -98,15 +93,3 @@ def picture_of(run: ReadRun, view: str) -> str | None:
     except (OSError, ValueError):  # a name that no file can have
         return None
     return str(path) if inside else None
-
-
-def _require_plain(path: Path, most: int = 0) -> None:
-    """Raises InputError if there is anything but a plain file of at most so many bytes; 0 = of any size."""
-    try:
-        status = path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    if not stat.S_ISREG(status.st_mode):
-        raise RunFolderError(f"{path}: is not a plain file, so this is not the folder of a run")
-    if most and status.st_size > most:
-        raise RunFolderError(f"{path}: has {status.st_size:,} bytes, and at most {most:,} are read")

@@ -1,6 +1,5 @@
 """What was measured of a run: metrics of held-out panoramas, seams between blocks, poses and movers."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -13,6 +12,7 @@ from panolog.orchestrator.watch.views.summary import Text, ViewModel
 from panolog.scene.errors import InputError
 from panolog.workers.seams.schema import Seam, parse_seams
 
+_MOST = 200_000_000  # bytes of a file at most
 _FACES = 3  # between blocks with pictures: the worst
 _MOVERS = 6  # panoramas with pictures: those with the largest movers
 _SEAM_PICTURES = ("truth.jpg", "merged.jpg", "below.jpg", "above.jpg", "face.png")
@@ -83,21 +83,21 @@ def findings_version(folder: RunFolder) -> str:
     return " ".join(version_of(path) or "-" for path in files)
 
 
-def read_findings(folder: RunFolder, read: Callable[[Path], bytes] = Path.read_bytes) -> Findings:
-    """The findings of a run; empty where there are none yet. Args: read, how its files are read.
+def read_findings(folder: RunFolder) -> Findings:
+    """The findings of a run; empty where there are none yet.
 
-    Raises InputError if a file is damaged, and what `read` raises.
+    Raises InputError if a file is damaged, or not below the run.
     """
 
     def parsed(kind: type[_File], path: Path) -> _File | None:
         try:
-            return kind.model_validate_json(read(path)) if path.exists() else None
+            return kind.model_validate_json(folder.read(path, _MOST)) if path.exists() else None
         except ValidationError as error:
             raise InputError(f"{path.name}: is damaged: {error.error_count()} values are wrong") from error
 
     poses = parsed(_PosesFile, folder.poses) or _PosesFile()
     shares = parsed(_MoversFile, folder.mover_shares) or _MoversFile()
-    seams = parse_seams(read(folder.seams)) if folder.seams.exists() else ()
+    seams = parse_seams(folder.read(folder.seams, _MOST)) if folder.seams.exists() else ()
     found = Findings(
         metrics=parsed(HeldOutMetrics, folder.metrics),
         seams=seams,

@@ -14,7 +14,6 @@ from panolog.orchestrator.runs.info import read_info
 from panolog.orchestrator.runs.records import Noticed, Part, Progressed, Record
 from panolog.orchestrator.runs.store import read_milestones
 from panolog.orchestrator.watch.views.exposures import exposure_curve
-from panolog.orchestrator.watch.views.figures import map_figure
 from panolog.orchestrator.watch.views.history import History
 from panolog.orchestrator.watch.views.pages.findings import (
     Findings,
@@ -23,7 +22,7 @@ from panolog.orchestrator.watch.views.pages.findings import (
     read_findings,
 )
 from panolog.orchestrator.watch.views.pages.shell import RUN, data_url, write_snapshot
-from panolog.orchestrator.watch.views.plan_map import read_points
+from panolog.orchestrator.watch.views.plan_page import cameras_of, map_of, plan_of, scores_of, view_camera
 from panolog.orchestrator.watch.views.preparation import (
     PreparationView,
     picture_path,
@@ -33,12 +32,9 @@ from panolog.orchestrator.watch.views.preparation import (
 from panolog.orchestrator.watch.views.queries import Filter, events, series, spread
 from panolog.orchestrator.watch.views.run_view import RunView, view_run
 from panolog.orchestrator.watch.views.site.photographs import WIDE, small_copy
-from panolog.partition.plan import Plan, read_plan
-from panolog.partition.scores import read_scores
 from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import natural_key
-from panolog.workers.seams.schema import by_blocks
-from panolog.workers.tasks import COARSE, Stage, TaskId
+from panolog.workers.tasks import Stage, TaskId
 
 _ID = "report"  # what the page calls its run
 _PATH = f"runs/{_ID}"
@@ -127,14 +123,10 @@ def _answers(folder: RunFolder, view: RunView, found: Findings) -> Iterator[tupl
         if (made := picture_path(folder, picture.name)) is not None:
             yield f"{_PATH}/preparation/{picture.name}?{picture.version}", _picture(made)
     if folder.exposure.is_file():
-        yield f"{_PATH}/exposure", exposure_curve(folder, Path.read_bytes)
+        yield f"{_PATH}/exposure", exposure_curve(folder)
     if folder.known_plan.exists():
-        plan, planned = read_plan(folder.known_plan), folder.plan.exists()
-        model = folder.model(COARSE)
-        points = read_points(model if model.exists() or planned else folder.outline_points)
-        fixes = {"fixes": read_points(folder.outline_fixes)} if folder.outline_fixes.exists() else {}
-        yield f"{_PATH}/map", map_figure(plan, points, by_blocks(found.seams), planned=planned, **fixes)
-        yield from _cameras(folder, plan)
+        yield f"{_PATH}/map", map_of(folder)
+        yield from _cameras(folder)
     if folder.database.exists():
         without = Filter(without=frozenset({Progressed.__name__}))
         latest = events(folder.database, without, _EVENTS)
@@ -144,20 +136,15 @@ def _answers(folder: RunFolder, view: RunView, found: Findings) -> Iterator[tupl
     yield from _held_out(folder, found)
 
 
-def _cameras(folder: RunFolder, plan: Plan) -> Iterator[tuple[str, Any]]:
+def _cameras(folder: RunFolder) -> Iterator[tuple[str, Any]]:
     """The cameras of a plan, and the blocks with theirs; nothing of a large one."""
-    if len(plan.rows) * plan.grid.count > _SCORES or not folder.scores.exists():
+    plan = plan_of(folder)
+    if len(plan.rows) * plan.grid.count > _SCORES or (scores := scores_of(folder, plan)) is None:
         return
-    scores = read_scores(folder.scores, plan.rows, plan.grid.count).toarray().tolist()
-    blocks: dict[int, list[dict[str, Any]]] = {block: [] for block in range(plan.grid.count)}
-    for k in range(len(plan.rows)):
-        camera = plan.camera_json(k)
-        known = camera.model_dump(mode="json", exclude={"center"}) | {"scores": scores[k]}
-        yield f"{_PATH}/camera/{camera.row}", known | {"no_picture": "a report has none of the scene"}
-        for block, reason in camera.assigned.items():
-            blocks[block].append({"row": camera.row, "name": camera.name, "reason": reason})
-    for block, cameras in blocks.items():
-        yield f"{_PATH}/block/{block}", {"block": block, "cameras": cameras}
+    for k, row in enumerate(plan.rows):
+        yield f"{_PATH}/camera/{row}", view_camera(plan, k, scores, "a report has none of the scene")
+    for block in range(plan.grid.count):
+        yield f"{_PATH}/block/{block}", cameras_of(plan, block)
 
 
 def _curves(folder: RunFolder, view: RunView) -> Iterator[tuple[str, Any]]:

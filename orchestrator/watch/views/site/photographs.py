@@ -5,7 +5,7 @@ import struct
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,30 +24,32 @@ WIDE = 2048  # pixels of a copy in 3D
 STORE_S = 10.0  # for which a store may fail before a page shows no picture
 _BYTES = 300_000_000  # of a panorama's file at most
 _PIXELS = 2**27  # of a panorama at most: 16,384 x 8,192
+Part = Literal["whole", "render", "truth"]
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 # What a damaged image makes Pillow raise.
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
 
 
-def small_copy(file: BinaryIO, name: str, width: int, *, rendered: bool = False) -> bytes:
+def small_copy(file: BinaryIO, name: str, width: int, part: Part = "whole") -> bytes:
     """A JPEG of at most `width` pixels, half as high, without metadata such as where it was taken.
 
-    Args: rendered, take the upper half of a square picture, which has a render above a photograph.
-    Raises InputError if the file is too large or no image.
+    Args: part, of a square picture that has a render above its photograph.
+    Raises InputError if the file is too large, no image, or no such picture.
     """
     require_size(file.seek(0, os.SEEK_END), name)
     file.seek(0)
     try:
-        with Image.open(file, formats=_FORMATS) as picture:  # reads the header alone
+        with Image.open(file, formats=_FORMATS if part == "whole" else ["JPEG"]) as picture:  # the header
             if picture.width * picture.height > _PIXELS:
                 raise InputError(f"{name} has more than {_PIXELS:,} pixels")
-            height = width if rendered else width // 2
-            picture.draft("RGB", (width, height))  # JPEG can be decoded smaller
-            picture.thumbnail((width, height), reducing_gap=3.0)
-            if rendered:
-                render = picture.crop((0, 0, picture.width, picture.height // 2))
+            if part != "whole" and picture.width > picture.height:
+                raise InputError(f"{name} is no render above a photograph")
+            picture.draft("RGB", (width, width // 2))  # JPEG can be decoded smaller
+            picture.thumbnail((width, width // 2 if part == "whole" else 2 * width), reducing_gap=3.0)
+            half, end = picture.width // 2, picture.height
+            top, end = {"whole": (0, end), "render": (0, half), "truth": (end - half, end)}[part]
             output = BytesIO()
-            in_srgb(render if rendered else picture).save(output, "JPEG", quality=85)
+            in_srgb(picture.crop((0, top, picture.width, end))).save(output, "JPEG", quality=85)
     except _DAMAGED as error:
         raise InputError(f"{name} cannot be decoded") from error
     return output.getvalue()

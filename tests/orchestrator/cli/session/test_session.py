@@ -5,7 +5,7 @@ import json
 import os
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import closing, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
 from itertools import chain, repeat
 from pathlib import Path
@@ -208,7 +208,11 @@ def test_two_drivers_of_one_folder(scene: Path, tmp_path: Path) -> None:
 def test_an_unforeseen_error_is_one_line_and_recorded(
     killed: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, line: str
 ) -> None:
-    monkeypatch.setattr(session, "_workers", lambda *_: nullcontext(calibrating(fails(error))))
+    def workers(*given: Any) -> AbstractContextManager[FakePool]:
+        given[-1]()  # what is done while it starts
+        return nullcontext(calibrating(fails(error)))
+
+    monkeypatch.setattr(session, "_workers", workers)
     metrics = "panolog.orchestrator.engine.cluster.run_metrics.RunMetrics"
     monkeypatch.setattr(metrics, lambda _, on_change: SimpleNamespace(show=on_change))
     answer = call("resume", killed, "--resumed-after", "killed by signal 9")

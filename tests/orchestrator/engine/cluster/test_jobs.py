@@ -214,7 +214,7 @@ def test_settings_survive_the_way_to_the_head() -> None:
 def test_a_run_of_panoramas_is_submitted_with_how_its_scene_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     begun = recorded(monkeypatch)
     given = ["--trajectory", "/data/walk.tum", "--nadir", "12.0", "--no-static", "--partial"]
-    given += ["--depth-model", "/data/m.onnx"]
+    given += ["--mask-model", "/data/people.onnx", "--depth-model", "/data/m.onnx"]
     assert invoke("submit", "/data/walk.mp4", "-o", "/runs/a", *given).exit_code == 0
     (words,) = begun
     assert list(words[:5]) == ["panolog", "run", "/data/walk.mp4", "-o", "/runs/a"]

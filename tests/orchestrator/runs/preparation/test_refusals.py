@@ -16,7 +16,8 @@ from panolog.orchestrator.runs.preparation.settings import (
     Options,
     Step,
     as_arguments,
-    parse_settings,
+    read_settings,
+    settings_path,
 )
 from panolog.orchestrator.runs.state import ignore
 from panolog.prepare.check import scene_check
@@ -153,7 +154,8 @@ def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     image(tmp_path / "two" / "b.jpg", 64, 32)
     run = ("run", tmp_path / "two", "-o")
     assert "is not empty and not a run" in one_line(call(*run, tmp_path / "full"))
-    assert "there is no such model" in one_line(call(*run, root, "--depth-model", tmp_path / "no.onnx"))
+    for network in ("--mask-model", "--depth-model"):
+        assert "there is no such model" in one_line(call(*run, root, network, tmp_path / "no.onnx"))
     assert "the panoramas have 64 pixels" in one_line(call(*run, root, "--width", 128))
     assert not root.exists()
 
@@ -168,6 +170,7 @@ def test_options_survive_the_way_through_a_command_line(
         },
         nadir=7.5,
         static=False,
+        mask_model="people.onnx",
         depth_model="m.onnx",
     )
     seen = list[Options]()
@@ -189,7 +192,9 @@ def test_options_survive_the_way_through_a_command_line(
 def test_files_of_the_preparation_that_are_none_are_not_believed(content: bytes, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.preparation.mkdir()
-    assert parse_settings(content) is None
+    settings_path(folder).write_bytes(content)
+    with pytest.raises(InputError, match=r"settings\.json"):
+        read_settings(folder)
     for path in (notes.progress_path(folder), notes.result_path(folder, Step.SFM)):
         path.write_bytes(content)
     assert notes.read_progress(folder) is None

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from onnx import helper
 
 from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.cli.session.preparing import settings_of
@@ -22,6 +23,8 @@ from panolog.scene.errors import InputError
 from panolog.scene.write import StageProgress
 from tests.orchestrator.cli.program import call, one_line, shown
 from tests.orchestrator.runs.preparation.fake_sfm import image, start
+from tests.prepare.networks.networks import CHANNELS, channel, save
+from tests.prepare.networks.networks import given as network_input
 from tests.prepare.video.videos import render, walk, write_video
 from tests.prepare.world.stills import crop, write_still
 from tests.scenes import write_scene
@@ -94,6 +97,52 @@ def test_each_source_is_masked_by_what_is_the_same_in_it(
     }
     assert len(shares["borne"]) == len(shares["free"]) == 6 and len(shares["few"]) == 2
     assert min(shares["borne"]) > 0.1 and max(shares["free"]) < 0.02 and max(shares["few"]) == 0
+
+
+def red_ones(folder: Path) -> Path:
+    """A network of views that finds what is red."""
+    size = 64
+    put = network_input(size, width=size, seam="tiles", fov=90)
+    others = [channel(1, "green"), helper.make_node("Neg", ["green"], ["without"])]
+    nodes = [channel(0, "red"), *others, helper.make_node("Add", ["red", "without"], ["found"])]
+    head = {"output": "found", "threshold": 0.5, "above": "ignore"}
+    manifest = {"task": "mask", "input": put, "ignore": head}
+    return save(folder, nodes, ["found"], manifest, shape=["N", 3, size, size], constants=CHANNELS)
+
+
+@pytest.mark.system
+def test_a_network_masks_folders_and_videos_and_what_it_has_done_is_kept(
+    gathering: list[Sequence[Path]], tmp_path: Path
+) -> None:
+    """A red thing across the seam, at another height in each panorama."""
+    pictures = []
+    for number, shot in enumerate(walk([0.9] * 6)):
+        grey = render(shot, WIDTH, bearer=False).mean(axis=2, keepdims=True)
+        picture = np.repeat(grey, 3, axis=2).astype(np.uint8)
+        for columns in (slice(0, 12), slice(-12, None)):
+            picture[40 + 4 * number : 70 + 4 * number, columns] = (0, 0, 255)
+        pictures.append(picture)
+    sources = [tmp_path / "photos", write_video(tmp_path / "walk.mp4", pictures, fourcc="mp4v")]
+    sources[0].mkdir()
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(sources[0] / f"{number}.png"), picture)
+    model = red_ones(tmp_path)
+    written = list[dict[str, int]]()
+    for _ in range(2):
+        with pytest.raises(MaskedError):
+            start(sources, tmp_path / "run", nadir=0, static=False, mask_model=str(model))
+        masks = sorted((tmp_path / "run" / "prepare" / "masks").rglob("*.png"))
+        written.append({str(it): it.stat().st_mtime_ns for it in masks})
+    assert written[0] == written[1]
+    assert {it.parent.name for it in masks} == {"photos", "walk"}
+    for mask in masks:
+        ignored = np.asarray(cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)) == 0
+        assert 0.5 < ignored.sum() / (30 * 24) < 2
+        assert ignored[:, :20].any() and ignored[:, -20:].any() and not ignored[:, 24:-24].any()
+    result = notes.read_result(RunFolder(tmp_path / "run"), Step.MASKS)
+    assert result is not None
+    assert result.settings == {"nadir": 0, "static": False, "model": str(model)}
+    assert result.lines[-1].endswith("% of the sphere: what net.onnx finds")
 
 
 @pytest.mark.system

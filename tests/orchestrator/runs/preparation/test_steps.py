@@ -21,8 +21,8 @@ from panolog.orchestrator.runs.preparation.settings import Options, Step, read_s
 from panolog.orchestrator.runs.records import Noticed, Preparing
 from panolog.orchestrator.runs.state import ignore
 from panolog.orchestrator.runs.store import read_records
+from panolog.orchestrator.watch.dashboard.api import encoded_map
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
-from panolog.orchestrator.watch.dashboard.maps import MapCache
 from panolog.prepare.sfm.pipeline import workspace_folder
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
@@ -31,6 +31,9 @@ from tests.orchestrator.runs.preparation.fake_sfm import FakeSfm, Killed, resume
 from tests.prepare.networks.networks import given, red_depth
 
 pytestmark = pytest.mark.system
+
+KILLED_AT = ("masks", "poses", "check")  # the first step, the one with work of its own to keep, the last one
+OTHERS = [pytest.param(moment, marks=pytest.mark.nightly) for moment in ("features", "report")]
 
 
 def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> None:
@@ -56,7 +59,7 @@ def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> N
     assert done["preparation"]["registered"] == 9
 
 
-@pytest.mark.parametrize("moment", ["features", "poses", "report", "masks", "check"])
+@pytest.mark.parametrize("moment", [*KILLED_AT, *OTHERS])
 def test_a_run_killed_in_a_step_ends_with_the_same_bytes(
     moment: str, calm: RunFolder, raw: Path, sfm: FakeSfm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,7 +153,7 @@ def test_the_map_grows_with_the_poses(raw: Path, sfm: FakeSfm, tmp_path: Path) -
 
     def look(at: str) -> None:
         if at in ("features", "poses", "check"):
-            figure = json.loads(MapCache().map_of(entry))
+            figure = json.loads(encoded_map(entry.folder))
             seen.append(
                 {trace["name"]: trace for trace in figure["data"]} | {"names": figure["blocks"]["names"]}
             )

@@ -29,7 +29,7 @@ from panolog.orchestrator.runs.records import (
     TaskStarted,
     ViewEvaluated,
 )
-from panolog.orchestrator.watch.dashboard import server
+from panolog.orchestrator.watch.dashboard import guard, server
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.workers.tasks import COARSE, EVAL, TaskId
@@ -72,7 +72,7 @@ def write_whole_run(root: Path, scene: str = "/scenes/town") -> RunFolder:
     write_plan(folder, plan(), SCORES)
     for path in (folder.root / "coarse" / "previews" / "000050.jpg", folder.images / "a" / "0.jpg"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), np.zeros((8, 16, 3), np.uint8))
+        cv2.imwrite(str(path), np.zeros((16, 16, 3), np.uint8))
     folder.point_cloud.write_bytes(b"ply\n")
     folder.report.write_text("<script>1</script>")
     append(
@@ -129,7 +129,7 @@ def serving(
     root: Path, *, token: str | None = None, port: int = 0, queue: Path | None = None
 ) -> Iterator[Served]:
     """A server in a thread while the context lasts."""
-    listener = server.listen("127.0.0.1", port)
+    listener = guard.listen("127.0.0.1", port)
     running = server.make_server(root, listener, token, queue)
     thread = Thread(target=running.run, kwargs={"sockets": [listener]})
     thread.start()

@@ -13,7 +13,7 @@ from panolog.orchestrator.cli.session.companion import companion_dashboard
 from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Outcome, RunBegan, RunEnded
-from panolog.orchestrator.watch.dashboard import discovery, guard, server
+from panolog.orchestrator.watch.dashboard import discovery, guard
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.scene.errors import InputError
 from tests.orchestrator.cli.program import call, one_line
@@ -205,17 +205,17 @@ def test_a_port_that_is_taken_and_a_folder_that_is_none(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(InputError, match=f"127.0.0.1:{port}: cannot listen there: .*; choose another"):
-            server.listen("127.0.0.1", port)
+            guard.listen("127.0.0.1", port)
         assert "choose another --host or --port" in one_line(call("dashboard", tmp_path, "--port", port))
     assert one_line(call("dashboard", tmp_path / "nothing")).endswith("nothing: is not a folder")
 
 
 def test_addresses() -> None:
-    with server.listen("127.0.0.1", 0) as listener:
+    with guard.listen("127.0.0.1", 0) as listener:
         port = listener.getsockname()[1]
-        assert server.address(listener, "127.0.0.1", None) == f"http://127.0.0.1:{port}/"
-        assert server.address(listener, "::1", None) == f"http://[::1]:{port}/"
-        named = server.address(listener, "0.0.0.0", "secret")
+        assert guard.address(listener, "127.0.0.1", None) == f"http://127.0.0.1:{port}/"
+        assert guard.address(listener, "::1", None) == f"http://[::1]:{port}/"
+        named = guard.address(listener, "0.0.0.0", "secret")
     assert named == f"http://{socket.gethostname()}:{port}/?token=secret"
 
 

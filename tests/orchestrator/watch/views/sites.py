@@ -143,12 +143,17 @@ def layers(viewpoints: Viewpoints, count: int = 60) -> Gaussians:
     return balls(viewpoints, torch.cat([across, depth], 1), depth[:, 0] * 0.1)
 
 
-def page_of_layers(root: Path) -> tuple[Path, Gaussians, Viewpoints]:
-    """The page of `layers` as one file, with their model and the viewpoints, which begin at 1.jpg."""
+def page_of_layers(root: Path, opacities: torch.Tensor | None = None) -> tuple[Path, Gaussians, Viewpoints]:
+    """The page of `layers` as one file, with their model and the viewpoints, which begin at 1.jpg.
+
+    Args: opacities (60,) of the layers, logits, if they are not to be opaque.
+    """
     folder = begun(root / "run")
     save_plan(folder)
     viewpoints = viewpoints_of(folder, "1.jpg")
     model = layers(viewpoints)
+    if opacities is not None:
+        model = replace(model, opacities=opacities)
     folder.of(COARSE).mkdir()
     write_ply(folder.model(COARSE), model)
     write_file(site_of_run(folder, Wanted(camera="1.jpg")), root / "page.html")

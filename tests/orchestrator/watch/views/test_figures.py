@@ -138,7 +138,7 @@ def panorama(number: int, **changes: Any) -> dict[str, Any]:
 
 def test_a_curve_has_both_ends_and_stops_of_each_channel(tmp_path: Path) -> None:
     folder = written(tmp_path, {"panoramas": [panorama(number) for number in range(1_500)]})
-    curve = exposure_curve(folder, Path.read_bytes)
+    curve = exposure_curve(folder)
     assert curve is not None
     assert len(curve.name) == len(curve.stops) == len(curve.red) == 600
     assert (curve.name[0], curve.name[-1], curve.stops[-1]) == ("0.jpg", "1499.jpg", 14.99)
@@ -157,7 +157,7 @@ def test_a_curve_has_both_ends_and_stops_of_each_channel(tmp_path: Path) -> None
     ],
 )
 def test_another_format_is_no_curve(content: Any, tmp_path: Path) -> None:
-    assert exposure_curve(written(tmp_path, content), Path.read_bytes) is None
+    assert exposure_curve(written(tmp_path, content)) is None
 
 
 # Linear RGB as seen with no red and with no green cones: Machado, Oliveira and Fernandes 2009, severity 1.

@@ -16,6 +16,15 @@ from tests.visual.compare import expand
 pytestmark = pytest.mark.system
 
 
+def move(page: Page, name: str, value: int) -> None:
+    """Moves a slider that may be behind others."""
+    page.evaluate(
+        "([name, value]) => { const slider = document.getElementById(name); slider.value = value;"
+        " slider.dispatchEvent(new Event('input')); }",
+        [name, value],
+    )
+
+
 def press(page: Page, name: str) -> None:
     """Presses a button that may be behind others."""
     page.evaluate(f"document.getElementById({name!r}).click()")
@@ -37,8 +46,7 @@ def test_views_are_saved_cropped_and_rendered_from(browser: Browser, tmp_path: P
         path.value.save_as(tmp_path / "path.json")
         press(page, "home")
         page.evaluate("document.getElementById('edges').style.display = 'none'")
-        slider = "document.getElementById('lower-x')"
-        page.evaluate(f"{slider}.value = 500; {slider}.dispatchEvent(new Event('input'))")
+        move(page, "lower-x", 500)
         option = page.evaluate("document.getElementById('option').textContent")
         cropped = shown(page)
         press(page, "whole")
@@ -56,3 +64,33 @@ def test_views_are_saved_cropped_and_rendered_from(browser: Browser, tmp_path: P
     assert np.allclose(first.rotation, axes, atol=1e-3)
     assert np.allclose(-first.rotation.T @ first.translation, start.position, atol=1e-3)
     assert np.arccos(last.rotation[2] @ viewpoints.up) == pytest.approx(np.deg2rad(80), abs=1e-3)
+
+
+def test_floaters_are_hidden_as_export_leaves_them_out(browser: Browser, tmp_path: Path) -> None:
+    order = torch.randperm(60, generator=torch.Generator().manual_seed(2))
+    file, model, viewpoints = page_of_layers(tmp_path, torch.linspace(-2, 4, 60)[order])
+    with opened(browser, file.as_uri(), width=SIZE[0], height=SIZE[1]) as page:
+        whole = shown(page)
+        for faint, large in ((500, 1000), (0, 500), (500, 500)):
+            move(page, "fainter", faint)
+            move(page, "larger", large)
+            text = page.evaluate("document.getElementById('option').textContent")
+            option = {name: float(value) for name, value in (word.split("=") for word in text.split())}
+            assert option.keys() == {
+                name for name, given in (("--min-opacity", faint > 0), ("--max-size", large < 1000)) if given
+            }
+            selection = Selection(
+                min_opacity=option.get("--min-opacity", 0.0), max_size=option.get("--max-size")
+            )
+            kept = selection.keeps(Splats.of(model), np.ones(len(model), bool))
+            assert 5 < kept.sum() < len(model) - 5
+            cleaned = shown(page)
+            inside = model.select(torch.from_numpy(kept))
+            quality, other = (
+                psnr(cleaned, rendered(it, viewpoints, SIZE, background=cleaned[0, 0]))
+                for it in (inside, model)
+            )
+            assert quality >= max(25, other + 3), f"{text}: {quality:.1f} dB, with all {other:.1f} dB"
+        press(page, "whole")
+        assert psnr(shown(page), whole) > 35
+        assert page.evaluate("document.getElementById('kept').hidden")

@@ -26,7 +26,7 @@ from panolog.orchestrator.runs.records import (
     TaskYielded,
 )
 from panolog.orchestrator.runs.state import RunState
-from panolog.orchestrator.watch.views.summary import task_label
+from panolog.orchestrator.watch.views.summary import summarize, task_label
 from panolog.orchestrator.watch.views.terminal import WIDE, page, progress
 from panolog.workers.tasks import EVAL, Stage
 from tests.orchestrator.history import started
@@ -56,7 +56,8 @@ def shown(records: list[Timed], width: int, *, running: bool) -> str:
     began = time.time() - records[-1][0] - 1
     records = [(began + at, record) for at, record in records]
     output, root = StringIO(), Path("runs/my street")
-    content = page(state(records), root=root, running=running, wide=width >= WIDE)
+    summary = summarize(state(records), running=running, root=root)
+    content = page(summary, root=root, wide=width >= WIDE)
     Console(file=output, width=width).print(content, crop=False)
     return output.getvalue()
 

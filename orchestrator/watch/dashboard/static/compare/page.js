@@ -98,7 +98,6 @@ const [soon, curvesSoon] = [throttled(refresh, POLL), throttled(refreshCurves, C
 const line = connectionLine(
   (time) => {
     lost = time;
-    document.body.classList.toggle("lost", time !== null);
     show();
   },
   () => " — below is the last known state; trying again …",

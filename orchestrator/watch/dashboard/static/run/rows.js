@@ -1,11 +1,11 @@
 // The rows of the block table: Stage I and all blocks of the plan, and the status of each block on the map.
 
-/** @import { BlockView, RunPage, Status, TaskView } from "../shared/messages.js" */
+/** @import { BlockPlan, RunPage, Status, TaskView } from "../shared/messages.js" */
 import { blockTask } from "panolog/shared/format.js";
 
 /**
  * A row: a task, which has few fields before it starts. `block` is -1 for all but blocks, `place` that in the order of the stages, `kept` is a block that is not trained.
- * @typedef {Partial<Omit<TaskView, "status">> & {name: string, status: Status | "kept" | "pausing", share: number, block: number, place: number, plan?: BlockView, kept: boolean, device: string}} Row
+ * @typedef {Partial<Omit<TaskView, "status">> & {name: string, status: Status | "kept" | "pausing", share: number, block: number, place: number, plan?: BlockPlan, kept: boolean, device: string}} Row
  */
 
 /** The statuses of a block; "kept" is not trained. */
@@ -33,7 +33,7 @@ export function blockStatuses({ summary }) {
 export function trainingRows({ summary, nodes, paused }) {
   const devices = new Map(nodes.map((node) => [node.node, node.gpus.join(", ") || node.device]));
   const tasks = new Map(summary.tasks.map((task) => [task.name, task]));
-  /** @param {string} name @param {number} block @param {BlockView} [plan] @returns {Row} */
+  /** @param {string} name @param {number} block @param {BlockPlan} [plan] @returns {Row} */
   const row = (name, block, plan) => {
     const task = tasks.get(name) ?? { name, status: "waiting", share: 0, retries: 0, reasons: [] };
     const kept = plan !== undefined && !plan.train;

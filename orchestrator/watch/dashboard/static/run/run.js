@@ -17,6 +17,7 @@ import { views } from "panolog/run/views.js";
 import { connectionLine, get, messageOf, snapshot, statusOf, stream } from "panolog/shared/api.js";
 import { byId, setMessage } from "panolog/shared/dom.js";
 import { shellWord } from "panolog/shared/format.js";
+import { plotly } from "panolog/shared/plot.js";
 
 const id = snapshot ? "report" : encodeURIComponent(location.pathname.split("/").filter(Boolean).pop() ?? "");
 const path = `runs/${id}`;
@@ -141,9 +142,9 @@ function lastState() {
 
 const line = connectionLine((time) => {
   lost = time;
-  document.body.classList.toggle("lost", time !== null);
   if (known) show(known);
 }, lastState);
+plotly().catch(() => {}); // now, as a run may only begin; what draws first says what is wrong
 stream(
   `?run=${id}&changes=1`,
   () => {

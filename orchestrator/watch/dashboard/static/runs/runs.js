@@ -180,7 +180,6 @@ function show() {
 const line = connectionLine(
   (time) => {
     lost = time !== null;
-    document.body.classList.toggle("lost", lost);
     show();
   },
   () => " — below is the last known state; trying again …",

@@ -21,8 +21,8 @@ export interface BlockCameras {
   cameras: Array<BlockCamera>;
 }
 
-/** A block of the plan; without `train` it keeps its Stage I Gaussians. */
-export interface BlockView {
+/** One block of the plan: what it weighs and whether it is trained at all. */
+export interface BlockPlan {
   block: number;
   cameras: number;
   gaussians: number;
@@ -142,8 +142,8 @@ export interface Findings {
   pictures: Array<string>;
 }
 
-/** What a GPU does; `utilization` 0 to 1. */
-export interface GpuUsageView {
+/** What one GPU does; None where nvidia-smi does not know it. */
+export interface GpuUsage {
   name: string;
   utilization: number | null;
   memory_used: number | null;
@@ -557,7 +557,7 @@ export interface Summary {
   leaving: Array<LeavingView>;
   money: MoneyView | null;
   tasks: Array<TaskView>;
-  blocks: Array<BlockView>;
+  blocks: Array<BlockPlan>;
 }
 
 /** The state of a run but for its tasks and blocks. */
@@ -622,7 +622,7 @@ export interface UsageView {
   memory_total: number;
   disk_used: number;
   disk_total: number;
-  gpus: Array<GpuUsageView>;
+  gpus: Array<GpuUsage>;
 }
 
 /** Seconds of machines, and their cost; None where no price is known. */

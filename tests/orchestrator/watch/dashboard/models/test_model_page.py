@@ -165,6 +165,7 @@ def test_a_model_in_training_is_replaced_by_newer_ones_and_the_view_stays(
     """From its first picture on: upright, at a panorama, with cameras, before there is a plan."""
     monkeypatch.setattr(pages, "_REFRESH_S", 1)
     monkeypatch.setattr(pages, "_SHARE", 1e6)  # as soon as there is one
+    monkeypatch.setattr(making, "_IDLE_S", 600)  # one process makes all pages
     folder = write_run(tmp_path / "run")
     write_json(folder.outline, plan().to_json())
     with lock.hold(folder.lock), serving(tmp_path) as served:

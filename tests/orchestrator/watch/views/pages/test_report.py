@@ -24,8 +24,6 @@ from panolog.orchestrator.runs.info import read_info
 from panolog.orchestrator.runs.records import Noticed, Stored, TaskFailed
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.dashboard.messages import (
-    BlockCameras,
-    CameraView,
     EventList,
     HeldOutViews,
     PreviewList,
@@ -33,6 +31,7 @@ from panolog.orchestrator.watch.dashboard.messages import (
     Series,
 )
 from panolog.orchestrator.watch.views.pages.report import report_or_notice, write_report
+from panolog.orchestrator.watch.views.plan_page import BlockCameras, CameraView
 from panolog.scene.errors import InputError, RunError
 from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE

@@ -112,7 +112,7 @@ def test_all_is_there_without_network(browser: Browser, report: Path) -> None:
         _unfold(page)
         expect(page.locator("#map-plot")).to_be_visible()
         expect(page.locator("#actions button, #selected button, #cost:visible")).to_have_count(0)
-        assert page.evaluate("[...document.images].filter((image) => !image.naturalWidth).length") == 0
+        page.wait_for_function("[...document.images].every((image) => image.naturalWidth)")
         page.locator(".face .mark").check()
         expect(page.locator(".strips .line").first).to_be_visible()
 
