@@ -34,7 +34,8 @@ from panolog.scene.files import atomic, natural_key
 _SENSOR = 0  # COLMAP's type of a sensor that is a camera
 LARGEST = 1e12  # of any coordinate: a larger one is no place, and its square must stay a number
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: text models have as few as four digits
-Posed = tuple[str, NDArray[np.float64], NDArray[np.float64]]  # name, rotation (3, 3), translation (3,)
+# Name, rotation (3, 3) or quaternion (4,) w x y z, translation (3,).
+Posed = tuple[str, NDArray[np.float64], NDArray[np.float64]]
 Observations = tuple[NDArray[np.int64], NDArray[np.float64]]  # (M,) rows of the points, (M, 2) pixels
 
 
@@ -49,6 +50,7 @@ class ColmapImage:
     observed: NDArray[np.int64]  # (N,) rows of the model's points whose tracks have the image, ascending
     points: NDArray[np.int64]  # (M,) rows of the model's points, one for each observation
     pixels: NDArray[np.float64]  # (M, 2) of the observations, pixel centres at +0.5
+    quaternion: NDArray[np.float64]  # (4,) w x y z of the rotation, as the file has it
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +176,12 @@ def _point_records(
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """w x y z of a rotation (3, 3), from its largest value: as Eigen, and so COLMAP, computes it."""
+    """w x y z of a rotation (3, 3), from its largest value: as Eigen, and so COLMAP, computes it.
+
+    A quaternion (4,) stays as it is.
+    """
+    if rotation.shape == (4,):
+        return rotation
     R, trace = rotation, rotation[0, 0] + (rotation[1, 1] + rotation[2, 2])
     if trace > 0:
         root = math.sqrt(trace + 1)
@@ -261,6 +268,7 @@ def _image(
         observed.get(record.id, np.empty(0, np.int64)),
         row[known].astype(np.int64),
         pixels,
+        np.array(record.pose[:4]),
     )
 
 

@@ -35,6 +35,7 @@ from panolog.scene.stores.outline import outline
 from panolog.scene.stores.url import is_url
 
 DEPTHS, SKY_MASKS, MASKS = "depths", "skymasks", "masks"
+DEPTH_PARAMS = "depth_params.json"  # next to the model
 # Where the model is in a scene: as COLMAP has it, and those that others make of equirectangular pictures.
 MODELS = ("sparse/0", "sparse", "sparse_equirectangular/0", "colmap/sparse/0")
 MIN_CAMERAS = 2  # one panorama has no parallax
@@ -256,7 +257,7 @@ def _read_depth_params(folder: Path) -> dict[str, tuple[float, float]]:
 
     Raises SceneError: the file is not JSON of that form.
     """
-    path = folder / "depth_params.json"
+    path = folder / DEPTH_PARAMS
     if not path.is_file():
         return {}
     try:

@@ -97,6 +97,9 @@ class PosedImage:
     rotation: NDArray[np.float64]  # (3, 3)
     translation: NDArray[np.float64]  # (3,)
     sightings: Sightings = UNSEEN  # which points it sees, and where as fractions of width and height
+    quaternion: NDArray[np.float64] | None = (
+        None  # (4,) w x y z, to be kept bit by bit; None: of the rotation
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +109,7 @@ class NewScene:
     images: Sequence[PosedImage]  # in the natural order of their names
     size: tuple[int, int]  # width and height of each
     points: NDArray[np.float64]  # (P, 3) world units
-    colors: NDArray[np.uint8] | None  # (P, 3) RGB; None: from the panoramas
+    colors: NDArray[np.uint8] | None  # (C, 3) RGB of the first C points; others' are from the panoramas
     split: Mapping[str, Sequence[str]] | None = None  # stems by "train.txt" and "test.txt"; None: every 8th
     layers: Mapping[str, Sequence[Path | None]] | None = None  # by folder, for each image its file
     offset: Offset | None = None
@@ -118,11 +121,19 @@ def require_new(output: Path) -> None:
         raise SceneError(f"{output}: already exists; give a new folder")
 
 
-def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress = no_progress) -> None:
+def write_scene(
+    output: Path,
+    new: NewScene,
+    *,
+    link: bool,
+    progress: Progress = no_progress,
+    complete: Callable[[Path], None] = no_progress,
+) -> None:
     """Writes `new` to the folder `output`, which must be new or empty.
 
     Args:
         progress: called after each panorama that is copied, and again after each that gives points a colour.
+        complete: called with the folder before it is at `output`, for what else belongs into it.
 
     Raises SceneError: it could not be trained; `output` is then untouched; OSError: a file cannot be read or
     written.
@@ -131,14 +142,19 @@ def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress =
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}{SUFFIX}")
     try:
-        steps = len(new.images) * (2 if new.colors is None else 1)
+        colors = np.empty((0, 3), np.uint8) if new.colors is None else new.colors
+        given = len(colors)
+        steps = len(new.images) * (2 if given < len(new.points) else 1)
         _copy_files(temporary, new, link, lambda done, _: progress(done, steps))
-        colors = new.colors
-        if colors is None:
-            colors = _sampled(new.images, len(new.points), lambda done, total: progress(total + done, steps))
+        if given < len(new.points):
+            seen = _sampled(new.images, len(new.points), lambda done, total: progress(total + done, steps))
+            colors = np.concatenate([colors, seen[given:]])
         write_colmap(
             temporary / "sparse" / "0",
-            [(image.name, image.rotation, image.translation) for image in new.images],
+            [
+                (it.name, it.rotation if it.quaternion is None else it.quaternion, it.translation)
+                for it in new.images
+            ],
             width=new.size[0],
             height=new.size[1],
             points=new.points,
@@ -149,6 +165,7 @@ def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress =
             write_bytes(temporary / name, ("\n".join(members) + "\n").encode())
         if new.offset is not None:
             write_offset(temporary, new.offset)
+        complete(temporary)
         _check(temporary, output)
         temporary.replace(target)
     finally:

@@ -127,6 +127,10 @@ def sfm(
         list[Path], argument("SOURCE...", "Folders of panoramas and 360° videos, one or several.")
     ],
     output: NewSceneOption,
+    into: Annotated[
+        Path | None,
+        option("SCENE", "Add them to this scene, of which nothing moves; -o gets both.", "--into"),
+    ] = None,
     pairs: Annotated[
         Literal["auto", "exhaustive", "sequential"],
         option("HOW", "Pairs to match: auto, exhaustive or sequential.", "--pairs"),
@@ -146,6 +150,7 @@ def sfm(
 ) -> None:
     """Make a scene from raw panoramas and 360° videos, also several: find poses and points."""
     from panolog.orchestrator.runs.machines.machine import memory
+    from panolog.prepare.sfm.joining.join import join_scene
     from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
     from panolog.prepare.video.frames import PARALLAX
 
@@ -163,8 +168,12 @@ def sfm(
         trajectory=trajectory,
     )
     with progress_bar("reading the panoramas", resumable=True) as show:
-        given = source if len(source) > 1 else source[0]
-        report = make_scene(given, output, settings, show, memory=memory() * 3 // 4)
+        free = memory() * 3 // 4
+        if into is not None:
+            report = join_scene(source, into, output, settings, show, memory=free)
+        else:
+            given = source if len(source) > 1 else source[0]
+            report = make_scene(given, output, settings, show, memory=free)
     print_result({"scene": str(output), **report.as_json()}, report.lines(), as_json=as_json)
     _suggest_check(output, as_json=as_json, drawn=output / "sfm.png")
 

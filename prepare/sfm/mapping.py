@@ -3,6 +3,7 @@
 import shutil
 from typing import Literal
 
+import numpy as np
 import pycolmap
 
 from panolog.prepare.sfm.workspace import Workspace
@@ -17,21 +18,29 @@ _LEAST = (
 
 
 def map_pairs(
-    work: Workspace, mapper: Mapper, max_error: float, progress: StageProgress
+    work: Workspace,
+    mapper: Mapper,
+    max_error: float,
+    progress: StageProgress,
+    known: pycolmap.Reconstruction | None = None,
 ) -> pycolmap.Reconstruction | None:
     """The reconstruction of most panoramas from the verified pairs of a database; None if there is none.
 
-    Args: max_error, pixels that an observation may be away from its point.
+    Args: max_error, pixels that an observation may be away from its point; known, a reconstruction of some of
+    them, that of others is added to: its poses stay.
     """
     shutil.rmtree(work.models, ignore_errors=True)
     work.models.mkdir(parents=True)
-    models = _global(work, progress) if mapper == "global" else _incremental(work, max_error, progress)
+    found = _global(work, progress) if mapper == "global" else None
+    models = _incremental(work, max_error, progress, known) if found is None else found
     if not models:
         return None
     return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
 
 
-def _incremental(work: Workspace, max_error: float, progress: StageProgress) -> list[pycolmap.Reconstruction]:
+def _incremental(
+    work: Workspace, max_error: float, progress: StageProgress, known: pycolmap.Reconstruction | None
+) -> list[pycolmap.Reconstruction]:
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2
     options.extract_colors = False
@@ -47,6 +56,12 @@ def _incremental(work: Workspace, max_error: float, progress: StageProgress) -> 
     options.mapper.init_min_tri_angle = _FIRST_ANGLE
     options.mapper.abs_pose_min_num_inliers = _LEAST
     models, done = pycolmap.ReconstructionManager(), 2
+    if known is not None:
+        known.write(work.models)
+        models.read(work.models)
+        options.fix_existing_frames = options.load_all_images = True
+        options.structure_less_registration_fallback = False  # it needs no points, and so finds no scale
+        options.multiple_models, done = False, known.num_reg_images()
 
     def another() -> None:
         nonlocal done
@@ -62,7 +77,21 @@ def _incremental(work: Workspace, max_error: float, progress: StageProgress) -> 
     pipeline.add_callback(pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK, another)
     pipeline.run()
     progress("poses", len(work.numbers), len(work.numbers))
+    if known is not None:
+        _put_back(models.get(0), known)
     return [models.get(number) for number in range(models.size())]
+
+
+def _put_back(model: pycolmap.Reconstruction, known: pycolmap.Reconstruction) -> None:
+    """Undoes COLMAP's normalisation of a model that has those of `known`: a shift and a scale."""
+    posed = [image.image_id for image in known.images.values() if image.has_pose]
+    before, after = (
+        np.array([it.image(number).projection_center() for number in posed]) for it in (known, model)
+    )
+    sizes = [float(np.linalg.norm(centers - centers.mean(axis=0))) for centers in (before, after)]
+    scale = sizes[0] / sizes[1]
+    shift = before.mean(axis=0) - scale * after.mean(axis=0)
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), shift))
 
 
 def _global(work: Workspace, progress: StageProgress) -> list[pycolmap.Reconstruction]:

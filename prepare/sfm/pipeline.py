@@ -137,8 +137,13 @@ def _write(output: Path, report: SfmReport, link: bool, progress: StageProgress)
     """Writes the scene of a part, with its report: the first in SCENE, the second in SCENE-2."""
     scene = output if report.number == 1 else output.with_name(f"{output.name}-{report.number}")
     new = _scene(report.found, report.world)
-    write_scene(scene, new, link=link, progress=lambda d, n: progress("scene", d, n))
-    write_report(scene, report)
+    write_scene(
+        scene,
+        new,
+        link=link,
+        progress=lambda d, n: progress("scene", d, n),
+        complete=lambda folder: write_report(folder, report),
+    )
 
 
 def _georeference(found: Reconstruction, settings: SfmSettings, first: bool) -> Georeference:

@@ -70,20 +70,10 @@ def reconstruct(
     Returns: the parts that are each without a contradiction, the largest first.
     Raises: SceneError, a file is damaged or of another size, or the panoramas share too little.
     """
-    size = check_images([panorama.path for panorama in panoramas])
-    names = [panorama.name for panorama in panoramas]
-    work = Workspace(folder, tuple(panoramas), sketcher=sketcher)
-    masks = [
-        [path for layer in (MASKS, SKY_MASKS) if (path := layers.get(layer, [None] * len(names))[row])]
-        for row in range(len(names))
-    ]
-    allowed = max_error(size[0])
-    work.open([_VERSION, allowed, [[(str(path), *file_state(path)) for path in paths] for paths in masks]])
     with silence_colmap():
-        features = find_features(work, masks, progress, memory)
-        if features == 0:
-            where = panoramas[0].path.parent
-            raise SceneError(f"{where}: no features in any panorama; are they masked, or empty?")
+        work = Workspace(folder, tuple(panoramas), sketcher=sketcher)
+        size, features = featured(work, layers, progress, memory)
+        allowed = max_error(size[0])
         pairs = choose_pairs(work, pairing, progress, [] if places is None else near_pairs(places, _NEAREST))
         match_pairs(work, pairs, allowed, progress)
         solver = Solver(work, size, mapper, allowed, progress, places)
@@ -101,9 +91,9 @@ def reconstruct(
             layers=layers,
             size=size,
             model=model,
-            links=_links(model, size[0]),
+            links=links_of(model, size[0]),
             contradictions=[it for it in against if set(it.between) & set(model.rows)],
-            missing={row: shared[row] for row in range(len(names)) if row not in model.rows},
+            missing={row: shared[row] for row in range(len(panoramas)) if row not in model.rows},
             others=[other.rows for other in models if other is not model],
             features=features,
             pairs=len(pairs),
@@ -112,7 +102,28 @@ def reconstruct(
     ]
 
 
-def _links(model: SparseModel, width: int) -> list[Link]:
+def featured(
+    work: Workspace, layers: LayerFiles, progress: StageProgress, memory: int
+) -> tuple[tuple[int, int], int]:
+    """The width and height of the panoramas of a workspace, and how many features it then has of them.
+
+    Raises SceneError as `reconstruct` does.
+    """
+    size, count = check_images([panorama.path for panorama in work.panoramas]), len(work.panoramas)
+    masks = [
+        [path for layer in (MASKS, SKY_MASKS) if (path := layers.get(layer, [None] * count)[row])]
+        for row in range(count)
+    ]
+    states = [[(str(path), *file_state(path)) for path in paths] for paths in masks]
+    work.open([_VERSION, max_error(size[0]), states])
+    features = find_features(work, masks, progress, memory)
+    if features == 0:
+        where = work.panoramas[0].path.parent
+        raise SceneError(f"{where}: no features in any panorama; are they masked, or empty?")
+    return size, features
+
+
+def links_of(model: SparseModel, width: int) -> list[Link]:
     """Between parts of a model of panoramas of that width in pixels, the weakest first."""
     sigma = float(np.median(np.concatenate(model.errors(width)))) * 2 * np.pi / width
     return find_links(model.centers, model.points, [rows for rows, _ in model.sightings], sigma)

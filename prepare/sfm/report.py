@@ -18,6 +18,14 @@ from panolog.scene.files import write_bytes
 WEAK = 0.01  # relative error of the scale across a link, by rays alone, from which it is reported
 
 
+@dataclass(frozen=True)
+class Into:
+    """The scene that panoramas were added to."""
+
+    scene: Path
+    panoramas: int  # that it had: the first ones of the reconstruction
+
+
 @dataclass(frozen=True, eq=False)
 class SfmReport:
     """A reconstruction for users and programs."""
@@ -28,12 +36,14 @@ class SfmReport:
     left_out: tuple[str, ...] = ()  # what of the source was not read, one line for each kind
     number: int = 1  # of the part
     sources: tuple[Source, ...] = ()  # in the order of capture, where there are several
+    into: Into | None = None  # the scene that the sources were added to
 
     def as_json(self) -> dict[str, Any]:
         """As `--json` prints it. Errors are in pixels of the panoramas, scale errors relative."""
         model = self.found.model
         errors = model.errors(self.found.size[0])
         lengths = np.bincount(np.concatenate([rows for rows, _ in model.sightings]))
+        lengths = lengths[lengths > 0]  # of a scene without observations there may be none
         return {
             "panoramas": len(self.found.panoramas),
             "registered": len(model.rows),
@@ -69,14 +79,18 @@ class SfmReport:
             "notes": list(self.notes),
             "left_out": list(self.left_out),
             **({"sources": [self._source(it) for it in self.sources]} if self.sources else {}),
+            **({} if self.into is None else {"into": self._joined(self.into)}),
         }
 
     def lines(self) -> Iterator[str]:
         """The same as text."""
         content = self.as_json()
+        posed = f"{content['registered']} of {content['panoramas']} panoramas have a pose"
+        if self.into is not None:
+            it = content["into"]
+            posed = f"{it['joined']} of {it['given']} panoramas joined the {it['panoramas']} of {it['scene']}"
         yield (
-            f"{content['registered']} of {content['panoramas']} panoramas have a pose, "
-            f"{content['points']:,} points, seen by {content['track_length']:.1f} panoramas, "
+            f"{posed}, {content['points']:,} points, seen by {content['track_length']:.1f} panoramas, "
             f"{content['error']:.2f} pixels off"
         )
         for source in content.get("sources", ()):
@@ -110,9 +124,18 @@ class SfmReport:
                 "fit their poses: one of them stands elsewhere than their matches say, as happens where "
                 "windows repeat. Take more panoramas around them, or leave some out"
             )
-        yield self._frame()
+        if self.into is None:
+            yield self._frame()
+        else:
+            yield f"the world: that of {self.into.scene}, in which nothing has moved"
         yield from self.notes
         yield from self.left_out
+
+    def _joined(self, into: Into) -> dict[str, Any]:
+        """How many of the panoramas that were given have a pose in the scene."""
+        given = len(self.found.panoramas) - into.panoramas
+        joined = len(self.found.model.rows) - into.panoramas
+        return {"scene": str(into.scene), "panoramas": into.panoramas, "given": given, "joined": joined}
 
     def _source(self, source: Source) -> dict[str, Any]:
         """How many of the panoramas of a source have a pose in this part."""

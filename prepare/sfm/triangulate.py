@@ -1,5 +1,6 @@
 """Points for formats with poses only: features, matches between neighbours, triangulation, poses kept."""
 
+import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +10,7 @@ import pycolmap
 
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.features import find_features
-from panolog.prepare.sfm.pairs import Pairs, match_pairs
+from panolog.prepare.sfm.pairs import match_pairs
 from panolog.prepare.sfm.reconstruct import max_error
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.workspace import Workspace, silence_colmap
@@ -38,13 +39,12 @@ def triangulate(
         work = Workspace(Path(name), panoramas)
         work.open(None)
         find_features(work, [[] for _ in panoramas], progress)
-        match_pairs(work, _neighbours(work, images), max_error(size[0]), progress)
-        work.models.mkdir()
+        ids = work.ids()
+        pairs = [(ids[a], ids[b]) for a, b in neighbours(images)]
+        match_pairs(work, sorted(pairs), max_error(size[0]), progress)
         progress("points", 0, len(images))
         try:
-            model = pycolmap.triangulate_points(
-                _model(work, images, size), work.database, work.images, work.models
-            )
+            model = points_of(work, images, size)
         except (RuntimeError, ValueError) as error:
             reason = str(error).strip().split("\n")[0][:120]
             raise SceneError(
@@ -61,16 +61,27 @@ def triangulate(
     return found
 
 
-def _neighbours(work: Workspace, images: Sequence[PosedImage]) -> Pairs:
-    """Pairs of images whose cameras are near each other."""
-    ids = work.ids()
+def neighbours(images: Sequence[PosedImage]) -> set[tuple[int, int]]:
+    """Pairs of rows, ascending, of images whose cameras are near each other."""
     centers = np.stack([-image.rotation.T @ image.translation for image in images])
     pairs = set()
     for a, center in enumerate(centers):
         order = np.argsort(np.linalg.norm(centers - center, axis=1), kind="stable")
-        near = [ids[b] for b in order[: NEIGHBOURS + 1].tolist() if b != a]
-        pairs |= {(min(ids[a], b), max(ids[a], b)) for b in near}
-    return sorted(pairs)
+        pairs |= {(min(a, b), max(a, b)) for b in order[: NEIGHBOURS + 1].tolist() if b != a}
+    return pairs
+
+
+def points_of(
+    work: Workspace, images: Sequence[PosedImage], size: tuple[int, int]
+) -> pycolmap.Reconstruction:
+    """The poses of the first panoramas of a database, and the points that its pairs of them see.
+
+    Raises RuntimeError or ValueError: pycolmap finds none.
+    """
+    shutil.rmtree(work.models, ignore_errors=True)
+    work.models.mkdir()
+    model = _model(work, images, size)
+    return pycolmap.triangulate_points(model, work.database, work.images, work.models)
 
 
 def _model(work: Workspace, images: Sequence[PosedImage], size: tuple[int, int]) -> pycolmap.Reconstruction:
@@ -84,7 +95,7 @@ def _model(work: Workspace, images: Sequence[PosedImage], size: tuple[int, int])
             camera_id=number, model="EQUIRECTANGULAR", width=size[0], height=size[1], params=params
         )
         model.add_camera_with_trivial_rig(camera)
-    for name, number, image in zip(work.numbers, work.ids(), images, strict=True):
+    for name, number, image in zip(work.numbers, work.ids(), images, strict=False):
         posed = pycolmap.Image(name=name, camera_id=owners[number], image_id=number)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(image.rotation), image.translation)
         model.add_image_with_trivial_frame(posed, pose)

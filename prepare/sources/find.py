@@ -6,7 +6,7 @@ GoPro divides a recording into chapters that share its number, GH010042, GH02004
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -45,10 +45,11 @@ class Sources:
     left_out: tuple[str, ...]  # of folders of videos, one line for each kind of files
 
 
-def find_sources(given: Sequence[Path]) -> Sources:
+def find_sources(given: Sequence[Path], taken: Collection[str] = ()) -> Sources:
     """The videos and folders of panoramas that are given, and the videos in folders without pictures.
 
     Each has a label of its own: the name of its file or folder, after those above where names are equal.
+    Args: taken, labels of the scene that they are added to, if there is one.
 
     Raises SceneError: a file or folder is missing, or given twice.
     """
@@ -68,8 +69,8 @@ def find_sources(given: Sequence[Path]) -> Sources:
     twice = [path for path, count in Counter(it.path.resolve() for it in found).items() if count > 1]
     if twice:
         raise SceneError(f"{twice[0]}: is given twice; give each video and each folder once")
-    if len(found) > 1:
-        labels = _labels([it.path.resolve() for it in found])
+    if len(found) > 1 or taken:
+        labels = _labels([it.path.resolve() for it in found], taken)
         found = [replace(it, label=label) for it, label in zip(found, labels, strict=True)]
     return Sources(tuple(_in_order(found)), tuple(left_out))
 
@@ -97,18 +98,18 @@ def _without_companions(sources: Sequence[Source]) -> tuple[list[Source], list[s
     return kept, lines
 
 
-def _labels(paths: Sequence[Path]) -> list[str]:
-    """A label for each resolved path, of letters, digits, - and _, all different."""
+def _labels(paths: Sequence[Path], taken: Collection[str]) -> list[str]:
+    """A label for each resolved path, of letters, digits, - and _, all different and none that is taken."""
     depths = [1] * len(paths)
     while True:
         labels = [_label(path, depth) for path, depth in zip(paths, depths, strict=True)]
-        alike = {label for label, count in Counter(labels).items() if count > 1}
+        alike = {label for label, count in Counter(labels).items() if count > 1}.union(taken)
         deeper = [
             depth + (label in alike and depth < len(path.parts))
             for path, depth, label in zip(paths, depths, labels, strict=True)
         ]
         if deeper == depths:
-            return list(_numbered(labels))
+            return list(_numbered(labels, taken))
         depths = deeper
 
 
@@ -118,9 +119,9 @@ def _label(path: Path, depth: int) -> str:
     return "-".join("".join(it if it.isalnum() or it in "-_" else "_" for it in part) for part in parts)
 
 
-def _numbered(labels: Iterable[str]) -> Iterable[str]:
+def _numbered(labels: Iterable[str], taken: Iterable[str]) -> Iterable[str]:
     """Labels of which the second of the same name ends in -2."""
-    used = set[str]()
+    used = set(taken)
     for label in labels:
         number, new = 1, label
         while new in used:

@@ -68,8 +68,17 @@ class _Row:
     layers: dict[str, Path | None]
 
 
-def gather(sources: Sources, work: Path, choice: Choice, progress: StageProgress) -> Gathered:
-    """The panoramas of all sources. Args: work, the workspace.
+def gather(
+    sources: Sources,
+    work: Path,
+    choice: Choice,
+    progress: StageProgress,
+    known: tuple[Sequence[PanoramaFile], LayerFiles] = ((), {}),
+) -> Gathered:
+    """The panoramas of all sources.
+
+    Args: work, the workspace; known, panoramas of a scene that these are added to, with their layers. They
+        come first, and what is a copy of one is left out.
 
     Raises InputError if a source is wrong, or there is nothing else than copies of one panorama; OSError if a
     file cannot be read or written.
@@ -84,17 +93,19 @@ def gather(sources: Sources, work: Path, choice: Choice, progress: StageProgress
     for turn, source in enumerate(folders):
         show = part_of(partial(progress, "stitching"), turn, len(folders))
         folder, others = _stitched(source.path, _place(work, source), choice.up, show, notes.append)
-        rows[source] = _photographs(source, folder, MIN_CAMERAS if len(sources.all) == 1 else 1)
+        alone = len(sources.all) == 1 and not known[0]
+        rows[source] = _photographs(source, folder, MIN_CAMERAS if alone else 1)
         left_out += others
     if folders:
         taken = [row for source in folders for row in rows[source]]
-        least = 1 if videos else MIN_CAMERAS
-        whole, copies = _completed(taken, least, work / "whole", partial(progress, "metadata"))
+        least = 1 if videos or known[0] else MIN_CAMERAS
+        show = partial(progress, "metadata")
+        whole, copies = _completed(taken, known[0], least, work / "whole", show)
         left_out[:0] = copies
         rows |= {source: [it for it in whole if it.panorama.source == source.label] for source in folders}
     if len(sources.all) > 1:
         rows |= {source: _in_order(rows[source]) for source in folders}
-    found = [row for source in sources.all for row in rows[source]]
+    found = _rows(*known) + [row for source in sources.all for row in rows[source]]
     panoramas = [row.panorama for row in found]
     check_names(work, [panorama.name for panorama in panoramas])
     sized = to_one_size(panoramas, work / "sized", partial(progress, "sizes"), notes.append)
@@ -150,25 +161,27 @@ def _stitched(
 def _photographs(source: Source, folder: Path, least: int) -> list[_Row]:
     """The panoramas of a source that is a folder. Args: folder, where they are."""
     panoramas, layers = panoramas_in_folder(folder, least)
-    of_each = zip(*layers.values(), strict=True)
+    return _rows([_labelled(source, panorama) for panorama in panoramas], layers)
+
+
+def _rows(panoramas: Sequence[PanoramaFile], layers: LayerFiles) -> list[_Row]:
     return [
-        _Row(_labelled(source, panorama), dict(zip(layers, files, strict=True)))
-        for panorama, files in zip(panoramas, of_each, strict=True)
+        _Row(panorama, {layer: files[row] for layer, files in layers.items()})
+        for row, panorama in enumerate(panoramas)
     ]
 
 
 def _completed(
-    rows: Sequence[_Row], least: int, folder: Path, progress: Progress
+    rows: Sequence[_Row], known: Sequence[PanoramaFile], least: int, folder: Path, progress: Progress
 ) -> tuple[list[_Row], list[str]]:
-    """Photographs without copies, whole where they are cropped; and a line for each copy."""
+    """Photographs without copies, also of those that are known, whole where they are cropped.
+
+    And a line for each copy.
+    """
     panoramas = [row.panorama for row in rows]
     layers = {layer: [row.layers.get(layer) for row in rows] for layer in _LAYERS}
-    kept, layers, lines = without_copies(panoramas, layers, least)
-    whole = complete_panoramas(kept, folder, progress)
-    of_each = zip(*layers.values(), strict=True)
-    return [
-        _Row(it, dict(zip(layers, files, strict=True))) for it, files in zip(whole, of_each, strict=True)
-    ], lines
+    kept, layers, lines = without_copies(panoramas, layers, least, known)
+    return _rows(complete_panoramas(kept, folder, progress), layers), lines
 
 
 def _in_order(rows: Sequence[_Row]) -> list[_Row]:
@@ -207,25 +220,31 @@ def panoramas_in_folder(
 
 
 def without_copies(
-    panoramas: Sequence[PanoramaFile], layers: LayerFiles, least: int = MIN_CAMERAS
+    panoramas: Sequence[PanoramaFile],
+    layers: LayerFiles,
+    least: int = MIN_CAMERAS,
+    known: Sequence[PanoramaFile] = (),
 ) -> tuple[tuple[PanoramaFile, ...], LayerFiles, list[str]]:
     """The panoramas whose files differ, their layers, and a line for each other one: it shows nothing more.
 
+    Args: known, others that they are not to be copies of.
     Raises: SceneError, fewer than `least` differ.
     """
-    sizes = Counter(panorama.path.stat().st_size for panorama in panoramas)
+    every = [*known, *panoramas]
+    sizes = Counter(panorama.path.stat().st_size for panorama in every)
     first, kept, lines = dict[bytes, str](), list[int](), list[str]()
-    for row, panorama in enumerate(panoramas):
+    for row, panorama in enumerate(every, start=-len(known)):
         if sizes[panorama.path.stat().st_size] > 1:
             digest = hashlib.sha256(panorama.path.read_bytes()).digest()
-            if digest in first:
+            if digest in first and row >= 0:
                 lines.append(f"{panorama.name}: is a copy of {first[digest]}, left out")
                 continue
-            first[digest] = panorama.name
+            first.setdefault(digest, panorama.name)
         kept.append(row)
+    kept = kept[len(known) :]
     if len(kept) < least:
         raise SceneError(
-            f"{panoramas[0].root}: all panoramas are copies of {panoramas[0].name}; give different ones"
+            f"{panoramas[0].root}: all panoramas are copies of {every[0].name}; give different ones"
         )
     chosen = {layer: [files[row] for row in kept] for layer, files in layers.items()}
     return tuple(panoramas[row] for row in kept), chosen, lines

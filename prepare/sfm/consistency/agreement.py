@@ -85,8 +85,14 @@ def has_moved(found: Posed, between: tuple[int, int], motion: Motion | None) -> 
     """Whether a reconstruction has a motion between two panoramas; true if that is unknown."""
     if motion is None or not set(between) <= found.poses.keys():
         return True
+    known = motion_between(found, between)
+    return known is None or motion.is_like(known)
+
+
+def motion_between(found: Posed, between: tuple[int, int]) -> Motion | None:
+    """The motion from one panorama of a reconstruction to another; None if both are at one place."""
     (one, start), (other, end) = (found.poses[row] for row in between)
     rotation = other @ one.T
     shift = end - rotation @ start
     length = float(np.linalg.norm(shift))
-    return length == 0 or motion.is_like(Motion(rotation, shift / length))
+    return None if length == 0 else Motion(rotation, shift / length)

@@ -68,8 +68,9 @@ def find_contradictions(
             off = off[judged(pair, off)]
             fit = Contradiction(pair.between, len(off), int((off <= bound).sum()))
             against.append((pair, fit, float(np.median(off))))
-    sides = components(skeleton.tree - skeleton.guessed, len(evidence.rays))
-    way = widest_tree(agreeing, len(evidence.rays))
+    sides = components(skeleton.certain, len(evidence.rays))
+    known = [Pair(edge, np.empty((0, 2), np.int64), 1.0) for edge in sorted(skeleton.star)]
+    way = widest_tree([*agreeing, *known], len(evidence.rays))
     likely = []
     for pair, fit, median in against:
         guessed = sides[pair.between[0]] != sides[pair.between[1]]
@@ -84,24 +85,24 @@ def find_contradictions(
         elif counts and pair.share >= _SHARED * share * np.sqrt(nearer):
             likely.append((pair, fit))
     if likely and skeleton.ordered:
-        doubted = _outvoted(skeleton.tree, agreeing, [pair for pair, _ in likely])
-        ways = [tree_path(skeleton.tree, pair.between) for pair, _ in likely]
+        doubted = _outvoted(skeleton, agreeing, [pair for pair, _ in likely])
+        ways = [tree_path(skeleton.edges, pair.between) for pair, _ in likely]
         likely = [it for it, way_ in zip(likely, ways, strict=True) if not way_ or doubted & set(way_)]
     contradictions += [fit for _, fit in likely]
     return sorted(contradictions, key=lambda it: (it.points - it.matches, it.between))
 
 
-def _outvoted(tree: frozenset[Edge], agreeing: Sequence[Pair], against: Sequence[Pair]) -> set[Edge]:
-    """The edges of a tree across which more is shared by pairs that contradict than by those that agree.
+def _outvoted(skeleton: Skeleton, agreeing: Sequence[Pair], against: Sequence[Pair]) -> set[Edge]:
+    """The edges of the tree across which more is shared by pairs that contradict than by those that agree.
 
     Where a motion is wrong, all pairs that lead across it contradict, but for those that are misled alike.
     """
-    votes: dict[Edge, float] = dict.fromkeys(tree, 0.0)
+    votes: dict[Edge, float] = dict.fromkeys(skeleton.edges, 0.0)
     for pairs, sign in ((agreeing, 1.0), (against, -1.0)):
         for pair in pairs:
-            for edge in tree_path(tree, pair.between):
+            for edge in tree_path(skeleton.edges, pair.between):
                 votes[edge] += sign * pair.share
-    return {edge for edge, vote in votes.items() if vote < 0}
+    return {edge for edge in skeleton.tree if votes[edge] < 0}
 
 
 def is_repetitive(skeleton: Skeleton, rows: Collection[int]) -> bool:
@@ -113,14 +114,23 @@ def is_repetitive(skeleton: Skeleton, rows: Collection[int]) -> bool:
 def is_trusted(contradictions: Sequence[Contradiction], skeleton: Skeleton, rows: Collection[int]) -> bool:
     """Whether poses of panoramas can be used in spite of contradictions and of geometries that have rivals.
 
-    Where the order was followed by a guess, or the tree does not connect them, there may be no contradiction.
+    Where the order was followed by a guess, or the tree does not connect them, there may be no contradiction;
+    it has to connect them with poses that are known.
     """
-    sides = components(skeleton.among(rows).tree, max(rows) + 1)
+    sides = components(skeleton.among(rows).edges, max(rows) + 1)
     guessed = len({int(sides[row]) for row in rows}) > 1
+    if guessed and skeleton.given:
+        return False
     broken = any(it.between in skeleton.tree for it in contradictions)
     guessed |= any(edge in skeleton.tree and set(edge) <= set(rows) for edge in skeleton.guessed)
     few = len(contradictions) <= (0 if guessed else max(1, _MOST * len(rows)))
     return few and not broken and not is_repetitive(skeleton, rows)
+
+
+def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton) -> set[Edge]:
+    """The guesses that led from one panorama to the other where these contradict each other."""
+    paths = (tree_path(skeleton.edges, it.between) for it in contradictions)
+    return {edge for path in paths for edge in path if edge in skeleton.guessed}
 
 
 def consistent_part(
@@ -132,22 +142,25 @@ def consistent_part(
     """The largest part of panoramas without a contradiction between them, ascending.
 
     The tree is cut where it is weakest between two that contradict each other, and the smaller side left out;
-    where too many geometries have rivals, at all of these before.
+    where too many geometries have rivals, at all of these before. Panoramas whose poses are known stay, and
+    the cut is at each guess on the way.
     """
     coverage = {pair.between: pair.coverage for pair in evidence.pairs}
-    part, tree = set(rows), {edge for edge in skeleton.tree if set(edge) <= set(rows)}
+    part, star, known = set(rows), skeleton.star, sorted(skeleton.given)[:1]
+    tree = {edge for edge in skeleton.tree if set(edge) <= part}
     if is_repetitive(skeleton, rows):
         tree -= skeleton.rivalled
-        part = _largest(part, tree, sorted(part), len(evidence.rays))
+        part = _largest(part, tree | star, known or sorted(part), len(evidence.rays))
     for it in contradictions:
         if not set(it.between) <= part:
             continue
-        path = tree_path(tree, it.between)
+        path = [edge for edge in tree_path(tree | star, it.between) if edge in tree]
         if not path:
-            part -= {max(it.between)}
+            part -= {max(set(it.between) - skeleton.given)}
             continue
-        tree.remove(min(path, key=lambda edge: (coverage[edge], edge)))
-        part = _largest(part, tree, it.between, len(evidence.rays))
+        guesses = skeleton.guessed.intersection(path) if known else frozenset()
+        tree -= guesses or {min(path, key=lambda edge: (coverage[edge], edge))}
+        part = _largest(part, tree | star, known or it.between, len(evidence.rays))
         tree = {edge for edge in tree if set(edge) <= part}
     return sorted(part)
 

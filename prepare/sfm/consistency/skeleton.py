@@ -29,43 +29,68 @@ class Skeleton:
     tree: frozenset[Edge]
     guessed: frozenset[Edge] = frozenset()  # of the tree, where the order of capture does not decide
     rivalled: frozenset[Edge] = frozenset()  # of the tree, where another geometry explains about as much
+    given: frozenset[int] = frozenset()  # rows of panoramas whose poses are known
+
+    @property
+    def star(self) -> frozenset[Edge]:
+        """Edges between the panoramas whose poses are known: these need no pairs, and nothing judges them."""
+        return frozenset((min(self.given), row) for row in self.given if row > min(self.given))
+
+    @property
+    def edges(self) -> frozenset[Edge]:
+        """All that connects panoramas."""
+        return self.tree | self.star
+
+    @property
+    def certain(self) -> frozenset[Edge]:
+        """What connects them without a guess."""
+        return self.edges - self.guessed
 
     def among(self, rows: Collection[int]) -> "Skeleton":
         """What of it connects these panoramas."""
         wanted, sets = set(rows), (self.tree, self.guessed, self.rivalled)
-        inside = (frozenset(edge for edge in edges if wanted.issuperset(edge)) for edges in sets)
-        return Skeleton(self.ordered, *inside)
+        tree, guessed, rivalled = (frozenset(it for it in edges if wanted.issuperset(it)) for edges in sets)
+        return Skeleton(self.ordered, tree, guessed, rivalled, self.given & wanted)
 
 
-def find_skeleton(evidence: Evidence, places: NDArray[np.float64] | None = None) -> Skeleton:
+def find_skeleton(
+    evidence: Evidence,
+    places: NDArray[np.float64] | None = None,
+    given: Collection[int] = (),
+    refuted: Collection[Edge] = (),
+) -> Skeleton:
     """The skeleton of panoramas with these verified pairs.
 
     Args: places, (K, 3) where they were taken, if that is known, NaN where it is not. The nearest ones then
-        take the part of neighbours in order.
+        take the part of neighbours in order; given, rows of panoramas whose poses are known, which count as
+        connected: the order is that of the others; refuted, pairs that carry nothing.
     """
-    pairs, count = evidence.pairs, len(evidence.rays)
+    count = len(evidence.rays)
+    pairs = [pair for pair in evidence.pairs if pair.between not in refuted]
     if places is not None:
         near = sorted(_near(pairs, places), key=lambda it: (it[1], it[0]))
         tree = _strongest_tree(pairs, count, [edge for edge, _ in near])
         return Skeleton(True, frozenset(tree))
-    ordered = is_ordered(pairs, count)
-    firm = _chain(pairs, LIKE_OTHERS) if ordered else frozenset()
-    weak = _chain(pairs, _WEAK) - firm if ordered else frozenset()
-    tree = _strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], weak)
+    own = [pair for pair in pairs if not set(pair.between) & set(given)]
+    ordered = is_ordered(own, count - len(given))
+    firm = _chain(own, LIKE_OTHERS) if ordered else frozenset()
+    weak = _chain(own, _WEAK) - firm if ordered else frozenset()
+    tree = _strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], weak, given)
     return Skeleton(
         ordered,
         frozenset(tree),
-        frozenset(tree - firm) if ordered else frozenset(),
+        frozenset(tree - firm) if ordered or given else frozenset(),
         frozenset(pair.between for pair in pairs if pair.rivalled and pair.between in tree),
+        frozenset(given),
     )
 
 
 def is_ordered(pairs: Sequence[Pair], count: int) -> bool:
-    """Whether most panoramas share about as much with the next one as with any other."""
-    best = np.zeros(count)
+    """Whether most of `count` panoramas share about as much with the next one as with any other."""
+    best = dict[int, float]()
     for pair in pairs:
         for row in pair.between:
-            best[row] = max(best[row], pair.coverage)
+            best[row] = max(best.get(row, 0.0), pair.coverage)
     near = [pair for pair in pairs if pair.apart == 1]
     fit = [pair for pair in near if pair.coverage >= _AMONG_BEST * min(best[row] for row in pair.between)]
     return count > 2 and len(fit) >= _ORDERED * (count - 1)
@@ -85,15 +110,21 @@ def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> list[tuple[Edge
 
 
 def _strongest_tree(
-    pairs: Sequence[Pair], count: int, first: Sequence[Edge], weak: frozenset[Edge] = frozenset()
+    pairs: Sequence[Pair],
+    count: int,
+    first: Sequence[Edge],
+    weak: frozenset[Edge] = frozenset(),
+    given: Collection[int] = (),
 ) -> set[Edge]:
     """Kruskal's tree: the edges `first` in their order, then by coverage, then by matches.
 
     Without edges that share much less than others, except `weak`: where the tree falls apart, it is unknown
-    what is right.
+    what is right. Panoramas that are `given` are connected from the start.
     """
     rank = {edge: place for place, edge in enumerate(first)}
     label, tree = list(range(count)), set[Edge]()
+    for row in given:
+        label[row] = min(given)
 
     def root(row: int) -> int:
         while label[row] != row:

@@ -5,7 +5,7 @@ judged by it: their points must be where they are seen, but for its drift. With 
 of panoramas that it has not reached, the mapper starts again, until its result contradicts none of them.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from panolog.prepare.sfm.consistency.contradictions import (
     consistent_part,
     find_contradictions,
     is_trusted,
+    refuted_guesses,
 )
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, read_evidence
 from panolog.prepare.sfm.consistency.guided import Guide
@@ -32,6 +33,8 @@ _DRIFT = 0.05  # degrees more for each panorama on the way between the two
 _FARTHEST = 6.0  # degrees at most: a window further on is farther off
 _PURE = 0.8  # share of the matches of a pair that fit, for those to count that cannot be judged
 _ROUNDS = 4  # of mapping with the pairs that fit
+_AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
+_GUESSES = 4  # of what connects panoramas with a scene that they are added to
 
 Kept = dict[Edge, NDArray[np.int64]]  # matches (M, 2) of the pairs that are mapped
 
@@ -64,17 +67,25 @@ class Solver:
         max_error: float,
         progress: StageProgress,
         places: NDArray[np.float64] | None = None,
+        known: pycolmap.Reconstruction | None = None,
     ) -> None:
         """Args: size, (width, height) of the panoramas; max_error, pixels that an observation may be off;
-        places, (K, 3) where panoramas were taken, if that is known, else NaN.
+        places, (K, 3) where panoramas were taken, if that is known, else NaN; known, poses that stay, with
+        their points, of panoramas of the database.
         """
         self._work, self._mapper, self._max_error, self._progress = work, mapper, max_error, progress
         self._ids, evidence = work.ids(), read_evidence(work, size)
         self._geometries = Geometries(work, size, max_error, evidence)
         evidence = look_again(self._geometries.marked(evidence), self._geometries)
-        self._skeleton = find_skeleton(evidence, places)
-        guide = Guide(work, evidence.rays, max_error * 2 * np.pi / size[0])
-        self._evidence = _thicker(evidence, self._skeleton, self._geometries, guide)
+        self._known, self._given, self._refuted = known, set[int](), set[Edge]()
+        if known is not None:
+            self._given = set(posed(known, self._ids).poses)
+            judged = [pair for pair in evidence.pairs if not self._given.issuperset(pair.between)]
+            self._refuted = _looking_alike(judged, evidence.among(self._given).pairs, self._given)
+            evidence = replace(evidence, pairs=tuple(judged))
+        self._skeleton = find_skeleton(evidence, places, self._given, self._refuted)
+        self._guide = Guide(work, evidence.rays, max_error * 2 * np.pi / size[0])
+        self._evidence = self._thicker(evidence, self._skeleton.tree)
         self.cuts: list[Contradiction] = []  # for which `parts` has left panoramas out
 
     def parts(self, least: int, doubtful: bool = False) -> list[Solution]:
@@ -93,6 +104,26 @@ class Solver:
                 todo += self._sides(rows - part.found.poses.keys())
         return sorted(found, key=lambda part: -len(part.found.poses))
 
+    def joined(self) -> Solution | None:
+        """What is known with those of the other panoramas that agree with it; None if there are none.
+
+        What leads from these to it is guessed by looks. A guess that contradictions refute makes room for the
+        next one; after several, what contradicts is cut off.
+        """
+        rows = range(len(self._ids))
+        found = self.solve(rows)
+        for _ in range(_GUESSES):
+            if found is None or not (against := refuted_guesses(found.contradictions, found.skeleton)):
+                break
+            self._refuted |= against
+            before = self._skeleton
+            self._skeleton = find_skeleton(self._evidence, None, self._given, self._refuted)
+            self._evidence = self._thicker(self._evidence, self._skeleton.tree - before.tree)
+            found = self.solve(rows)
+        if found is not None and not found.trusted:
+            found = self._part(rows, cut=True)
+        return found if found is not None and found.found.poses.keys() > self._given else None
+
     def _part(self, rows: Collection[int], cut: bool) -> Solution | None:
         """The reconstruction of the most of these panoramas that agree; None if some do not, but to `cut`."""
         while (found := self.solve(rows)) is not None and not found.trusted:
@@ -101,16 +132,33 @@ class Solver:
                 return None
             before = sorted(found.found.poses)
             agreed = consistent_part(before, found.contradictions, found.skeleton, found.evidence)
-            rows = max(self._sides(agreed), key=len, default=set())
+            sides = [(side >= self._given, len(side), side) for side in self._sides(agreed)]
+            *_, rows = max(sides, key=lambda it: it[:2], default=(False, 0, set[int]()))
             if len(rows) == len(before):
                 return None
             self.cuts += [it for it in found.contradictions if not set(it.between) <= set(rows)]
         return found
 
+    def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
+        """The pairs of these edges with what matches along their motion."""
+
+        def thicker(pair: Pair) -> Pair:
+            motion = self._geometries.motion(pair) if pair.between in edges else None
+            if motion is None:
+                return pair
+            matches = self._guide.along(pair.between, motion)
+            more = len(matches) >= len(pair.matches)
+            return self._geometries.mark(replace(pair, matches=matches), motion) if more else pair
+
+        return replace(evidence, pairs=tuple(map(thicker, evidence.pairs)))
+
     def _sides(self, rows: Collection[int]) -> list[set[int]]:
-        """The parts of these panoramas that the skeleton connects, but for guesses: nothing judges across."""
+        """The parts of these panoramas that the skeleton connects, but for guesses: nothing judges across.
+
+        Poses that are known judge also what a guess connects with them.
+        """
         skeleton = self._skeleton.among(rows)
-        of = components(skeleton.tree - skeleton.guessed, len(self._ids))
+        of = components(skeleton.edges if skeleton.given else skeleton.certain, len(self._ids))
         return [{row for row in rows if of[row] == side} for side in sorted({int(of[row]) for row in rows})]
 
     def solve(self, rows: Collection[int]) -> Solution | None:
@@ -119,9 +167,9 @@ class Solver:
         kept: Kept = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.tree}
         best: Solution | None = None
         for turn in range(_ROUNDS + 1):
-            part = write_pairs(self._work, kept, "pairs.db")
+            part = write_pairs(self._work, kept, "pairs.db", self._given)
             mapper = self._mapper if turn else "incremental"
-            model = map_pairs(part, mapper, self._max_error, self._progress)
+            model = map_pairs(part, mapper, self._max_error, self._progress, self._known)
             if model is None:
                 break
             found = posed(model, self._ids)
@@ -136,25 +184,25 @@ class Solver:
         return best
 
 
-def _thicker(evidence: Evidence, skeleton: Skeleton, geometries: Geometries, guide: Guide) -> Evidence:
-    """The pairs of the skeleton with what matches along their motion."""
+def _looking_alike(pairs: Sequence[Pair], known: Sequence[Pair], given: Collection[int]) -> set[Edge]:
+    """The pairs with panoramas of known poses that cover less than these cover of each other.
 
-    def thicker(pair: Pair) -> Pair:
-        motion = geometries.motion(pair) if pair.between in skeleton.tree else None
-        if motion is None:
-            return pair
-        matches = guide.along(pair.between, motion)
-        more = len(matches) >= len(pair.matches)
-        return geometries.mark(replace(pair, matches=matches), motion) if more else pair
-
-    return replace(evidence, pairs=tuple(map(thicker, evidence.pairs)))
+    They may only look alike: what connects panoramas with a scene is as near as neighbours in it.
+    Args: known, the pairs between panoramas of known poses.
+    """
+    best = dict[int, float]()
+    for pair in known:
+        for row in pair.between:
+            best[row] = max(best.get(row, 0.0), pair.coverage)
+    least = _AS_NEIGHBOURS * float(np.median(list(best.values()))) if best else 0.0
+    return {it.between for it in pairs if it.coverage < least and not set(it.between).isdisjoint(given)}
 
 
 def _agreeing(solution: Solution, drift: float) -> Kept:
     """The tree, pairs that fit the poses and points, and all of panoramas that have no pose yet."""
     evidence, tree, poses = solution.evidence, solution.skeleton.tree, solution.found.poses
     pairs = [pair.between for pair in evidence.pairs] if drift else []
-    way = hops(tree, len(evidence.rays), pairs, _FARTHEST / max(drift, _DRIFT))
+    way = hops(solution.skeleton.edges, len(evidence.rays), pairs, _FARTHEST / max(drift, _DRIFT))
     kept: Kept = {}
     for pair in evidence.pairs:
         bound = min(_CLOSE + drift * way[pair.between], _FARTHEST) if drift else _CLOSE
@@ -180,12 +228,15 @@ def _fitting(found: Posed, evidence: Evidence, pair: Pair, bound: float) -> NDAr
     return pair.matches[fit]
 
 
-def write_pairs(work: Workspace, kept: Kept, name: str) -> Workspace:
-    """The same panoramas and features with these pairs alone, in a database of that name in the folder."""
+def write_pairs(work: Workspace, kept: Kept, name: str, given: Collection[int] = ()) -> Workspace:
+    """The same panoramas and features with these pairs alone, in a database of that name in the folder.
+
+    Features are those of the pairs, and of the panoramas `given`.
+    """
     part = replace(work, name=name)
     part.database.unlink(missing_ok=True)
     ids = work.ids()
-    used = {ids[row] for edge in kept for row in edge}
+    used = {ids[row] for rows in (*kept, given) for row in rows}
     with pycolmap.Database.open(work.database) as all_, pycolmap.Database.open(part.database) as some:
         for camera in all_.read_all_cameras():
             some.write_camera(camera, True)

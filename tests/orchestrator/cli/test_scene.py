@@ -12,6 +12,7 @@ from typer.testing import Result
 from panolog.prepare.networks import depth_maps, masks
 from panolog.prepare.networks.depth_maps import DepthJob
 from panolog.prepare.sfm import pipeline
+from panolog.prepare.sfm.joining import join
 from panolog.scene.files import SUFFIX
 from panolog.scene.read import read_scene
 from tests.orchestrator.cli import program
@@ -234,6 +235,26 @@ def test_options_reach_the_job_and_its_report_is_printed(
     result = call("sfm", "images", "-o", output)
     assert result.exit_code == 0
     assert result.stdout.splitlines()[: len(list(report.lines()))] == list(report.lines())
+
+
+def test_panoramas_are_added_to_a_scene_into_a_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[tuple[Any, ...]] = []
+
+    def join_scene(*arguments: Any, memory: int) -> object:
+        assert memory > 0
+        given.append(arguments[:4])
+        return faulty()
+
+    monkeypatch.setattr(join, "join_scene", join_scene)
+    output = tmp_path / "both"
+    result = call("sfm", "a", "b", "--into", "scene", "-o", output, "--link", "--json")
+    assert result.exit_code == 0, result.output
+    wanted = pipeline.SfmSettings(link=True)
+    assert given == [([Path("a"), Path("b")], Path("scene"), output, wanted)]
+    assert json.loads(result.stdout)["scene"] == str(output)
+    assert call("sfm", "a", "--into", "scene").exit_code == 2  # the scene itself never changes
 
 
 def test_what_cannot_be_done_is_one_line(tmp_path: Path) -> None:

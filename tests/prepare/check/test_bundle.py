@@ -16,6 +16,7 @@ from panolog.scene.model import Panorama, Scene
 
 WIDTH, VIEWS, POINTS = 1024, 8, 300
 CAMERA = ColmapCamera(1, EQUIRECTANGULAR, WIDTH, WIDTH // 2, (float(WIDTH), WIDTH / 2))
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])  # not read here
 
 
 def walk(noise: float) -> tuple[Scene, Tracks]:
@@ -32,7 +33,7 @@ def walk(noise: float) -> tuple[Scene, Tracks]:
         )
         name = f"{number}.png"
         panoramas.append(Panorama(name, Path(name), rotation, translation, seen))
-        tracks[name] = ColmapImage(name, CAMERA, rotation, translation, seen, seen, pixels)
+        tracks[name] = ColmapImage(name, CAMERA, rotation, translation, seen, seen, pixels, UNTURNED)
     rows = tuple(range(VIEWS))
     scene = Scene(
         Path(), WIDTH, WIDTH // 2, tuple(panoramas), points, np.zeros((POINTS, 3), np.uint8), rows, (), ""

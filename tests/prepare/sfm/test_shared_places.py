@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from panolog.prepare.sfm.joining.join import join_scene
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
 from panolog.prepare.sfm.report import SfmReport
 from panolog.scene.read import read_scene
@@ -34,6 +35,27 @@ def test_the_long_street_holds_its_scale(tmp_path: Path) -> None:
     made = _make("street", 640, tmp_path, 40)
     assert len(made.found.model.rows) == 40
     assert drift(read_scene(tmp_path / "scene").centers, known) < 0.005 * length(known)
+
+
+def test_the_other_half_of_the_street_joins_the_first(tmp_path: Path) -> None:
+    known = {panorama.stem: panorama.center for panorama in read_scene(shared("street")).panoramas}
+    images, more = reduced("street", 640, tmp_path / "images", 24), tmp_path / "more"
+    more.mkdir()
+    for path in sorted(images.iterdir())[1::2]:
+        path.rename(more / path.name)
+    make_scene(images, tmp_path / "scene", SfmSettings(), no_progress)
+    report = join_scene([more], tmp_path / "scene", tmp_path / "both", SfmSettings(), no_progress)
+    assert report.as_json()["into"]["joined"] == 12 and report.found.contradictions == []
+    first, both = read_scene(tmp_path / "scene"), read_scene(tmp_path / "both")
+    named = {panorama.name: panorama for panorama in both.panoramas}
+    for one in first.panoramas:
+        same = named[one.name]
+        assert np.array_equal(one.rotation, same.rotation)
+        assert np.array_equal(one.translation, same.translation)
+    truth = np.stack([known[Path(panorama.name).stem] for panorama in both.panoramas])
+    assert drift(both.centers, truth) < 0.003 * length(np.stack(list(known.values()))[:24])
+    count = len(first.points)
+    assert len(both.points) > 1.5 * count and np.array_equal(both.points[:count], first.points)
 
 
 def _make(place: str, width: int, folder: Path, count: int | None = None) -> SfmReport:

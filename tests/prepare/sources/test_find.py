@@ -133,3 +133,10 @@ def test_nothing_is_taken_twice(again: str, tmp_path: Path) -> None:
 def test_a_missing_source_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no\.mp4: there is no such folder or video"):
         find_sources([file(tmp_path / "a.mp4"), tmp_path / "no.mp4"])
+
+
+def test_labels_of_the_scene_that_sources_are_added_to_are_taken(tmp_path: Path) -> None:
+    walk, other = file(tmp_path / "monday" / "walk.mp4", 2), file(tmp_path / "garden.mp4", 1)
+    found = find_sources([walk, other], {"walk", "scene"})
+    assert [source.label for source in found.all] == ["monday-walk", "garden"]
+    assert [source.label for source in find_sources([other], {"scene"}).all] == ["garden"]

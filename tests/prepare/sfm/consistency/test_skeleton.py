@@ -12,6 +12,7 @@ from panolog.prepare.sfm.consistency.contradictions import (
     consistent_part,
     is_repetitive,
     is_trusted,
+    refuted_guesses,
 )
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, with_coverage
 from panolog.prepare.sfm.consistency.skeleton import Skeleton, find_skeleton, hops
@@ -115,3 +116,19 @@ def test_the_part_that_agrees_is_cut_where_the_tree_is_weakest() -> None:
     for edge, part in (((2, 9), range(7)), ((3, 4), range(4, 10)), (None, range(10))):
         doubt = [] if edge is None else [Contradiction(edge, 80, 3)]
         assert consistent_part(range(10), doubt, skeleton, evidence) == list(part)
+
+
+def test_panoramas_whose_poses_are_known_need_no_pairs_and_one_edge_joins_others_with_them() -> None:
+    """Two walks in order, of which the first is known: what looks like its end is not in the tree."""
+    walk = {(row, row + 1): 0.8 for row in range(4, 7)}
+    skeleton = find_skeleton(_evidence(walk | {(0, 5): 0.75, (3, 7): 0.7}, 8), given=range(4))
+    assert skeleton.ordered and skeleton.tree == {*walk, (0, 5)}
+    assert skeleton.guessed == refuted_guesses([Contradiction((3, 7), 90, 1)], skeleton) == {(0, 5)}
+    assert refuted_guesses([Contradiction((5, 7), 90, 1)], skeleton) == set()
+    other = find_skeleton(_evidence(walk | {(0, 5): 0.75, (3, 7): 0.7}, 8), given=range(4), refuted={(0, 5)})
+    assert other.tree == {*walk, (3, 7)}  # the next guess
+    part = consistent_part(
+        range(8), [Contradiction((3, 7), 90, 1)], skeleton, _evidence(walk | {(0, 5): 0.75}, 8)
+    )
+    assert part == [0, 1, 2, 3]  # the known side stays, although the other is as large
+    assert skeleton.among([1, 2, 5, 6]).edges == {(1, 2), (5, 6)}
