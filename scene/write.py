@@ -97,9 +97,7 @@ class PosedImage:
     rotation: NDArray[np.float64]  # (3, 3)
     translation: NDArray[np.float64]  # (3,)
     sightings: Sightings = UNSEEN  # which points it sees, and where as fractions of width and height
-    quaternion: NDArray[np.float64] | None = (
-        None  # (4,) w x y z, to be kept bit by bit; None: of the rotation
-    )
+    quaternion: NDArray[np.float64] | None = None  # (4,) w x y z, kept bit by bit; None: of the rotation
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,7 +46,7 @@ def join_scene(
     """Makes a scene of the scene `into` and of the panoramas of `source` in the new folder `output`.
 
     Poses, points, names and layers of `into` are in it as they are; the folder `into` is only read. An
-    interrupted job goes on with the next call.
+    interrupted job is resumed by the next call.
     Args: memory, bytes that may be used.
 
     Raises SceneError if the scene or a source is wrong, or half of the panoramas or fewer can be joined, and
