@@ -29,9 +29,8 @@ from panolog.synthetic.make import make_town
 
 _TOWN = 512  # pixels of the trial's panoramas before they are enlarged
 _ALL = 0.99  # of the sphere: more is no mask of people in a street without any
-Trial = tuple[
-    str, float, float
-]  # device, seconds for a panorama after a first one, share as in CheckedNetwork
+# The device, seconds for a panorama after a first one, and the share as CheckedNetwork has it.
+Trial = tuple[str, float, float]
 
 
 class Known(ManifestPart):
