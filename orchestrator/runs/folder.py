@@ -312,7 +312,8 @@ def open_below(path: Path, below: Path) -> int:
     try:
         handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the path
-        raise InputError(f"{path.name}: cannot be read") from error
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise InputError(f"{path.name}: cannot be read: {why}") from error
     try:
         real = by_handle(handle).readlink()
         if not (stat.S_ISREG(os.fstat(handle).st_mode) and real.is_relative_to(below.resolve())):

@@ -112,6 +112,22 @@ def test_a_damaged_run_json_is_one_clear_line(folder: RunFolder, content: str) -
     assert "\n" not in str(caught.value)
 
 
+def test_only_plain_files_of_the_run_are_read_and_up_to_a_size(folder: RunFolder, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text("secret")
+    link, whole = folder.root / "link", folder.info.read_bytes()
+    link.symlink_to(tmp_path / "secret")
+    assert folder.read(folder.info, len(whole)) == whole
+    for path, most, why in (
+        (folder.root / "none", 9, "none: cannot be read: No such file or directory"),
+        (folder.root / "zero\0byte", 9, "cannot be read: embedded null byte"),
+        (link, 9, "link: is not a plain file of the run"),
+        (folder.root, 9, "run: is not a plain file of the run"),
+        (folder.info, len(whole) - 1, "run.json: has more than"),
+    ):
+        with pytest.raises(InputError, match=why):
+            folder.read(path, most)
+
+
 def test_only_one_holds_the_lock_and_looking_does_not_take_it(tmp_path: Path) -> None:
     path = tmp_path / "lock"
     assert not lock.held(path)
