@@ -85,31 +85,20 @@ class Network:
         return np.asarray(value, np.float32)
 
     def _open(self, runtime: Any, device: str) -> Any:
-        options = runtime.SessionOptions()
-        options.log_severity_level = _FATAL
-        runtime.set_default_logger_severity(_FATAL)
         tensorrt = any(map(importlib.util.find_spec, ("tensorrt", "tensorrt_libs")))
         wanted = providers(device, runtime.get_available_providers(), tensorrt=tensorrt)
         if len(wanted) > 1:  # the CUDA libraries that came with torch, or with packages of their own
             with contextlib.redirect_stdout(sys.stderr):  # it prints which libraries are missing
                 runtime.preload_dlls()
         try:
-            session = self._start(runtime, options, wanted)
+            session = _session(self.model, runtime, wanted)
         except ConfigError:
             if device != "auto" or len(wanted) == 1:
                 raise
-            session = self._start(runtime, options, wanted[-1:])  # the caller reports `device`
+            session = _session(self.model, runtime, wanted[-1:])  # the caller reports `device`
         if device != "auto" and DEVICES[device] not in session.get_providers():
             raise DeviceError(f"--device {device}: onnxruntime could not start it; --device cpu always works")
         return session
-
-    def _start(self, runtime: Any, options: Any, wanted: list[str]) -> Any:
-        try:  # onnxruntime's own fallback would print
-            return runtime.InferenceSession(str(self.model), options, providers=wanted, enable_fallback=0)
-        except self._errors as error:
-            raise ConfigError(
-                f"{self.model}: onnxruntime cannot open it with {wanted[0]}: {in_one_line(error, _LONGEST)}"
-            ) from error
 
     def _check_input(self) -> tuple[str, Any, int]:
         """(name, dtype, batch size or 0 where it is free) of the input, if it is what the manifest says."""
@@ -202,18 +191,25 @@ def describe_ends(model: Path) -> tuple[list[str], list[str]]:
 
     Raises ConfigError: it is none; DeviceError: onnxruntime is not installed.
     """
-    runtime = _runtime()
-    options = runtime.SessionOptions()
-    options.log_severity_level = _FATAL
-    try:
-        session = runtime.InferenceSession(str(model), options, providers=[DEVICES["cpu"]])
-    except _errors(runtime) as error:
-        raise ConfigError(f"{model}: onnxruntime cannot open it: {in_one_line(error, _LONGEST)}") from error
+    session = _session(model, _runtime(), [DEVICES["cpu"]])
 
     def words(nodes: Any) -> list[str]:
         return [f"{it.name} ({it.type} {' x '.join(map(str, it.shape))})" for it in nodes]
 
     return words(session.get_inputs()), words(session.get_outputs())
+
+
+def _session(model: Path, runtime: Any, wanted: list[str]) -> Any:
+    """The session of an ONNX file on these providers. Raises ConfigError if onnxruntime cannot open it."""
+    options = runtime.SessionOptions()
+    options.log_severity_level = _FATAL
+    runtime.set_default_logger_severity(_FATAL)
+    try:  # onnxruntime's own fallback would print
+        return runtime.InferenceSession(str(model), options, providers=wanted, enable_fallback=0)
+    except _errors(runtime) as error:
+        raise ConfigError(
+            f"{model}: onnxruntime cannot open it with {wanted[0]}: {in_one_line(error, _LONGEST)}"
+        ) from error
 
 
 def _runtime() -> Any:

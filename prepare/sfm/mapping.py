@@ -31,15 +31,15 @@ def map_pairs(
     """
     shutil.rmtree(work.models, ignore_errors=True)
     work.models.mkdir(parents=True)
-    found = _global(work, progress) if mapper == "global" else None
-    models = _incremental(work, max_error, progress, known) if found is None else found
+    given = work, progress
+    models = _global(*given) if mapper == "global" else _incremental(*given, max_error, known)
     if not models:
         return None
     return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
 
 
 def _incremental(
-    work: Workspace, max_error: float, progress: StageProgress, known: pycolmap.Reconstruction | None
+    work: Workspace, progress: StageProgress, max_error: float, known: pycolmap.Reconstruction | None
 ) -> list[pycolmap.Reconstruction]:
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2

@@ -79,9 +79,9 @@ class HeldOut:
         self._scene, self._width, self._locate = scene, width, locate
 
     def photograph(self, otherwise: Callable[[], View]) -> tuple[int, Pixels]:
-        """Its row and (width / 2, width, 3) pixels; those of another view if there is none to decode.
+        """The row and the pixels (width / 2, width, 3) of the panorama that pictures show.
 
-        The training does not need it, so it goes on without.
+        Args: otherwise, gives the view in its place if it cannot be decoded, as training does not need it.
         """
         if self._decoded is not None:
             return self._decoded

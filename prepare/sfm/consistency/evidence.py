@@ -5,7 +5,7 @@ sees everything around it: ground, sky and what stands between. Where the featur
 found in others have no match in this pair, though they lie all around, the pair does not show one place.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -81,6 +81,15 @@ def read_evidence(work: Workspace, size: tuple[int, int]) -> Evidence:
             pairs.append(Pair((min(one, other), max(one, other)), matches[:, ::-1] if flipped else matches))
     pairs.sort(key=lambda pair: pair.between)
     return Evidence(rays, tuple(with_coverage(rays, pairs)))
+
+
+def best_coverage(pairs: Iterable[Pair]) -> dict[int, float]:
+    """The greatest coverage of the pairs of each panorama, by its row."""
+    best = dict[int, float]()
+    for pair in pairs:
+        for row in pair.between:
+            best[row] = max(best.get(row, 0.0), pair.coverage)
+    return best
 
 
 def with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:

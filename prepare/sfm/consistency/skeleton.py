@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
 
-from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair
+from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair, best_coverage
 
 Edge = tuple[int, int]  # rows of two panoramas, ascending
 _ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
@@ -87,10 +87,7 @@ def find_skeleton(
 
 def is_ordered(pairs: Sequence[Pair], count: int) -> bool:
     """Whether most of `count` panoramas share about as much with the next one as with any other."""
-    best = dict[int, float]()
-    for pair in pairs:
-        for row in pair.between:
-            best[row] = max(best.get(row, 0.0), pair.coverage)
+    best = best_coverage(pairs)
     near = [pair for pair in pairs if pair.apart == 1]
     fit = [pair for pair in near if pair.coverage >= _AMONG_BEST * min(best[row] for row in pair.between)]
     return count > 2 and len(fit) >= _ORDERED * (count - 1)

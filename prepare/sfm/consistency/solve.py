@@ -20,7 +20,7 @@ from panolog.prepare.sfm.consistency.contradictions import (
     is_trusted,
     refuted_guesses,
 )
-from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, read_evidence
+from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, best_coverage, read_evidence
 from panolog.prepare.sfm.consistency.guided import Guide
 from panolog.prepare.sfm.consistency.motion import Geometries, look_again
 from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, components, find_skeleton, hops
@@ -190,10 +190,7 @@ def _looking_alike(pairs: Sequence[Pair], known: Sequence[Pair], given: Collecti
     They may only look alike: what connects panoramas with a scene is as near as neighbours in it.
     Args: known, the pairs between panoramas of known poses.
     """
-    best = dict[int, float]()
-    for pair in known:
-        for row in pair.between:
-            best[row] = max(best.get(row, 0.0), pair.coverage)
+    best = best_coverage(known)
     least = _AS_NEIGHBOURS * float(np.median(list(best.values()))) if best else 0.0
     return {it.between for it in pairs if it.coverage < least and not set(it.between).isdisjoint(given)}
 
@@ -229,9 +226,10 @@ def _fitting(found: Posed, evidence: Evidence, pair: Pair, bound: float) -> NDAr
 
 
 def write_pairs(work: Workspace, kept: Kept, name: str, given: Collection[int] = ()) -> Workspace:
-    """The same panoramas and features with these pairs alone, in a database of that name in the folder.
+    """A workspace whose database has these verified pairs alone.
 
-    Features are those of the pairs, and of the panoramas `given`.
+    Args: name, of the new database in the folder of `work`; given, rows of panoramas whose features it has
+        as well; it always has those of the pairs.
     """
     part = replace(work, name=name)
     part.database.unlink(missing_ok=True)

@@ -147,7 +147,7 @@ def test_movers_by_class(scene: Path, ignore: list[int], layout: str) -> None:
 
 
 def test_movers_by_the_index_of_the_class(scene: Path) -> None:
-    """As networks give it whose last operation is the choice of the greatest score."""
+    """Some networks choose the greatest score themselves, and give the index of its class."""
     winner = helper.make_node("ArgMax", ["image"], ["index"], axis=1, keepdims=0)
     nodes = [winner, helper.make_node("Cast", ["index"], ["found"], to=onnx.TensorProto.FLOAT)]
     masked(scene, movers(scene, nodes, classes={"output": "found", "ignore": [1]}))

@@ -70,7 +70,7 @@ def test_what_is_shown_changes_nothing_of_the_model(scene: Scene, events: list[E
 
 
 def test_a_damaged_held_out_panorama_is_none_of_the_training(tmp_path: Path, events: list[Event]) -> None:
-    """It counts as no panorama that is left out, and the first training view takes its place."""
+    """A held-out panorama is not counted as left out; pictures show the first training view instead."""
     scene = small_scene(tmp_path)
     truncate(scene, ROW)
     found = list(train(coarse_of(scene, settings(images={"damaged": 0.0}), shown=ROW)))
