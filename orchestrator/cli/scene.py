@@ -149,7 +149,7 @@ def sfm(
     as_json: JsonOption = False,
 ) -> None:
     """Make a scene from raw panoramas and 360° videos, also several: find poses and points."""
-    from panolog.orchestrator.runs.machines.machine import memory
+    from panolog.orchestrator.runs.machines.machine import memory_of_preparation
     from panolog.prepare.sfm.joining.join import join_scene
     from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
     from panolog.prepare.video.frames import PARALLAX
@@ -168,7 +168,7 @@ def sfm(
         trajectory=trajectory,
     )
     with progress_bar("reading the panoramas", resumable=True) as show:
-        free = memory() * 3 // 4
+        free = memory_of_preparation()
         if into is not None:
             report = join_scene(source, into, output, settings, show, memory=free)
         else:

@@ -26,7 +26,7 @@ from panolog.orchestrator.runs.clock import repeated
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.control import Action, ControlRequest
 from panolog.orchestrator.runs.folder import RunFolder, command_line
-from panolog.orchestrator.runs.machines.machine import memory
+from panolog.orchestrator.runs.machines.machine import memory_of_preparation
 from panolog.orchestrator.runs.preparation import notes
 from panolog.orchestrator.runs.preparation.notes import Counts, StepProgress, StepResult
 from panolog.orchestrator.runs.preparation.settings import LABELS, Settings, Step, write_settings
@@ -130,7 +130,7 @@ class Preparation:
             options = TypeAdapter(SfmSettings).validate_python(settings.sfm)
             paths = [Path(source) for source in settings.sources]
             source = paths if len(paths) > 1 else paths[0]
-            given = options, self.progress(Step.SFM), self._with_masks, memory() * 3 // 4
+            given = options, self.progress(Step.SFM), self._with_masks, memory_of_preparation()
             made = make_scene(source, scene, *given, self._sketched)
             self._lines += made.lines()
         shutil.rmtree(workspace_folder(scene.resolve()), ignore_errors=True)

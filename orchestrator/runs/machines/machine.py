@@ -56,6 +56,11 @@ def memory(mount: Path = _MOUNT, own: Path = _OWN) -> int:
     return min([_free(mount, own), *_share()])
 
 
+def memory_of_preparation() -> int:
+    """Bytes of memory that the preparation of a scene may take: what is free, but for a fourth."""
+    return memory() * 3 // 4
+
+
 def memory_total(mount: Path = _MOUNT, own: Path = _OWN) -> int:
     """Bytes of memory that this process's machine has, or its control groups may use; else as `memory`."""
     return min([_total(mount, own), *_share()])
