@@ -1,6 +1,5 @@
 """A real browser with WebGL on the processor, and a server of a folder, for viewers of others."""
 
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -8,8 +7,9 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 
-import pytest
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page
+
+from tests.orchestrator.watch.dashboard.browser import chromium
 
 SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 
@@ -32,33 +32,21 @@ def serving(folder: Path) -> Iterator[str]:
             thread.join()
 
 
-def chromium() -> str:
-    """The machine's browser; the test skips without one."""
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if path is None:
-        pytest.skip("no chromium here")
-    return path
-
-
 @contextmanager
 def software_page(url: str, first: str = "") -> Iterator[Page]:
     """A page of 800×600 pixels in Debian's Chromium; at the end, nothing may have gone wrong in it.
 
     Args: first, a script that runs before those of the page.
     """
-    path, wrong = chromium(), list[str]()
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", *SOFTWARE])
+    wrong = list[str]()
+    with chromium(SOFTWARE) as browser:
+        page = browser.new_page(viewport={"width": 800, "height": 600})
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
+        page.add_init_script(first)
+        page.set_default_timeout(300_000)
         try:
-            page = browser.new_page(viewport={"width": 800, "height": 600})
-            page.on("pageerror", lambda error: wrong.append(str(error)))
-            page.on(
-                "console", lambda message: wrong.append(message.text) if message.type == "error" else None
-            )
-            page.add_init_script(first)
-            page.set_default_timeout(300_000)
             page.goto(url)
             yield page
         finally:
-            browser.close()
             assert wrong == []  # which also explains what else has failed

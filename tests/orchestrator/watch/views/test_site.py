@@ -1,7 +1,6 @@
 """Pages of runs in 3D: what they show and from where; in a browser: measuring, streaming, what goes wrong."""
 
 import json
-import shutil
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from panolog.scene.ply import write_ply, write_ply_parts
 from panolog.scene.read import read_scene
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.history import begun
-from tests.orchestrator.watch.dashboard.browser import opened
+from tests.orchestrator.watch.dashboard.browser import opened, program
 from tests.orchestrator.watch.views.models import save_checkpoint, save_model, save_plan, some
 from tests.orchestrator.watch.views.sites import (
     SIZE,
@@ -270,8 +269,7 @@ def test_a_damaged_model_or_a_browser_without_webgl_is_one_line(browser: Browser
     write_ply(tmp_path / "model.ply", some(30))
     write_folder(site_of_file(tmp_path / "model.ply", Wanted()), tmp_path / "web")
     (tmp_path / "web" / "model.sog").write_bytes(b"no model")
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    bare = browser.browser_type.launch(executable_path=path, args=["--no-sandbox", "--disable-3d-apis"])
+    bare = browser.browser_type.launch(executable_path=program(), args=["--no-sandbox", "--disable-3d-apis"])
     lines = {browser: "The model cannot be read", bare: "This browser cannot draw in 3D"}
     with closing(bare), serving(tmp_path / "web") as url:
         for one, line in lines.items():
