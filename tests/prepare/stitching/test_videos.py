@@ -28,7 +28,7 @@ from tests.prepare.stitching.cameras import camera
 from tests.prepare.video.videos import numbers, render, walk
 
 Image = NDArray[np.uint8]
-COUNT = 24
+COUNT = 16
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +131,8 @@ def test_circles_of_different_places_are_refused(walked: list[tuple[Image, Image
         open_video(write(tmp_path / "clip.mp4", pictures)).__enter__()
 
 
-@pytest.mark.system
-@pytest.mark.parametrize("kind", ["video", pytest.param("folder", marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", ["video", "folder"])
 def test_raw_files_become_a_scene_in_one_command(
     kind: str, walked: list[tuple[Image, Image]], tmp_path: Path
 ) -> None:

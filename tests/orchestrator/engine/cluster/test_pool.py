@@ -285,6 +285,7 @@ def test_each_has_a_card_and_a_process_and_one_that_has_broken_its_context_harms
     assert end(pool, again, *others) == [Ended()] * 3
 
 
+@pytest.mark.nightly
 def test_parts_of_a_gpu_run_on_the_gpu_that_they_are_planned_for(pool: RayPool) -> None:
     """Ray alone puts both halves on one."""
     uuids = [gpu.uuid for gpu in pool.nodes()[0].gpus]
@@ -293,6 +294,7 @@ def test_parts_of_a_gpu_run_on_the_gpu_that_they_are_planned_for(pool: RayPool) 
     assert end(pool, one, other) == [Ended()] * 2
 
 
+@pytest.mark.nightly
 def test_a_whole_gpu_waits_for_parts_that_ray_has_spread(pool: RayPool) -> None:
     halves = start(pool, 0.5, 0, 1, 2, 3)
     first = {attempt.card: attempt for attempt in halves}
