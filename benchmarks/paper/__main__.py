@@ -1,14 +1,14 @@
 """The paper's tables and the recipes' worth on some scenes, in one resumable command.
 
     python -m benchmarks.paper SCENE ... -o FOLDER [--width 512] [--iterations 600] [--seeds 3]
-    python -m benchmarks.paper SCENE ... -o FOLDER --also OTHER --docs docs/quality.md
+    python -m benchmarks.paper SCENE ... -o FOLDER --docs docs/quality.md
 
-FOLDER keeps every run and its result; what is there is not run again.
+FOLDER keeps every run and its result; what is there is not run again. So does the page: a folder next to it
+keeps all results that it shows, and the command adds its own.
 """
 
 import argparse
 import json
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -17,7 +17,7 @@ from pathlib import Path
 from scipy.sparse import csr_array
 
 from benchmarks import report
-from benchmarks.paper import pages, study, tables
+from benchmarks.paper import pages, tables
 from benchmarks.paper.goals import KINDS
 from benchmarks.paper.results import Result, Results
 from benchmarks.paper.runner import Bench, run_all
@@ -58,9 +58,8 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
         help=f"what a scene's goals are: of {', '.join(KINDS)}; default: street",
     )
     parser.add_argument("--finished", action="store_true", help="run nothing: report what has a result")
-    parser.add_argument("--docs", type=Path, metavar="FILE", help="write this page of the documentation")
     parser.add_argument(
-        "--also", type=Path, action="append", default=[], metavar="FOLDER", help="a finished study for --docs"
+        "--docs", type=Path, metavar="FILE", help="add the results to this page of the documentation"
     )
     parsed = parser.parse_args(arguments)
     given = parsed.tables.split(",")
@@ -68,8 +67,6 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
         parser.error(f"--tables: {', '.join(sorted(unknown))} is none of {', '.join(names)}")
     if parsed.seeds < 1:
         parser.error("--seeds: at least 1")
-    if parsed.also and not parsed.docs:
-        parser.error("--also is for --docs FILE")
     kinds = {scene: kind for scene, _, kind in (pair.partition("=") for pair in parsed.kinds)}
     for scene, kind in kinds.items():
         if scene not in {path.resolve().name for path in parsed.scenes} or kind not in KINDS:
@@ -93,8 +90,6 @@ def checked(options: argparse.Namespace) -> Settings:
     known = variants()
     for recipe in RECIPES:  # a switch alone may be refused: then its row says why
         load_config(None, known[recipe].sets(settings, 0, settings.iterations))
-    for folder in options.also:
-        study.load(folder)
     store_settings(options.output, settings)
     return settings
 
@@ -126,14 +121,10 @@ def measure(options: argparse.Namespace, settings: Settings) -> Study:
 
     def so_far() -> Study:
         overlaps = [row for bench in benches if bench.seed == 0 for row in _overlaps(bench)]
-        command = shlex.join(["python", "-m", "benchmarks.paper", *_words(options)])
-        machine = report.sentence(report.machine())
         return Study(
-            command,
-            machine,
             settings,
             tuple(options.tables),
-            tuple(map(str, scenes)),
+            tuple("/".join(scene.parts[-2:]) for scene in scenes),
             Results(tuple(done)),
             tuple(overlaps),
             options.kinds,
@@ -160,15 +151,6 @@ def _overlaps(bench: Bench) -> list[tables.Overlap]:
     return [row for name, found in plans.items() for row in tables.overlaps(bench.scene.name, name, *found)]
 
 
-def _words(options: argparse.Namespace) -> list[str]:
-    """The options that decide what is measured, without this machine's folders."""
-    words = [scene.name for scene in options.scenes] + ["-o", "FOLDER", "--tables", ",".join(options.tables)]
-    words += ["--width", str(options.width), "--iterations", str(options.iterations)]
-    words += ["--blocks", options.blocks, "--seeds", str(options.seeds)]
-    words += [part for setting in options.sets for part in ("--set", setting)]
-    return words + [part for scene, kind in options.kinds.items() for part in ("--kind", f"{scene}={kind}")]
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """The program; returns its exit code."""
     options = parse(arguments)
@@ -178,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prepare(cores())
         made = measure(options, settings)
         if options.docs:
-            pages.write_docs(options.docs, [made, *map(study.load, options.also)])
+            pages.write_docs(options.docs, made)
         failed = any(result.failed for result in made.results.all)
         links = {name: name for name in pages.pictures(made)}
         return report.Report(made.to_json(), pages.markdown([made], links), passed=not failed)

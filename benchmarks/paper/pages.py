@@ -8,7 +8,7 @@ from pathlib import Path
 from benchmarks.paper.curves import overlap_curve, quality_curve, standalone
 from benchmarks.paper.goals import table as goal_table
 from benchmarks.paper.runner import other_settings
-from benchmarks.paper.study import Study
+from benchmarks.paper.study import Study, load
 from benchmarks.paper.tables import csv_rows
 from benchmarks.paper.variants import flat, variants
 from panolog.orchestrator.runs.config import RunConfig
@@ -20,8 +20,9 @@ from panolog.workers.training.recipes import Recipe
 RECIPES_FILE = "recipes.json"
 FIRST_LINE = "<!-- Written by `python -m benchmarks.paper … --docs`: do not edit. -->"
 _METHOD = (
-    "**Runs.** All are those of one command, on the same machine, one after another."
-    " Metrics are means over the held-out panoramas, which no run trains on. Minutes are wall clock from the"
+    "**Runs.** All of a section are those of one command, one after another; where they are not of one"
+    " machine and one version of the code, each row says of which, and only metrics compare. Metrics are"
+    " means over the held-out panoramas, which no run trains on. Minutes are wall clock from the"
     " start of the first task to the merged model, with the checkpoints, without the start of program and Ray"
     " and without evaluation. Tasks run one at a time, each with all cores of the machine, so that seconds of"
     " Stage I and of a block compare. `on workers` has the longest block in place of Stage II: a simulation"
@@ -73,19 +74,25 @@ def markdown(studies: Sequence[Study], links: dict[str, str]) -> str:
     return "\n\n".join([*parts, "## How it was measured", _METHOD, _CURVES]) + "\n"
 
 
-def write_docs(path: Path, studies: Sequence[Study]) -> None:
-    """Writes a page of the documentation from several studies, with its pictures in a folder next to it.
+def write_docs(path: Path, study: Study) -> None:
+    """Adds a study to a page of the documentation.
 
-    That also has the settings of the recipes in them, recipes.json. Raises InputError if a result is of other
+    A folder next to the page has its pictures, the results of all studies that it shows, each in a folder of
+    its own, and the settings of the recipes in them, recipes.json. Raises InputError if a result is of other
     settings than its variant has now.
     """
     folder = path.with_suffix("")
+    kept = {it.name: it for it in map(load, sorted(file.parent for file in folder.glob("*/results.json")))}
+    kept[study.name] = kept[study.name].joined(study) if study.name in kept else study
+    studies = sorted(kept.values(), key=lambda it: (it.settings.width, it.settings.iterations, it.chosen))
     recipes = measured_recipes(studies)
-    folder.mkdir(parents=True, exist_ok=True)
+    for each in studies:
+        (folder / each.name).mkdir(parents=True, exist_ok=True)
+        each.save(folder / each.name)
     write_json(folder / RECIPES_FILE, {name: flat(RunConfig(recipe=name)) for name in recipes})
     links = {}
-    for number, study in enumerate(studies):
-        for name, svg in pictures(study).items():
+    for number, each in enumerate(studies):
+        for name, svg in pictures(each).items():
             own = f"{number}-{name}" if len(studies) > 1 else name
             write_bytes(folder / own, standalone(svg).encode())
             links[own] = f"{folder.name}/{own}"
@@ -101,6 +108,7 @@ def measured_recipes(studies: Sequence[Study]) -> list[Recipe]:
                 continue
             now = variants()[result.variant].config(study.settings, result.seed, result.iterations)
             if changes := other_settings(result.settings, now):
-                raise InputError(f"{result.variant} of {result.scene} has {changes}: measure it again")
+                where = f"{result.variant} of {result.scene} in {study.name}"
+                raise InputError(f"{where} has {changes}: measure it again, or remove its results")
             found[now["recipe"]] = None
     return list(found)

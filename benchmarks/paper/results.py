@@ -48,6 +48,7 @@ class Result:
     settings: dict[str, Any] = field(default_factory=dict)  # resolved, by dotted key
     sources: str = ""  # fingerprint of the code that has measured it
     code: str = ""  # the same for readers
+    machine: str = ""  # that has measured it
     same_as: str = ""  # the variant with the same training or the same plan, which has not run again
     failed: str = ""  # why there is nothing else
 
@@ -149,6 +150,11 @@ class Results:
     def codes(self) -> dict[str, str]:
         """Names of the codes that have measured them by fingerprint, those of the latest results last."""
         return {result.sources: result.code for result in self.all if result.sources}
+
+    @property
+    def machines(self) -> list[str]:
+        """Those that have measured them, that of the latest results last."""
+        return list(dict.fromkeys(result.machine for result in self.all if result.machine))
 
     def failure(self, scene: str, variant: str) -> str:
         """Why a variant has no result; empty if it has one or was not run."""

@@ -32,6 +32,7 @@ from benchmarks.paper.variants import (
     same_stage_one,
     same_training,
 )
+from benchmarks.report import machine, sentence
 from panolog.orchestrator.cli.commands.api import resume, run
 from panolog.orchestrator.cli.commands.evaluate import evaluate_run
 from panolog.orchestrator.cli.commands.repartition import repartition
@@ -160,8 +161,10 @@ class Bench:
         gallery = Gallery.of(root, self.settings.device) if watched else None
         found = self._read(variant, length, donor, gallery, kept)
         changed = ("the sources changed while it ran",) if present() != self.code else ()
-        notes = (*found.notes, *changed)
-        return replace(found, notes=notes, settings=config, sources=self.code.sources, code=self.code.name)
+        notes, code, here = (*found.notes, *changed), self.code, sentence(machine())
+        return replace(
+            found, notes=notes, settings=config, sources=code.sources, code=code.name, machine=here
+        )
 
     def _train(self, config: RunConfig, root: Path) -> None:
         """Runs or resumes it to its end. Raises RunError also where it is refused, such as for its memory."""

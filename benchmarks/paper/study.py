@@ -1,8 +1,9 @@
 """All that a command has measured, as it is kept in FOLDER/results.json and read by the pages."""
 
 import json
+import shlex
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,11 @@ from panolog.scene.errors import InputError
 
 @dataclass(frozen=True)
 class Study:
-    """Results with where and how they were measured."""
+    """Results with how they were measured."""
 
-    command: str
-    machine: str
     settings: Settings
     chosen: tuple[str, ...]  # tables
-    scenes: tuple[str, ...]  # folders
+    scenes: tuple[str, ...]  # the last two folders of each path: one may name a published data set
     results: Results
     overlaps: tuple[Overlap, ...] = ()
     kinds: Mapping[str, str] = field(default_factory=dict)  # of `goals.KINDS` by scene
@@ -39,6 +38,34 @@ class Study:
         return goals(self.results, self.kinds)
 
     @property
+    def name(self) -> str:
+        """Of its folder among those of a page: what all runs have in common, and the tables."""
+        given = self.settings
+        parts = (given.width, given.iterations, given.blocks, *given.sets, *self.chosen)
+        return "-".join(map(str, parts))
+
+    @property
+    def command(self) -> str:
+        """That which measures all of it, without the folders of a machine."""
+        given, scenes = self.settings, [Path(scene).name for scene in self.scenes]
+        seeds = 1 + max((result.seed for result in self.results.all), default=0)
+        words = [
+            "python",
+            "-m",
+            "benchmarks.paper",
+            *scenes,
+            "-o",
+            "FOLDER",
+            "--tables",
+            ",".join(self.chosen),
+        ]
+        words += ["--width", str(given.width), "--iterations", str(given.iterations)]
+        words += ["--blocks", given.blocks, "--seeds", str(seeds)]
+        words += [part for setting in given.sets for part in ("--set", setting)]
+        words += [part for scene, kind in self.kinds.items() for part in ("--kind", f"{scene}={kind}")]
+        return shlex.join(words)
+
+    @property
     def title(self) -> str:
         """Of a section: what all runs have in common."""
         width, iterations = self.settings.width, self.settings.iterations
@@ -47,9 +74,23 @@ class Study:
     @property
     def place(self) -> str:
         """On what and with what it was measured."""
-        codes = list(self.results.codes.values())
-        several = f"Rows of {len(codes)} versions of the code: each says which."
-        return f"On {self.machine}. " + (several if len(codes) > 1 else "".join(f"Code: {c}." for c in codes))
+        codes, machines = list(self.results.codes.values()), self.results.machines
+        parts = [f"Rows of {len(machines)} machines" if len(machines) > 1 else f"On {''.join(machines)}"]
+        parts += [f"of {len(codes)} versions of the code" if len(codes) > 1 else f"code {''.join(codes)}"]
+        return ", ".join(parts) + (": each says which." if max(len(codes), len(machines)) > 1 else ".")
+
+    def joined(self, later: "Study") -> "Study":
+        """With what a later study of the same name has measured, anew or in addition."""
+        results = {(it.scene, it.variant, it.seed): it for it in (*self.results.all, *later.results.all)}
+        overlaps = {(it.scene, it.variant, it.tau): it for it in (*self.overlaps, *later.overlaps)}
+        names = {Path(scene).name: scene for scene in (*self.scenes, *later.scenes)}
+        return replace(
+            later,
+            scenes=tuple(names.values()),
+            results=Results(tuple(results.values())),
+            overlaps=tuple(overlaps.values()),
+            kinds={**self.kinds, **later.kinds},
+        )
 
     def to_json(self) -> dict[str, Any]:
         """As plain values."""
@@ -68,8 +109,6 @@ def load(folder: Path) -> Study:
         stored = json.loads(path.read_bytes())
         settings = stored["settings"]
         return Study(
-            stored["command"],
-            stored["machine"],
             Settings(**{**settings, "sets": tuple(settings["sets"])}),
             tuple(stored["chosen"]),
             tuple(stored["scenes"]),

@@ -128,7 +128,7 @@ def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ..
         steps,
         _times(first.densified, first.blocks),
         _times(first.resets, first.blocks),
-        "; ".join([variants()[name].what, *([same] if same else []), *first.notes, *_code(first, results)]),
+        "; ".join([variants()[name].what, *([same] if same else []), *first.notes, *_origin(first, results)]),
     )
 
 
@@ -137,11 +137,10 @@ def _times(counts: Sequence[int], blocks: int) -> str | None:
     return " + ".join([str(n) if k == 0 else f"{blocks} × {n}" for k, n in enumerate(counts)]) or None
 
 
-def _code(result: Result, results: Results) -> list[str]:
-    """Where results are of several codes: by which a row was measured."""
-    if len(results.codes) < 2:
-        return []
-    return [f"measured at {result.code or 'unknown code'}"]
+def _origin(result: Result, results: Results) -> list[str]:
+    """By which code and on which machine a row was measured, where results are of several."""
+    code = [f"measured at {result.code or 'unknown code'}"] if len(results.codes) > 1 else []
+    return code + ([f"on {result.machine}"] if len(results.machines) > 1 else [])
 
 
 def _same(result: Result, equal: bool) -> str:

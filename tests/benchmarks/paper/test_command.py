@@ -54,10 +54,8 @@ def stored(bench: Bench) -> Callable[..., None]:
     [
         (["{scene}", "{twin}"], "two scenes are named street"),
         (["{scene}", "--set", "sky.cuont=1"], "did you mean sky.count"),
-        (["{scene}", "--docs", "a.md", "--also", "{scene}"], "holds no results"),
         (["{scene}", "--tables", "main,mian"], "--tables: mian is none of main"),
         (["{scene}", "--seeds", "0"], "--seeds: at least 1"),
-        (["{scene}", "--also", "folder"], "--also is for --docs FILE"),
         (["{scene}", "--kind", "town=flat"], "--kind town=flat: give the name of a scene"),
         (["{scene}", "--kind", "street=road"], "--kind street=road: give the name of a scene"),
     ],

@@ -36,7 +36,7 @@ RUNS = (
 
 def study() -> Study:
     settings = Settings(512, 600, "2x1x1", "cpu", ())
-    return Study("command", "a machine", settings, ("main", "ablations"), ("street",), Results(RUNS), ())
+    return Study(settings, ("main", "ablations"), ("street",), Results(RUNS), ())
 
 
 def row(table: Table, name: str) -> dict[str, object]:
@@ -172,14 +172,35 @@ def test_a_page_has_the_settings_of_its_recipes_and_no_results_of_others(tmp_pat
         result(name, 24.0, settings=variants()[name].config(settings, 0, 600))
         for name in ("paper", "authors-stage1")
     ]
-    pages.write_docs(tmp_path / "quality.md", [replace(study(), results=Results(runs))])
+    page = tmp_path / "quality.md"
+    pages.write_docs(page, replace(study(), results=Results(runs)))
     stored = json.loads((tmp_path / "quality" / pages.RECIPES_FILE).read_bytes())
     assert {name: found["stage2.scale"] for name, found in stored.items()} == {"paper": 1.0, "authors": 0.4}
     older = replace(runs[0], settings=runs[0].settings | {"densify.gradient": 1e-4})
     with pytest.raises(
-        InputError, match=r"paper of street has densify.gradient = 0.0001, not 0.0002: measure"
+        InputError, match=r"paper of street in .* has densify.gradient = 0.0001, not 0.0002: "
     ):
-        pages.write_docs(tmp_path / "quality.md", [replace(study(), results=Results([older]))])
+        pages.write_docs(page, replace(study(), results=Results([older])))
+
+
+def test_a_page_keeps_what_earlier_commands_have_measured(tmp_path: Path) -> None:
+    page, settings = tmp_path / "quality.md", study().settings
+
+    def measured(name: str, ws_psnr: float, machine: str, iterations: int = 600) -> Study:
+        config = variants()[name].config(replace(settings, iterations=iterations), 0, iterations)
+        found = result(name, ws_psnr, settings=config, machine=machine, iterations=iterations)
+        given = replace(settings, iterations=iterations)
+        return replace(study(), settings=given, chosen=("main",), results=Results((found,)))
+
+    pages.write_docs(page, measured("paper", 24.0, "cpu A"))
+    pages.write_docs(page, measured("panolog", 25.0, "cpu A", iterations=1500))
+    assert page.read_text().count("On cpu A, code") == 2
+    pages.write_docs(page, measured("panolog", 26.0, "cpu B"))
+    short, _, long = page.read_text().partition("1,500 iterations")
+    assert "| paper   | –" in short and "| panolog | +2.00" in short
+    assert "Rows of 2 machines" in short and "; on cpu B" in short and "On cpu A" in long
+    pages.write_docs(page, measured("paper", 25.0, "cpu B"))  # anew
+    assert "| panolog | +1.00" in page.read_text() and "cpu A" not in page.read_text().partition("1,500")[0]
 
 
 def test_rows_say_how_often_a_run_densified_and_reset() -> None:
