@@ -67,14 +67,15 @@ class Agents:
             return
         here = NodeAffinitySchedulingStrategy(id, soft=False)
         remote: Any = ray.remote(Agent)
-        options = {"num_cpus": 0, "max_concurrency": 4, "max_restarts": -1, "scheduling_strategy": here}
-        actor = remote.options(**options).remote()
+        options = {"num_cpus": 0, "max_concurrency": 4, "max_restarts": -1, "max_task_retries": -1}
+        actor = remote.options(**options, scheduling_strategy=here).remote()
         self._known[id] = _Known(actor, actor.next_notice.remote(None))
 
     def stop(self, id: str, pid: int) -> None:
         """Requests a worker on a node to save a checkpoint and end.
 
-        Nothing waits for the result: where it never arrives, the task stops later or not at all.
+        An agent that Ray restarts gets the request again. Nothing waits for the result: where it never arrives,
+        the task stops later or not at all.
         """
         if id == self._home:
             stopping.request(pid)

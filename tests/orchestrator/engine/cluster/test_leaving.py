@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
 import pytest
 import ray
 from ray.cluster_utils import Cluster
@@ -43,8 +44,9 @@ class Spot:
         assert self.pool.ready(300) == [TASK]
         return self.pool.take(TASK)
 
-    def end(self) -> None:
-        self.pool.stop(TASK)
+    def end(self, *, stop: bool = True) -> None:
+        if stop:
+            self.pool.stop(TASK)
         messages = [self.message()]
         while not isinstance(messages[-1], Ended):
             messages.append(self.message())
@@ -84,16 +86,27 @@ def spot(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spot]:
             cluster.remove_node(node)
 
 
+def agent_of_the_node() -> psutil.Process:
+    def found() -> list[psutil.Process]:
+        return [it for it in psutil.Process().children(recursive=True) if it.name() == "ray::Agent"]
+
+    wait_until(lambda: len(found()) == 1, "the agent")
+    return found()[0]
+
+
 def test_a_provider_takes_a_node_away(spot: Spot) -> None:
     spot.begin()
     assert spot.kind() is None
-    (known,) = spot.pool._agents._known.values()
-    ray.kill(known.actor, no_restart=False)  # it comes back
+    agent_of_the_node().kill()  # it comes back
     spot.service.spot(7200)
     wait_until(lambda: spot.kind() == Leaving.PREEMPTION, "the notice")
     notice = spot.pool.notices()[spot.node]
     assert notice.seconds == pytest.approx(7200, abs=1200)
-    spot.end()
+    agent = agent_of_the_node()
+    agent.suspend()
+    spot.pool.stop(TASK)  # is lost with the agent, and requested again of the one that comes back
+    agent.kill()
+    spot.end(stop=False)
     assert spot.kind() == Leaving.PREEMPTION  # known as long as the node is there
 
 
