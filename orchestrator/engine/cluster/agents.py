@@ -74,7 +74,7 @@ class Agents:
     def stop(self, id: str, pid: int) -> None:
         """Requests a worker on a node to save a checkpoint and end.
 
-        An agent that Ray restarts gets the request again. Nothing waits for the result: where it never arrives,
+        An agent that Ray restarts gets it again. Nothing waits for the result: where it never arrives,
         the task stops later or not at all.
         """
         if id == self._home:

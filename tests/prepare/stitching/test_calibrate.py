@@ -15,6 +15,8 @@ from tests.data import shared
 from tests.prepare.stitching.cameras import Camera, camera
 from tests.prepare.video.videos import Shot, render
 
+pytestmark = pytest.mark.system
+
 SMALL, WIDTH = 1024, 2048  # of panoramas of lenses whose pictures have half of that
 
 

@@ -20,6 +20,8 @@ from tests.prepare.stitching.cameras import camera
 from tests.prepare.video.videos import Shot, render
 from tests.prepare.world.stills import write_still
 
+pytestmark = pytest.mark.system
+
 Image = NDArray[np.uint8]
 
 

@@ -27,6 +27,8 @@ from tests.orchestrator.cli.program import call, one_line, shown
 from tests.prepare.stitching.cameras import camera
 from tests.prepare.video.videos import numbers, render, walk
 
+pytestmark = pytest.mark.system
+
 Image = NDArray[np.uint8]
 COUNT = 16
 
