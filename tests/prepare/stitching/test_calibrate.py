@@ -54,6 +54,7 @@ def test_the_lenses_are_found(turned: float) -> None:
     assert found.size == (512, 512) and abs(np.rad2deg(found.reach) - 98.5) < 1
 
 
+@pytest.mark.nightly
 def test_on_a_street_at_full_size() -> None:
     files = sorted((shared("street") / "images").iterdir())[::11]
     views = [

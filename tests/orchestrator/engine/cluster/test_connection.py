@@ -40,7 +40,10 @@ with connect(None, Path(sys.argv[1]), nice=eval(sys.argv[2])):
 
 @pytest.mark.parametrize(
     ("end", "nice", "nicer"),
-    [(signal.SIGKILL, None, 2), (signal.SIGINT, 3, 3)],  # SIGINT: as of a terminal
+    [
+        (signal.SIGKILL, None, 2),
+        pytest.param(signal.SIGINT, 3, 3, marks=pytest.mark.nightly),  # as of a terminal
+    ],
 )
 def test_nothing_is_left_and_workers_have_the_priority_that_is_wanted(
     tmp_path: Path, end: signal.Signals, nice: int | None, nicer: int
