@@ -17,9 +17,8 @@ from panolog.scene.files import atomic
 
 
 def write_scores(path: Path, cameras: Sequence[int], scores: ArrayLike | csr_array) -> None:
-    """Writes the scores (K, B) of cameras, which are K rows of Scene.panoramas; makes the folder."""
+    """Writes the scores (K, B) of cameras, which are K rows of Scene.panoramas."""
     values = csr_array(scores, dtype=np.float64)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,

@@ -105,6 +105,7 @@ def _write_plan(folder: RunFolder, sizes: Sequence[int]) -> None:
     grid, scores = Grid((blocks, 1, 1)), np.ones((2, blocks))
     plan = make_plan(centers, centers, scores, grid, PartitionConfig(), rows=(0, 1), names=("a", "b"))
     plan.gaussians[:] = sizes
+    folder.make(folder.plan.parent)
     write_json(folder.plan, plan.to_json())
 
 

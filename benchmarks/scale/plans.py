@@ -34,6 +34,7 @@ class PlanSize:
 def measure(folder: Path, panoramas: int, blocks: int, seen: int) -> PlanSize:
     """Each panorama sees `seen` blocks at random, which compresses worse than the blocks around it."""
     root = RunFolder(folder / f"{panoramas}-{blocks}")
+    root.root.mkdir()
     write, made = in_fresh_process(_write, root, panoramas, blocks, seen)
     read, used = in_fresh_process(_read, root)
     plan, scores = (path.stat().st_size / 1e6 for path in (root.plan, root.scores))

@@ -73,6 +73,17 @@ class RunFolder:
     images = _At("eval/images")  # held-out renders above their photographs
     seams = _At("eval/seams.json")  # what was measured at the faces between blocks
 
+    def make(self, place: Path) -> None:
+        """Makes a folder below that of the run, with those between. Raises OSError.
+
+        Never the run's own: where that is gone, as with a disk that is not mounted, another one in its place
+        would take what the run writes, and keep the right one from coming back.
+        """
+        made = self.root
+        for name in place.relative_to(self.root).parts:
+            made /= name
+            made.mkdir(exist_ok=True)
+
     @property
     def known_plan(self) -> Path:
         """The partition, or before there is one the outline: perhaps neither is there."""
@@ -281,8 +292,7 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes a JSON object atomically, for people too; makes its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Writes a JSON object atomically, for people too. Raises OSError."""
     write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 

@@ -90,7 +90,7 @@ def why_waiting(error: BaseException, root: Path, size: int = 0) -> str:
     code = _code(error)
     if code in _FULL:
         return f"disk full, waiting: free {_missing(root, size)} on the disk of {root} or stop the run"
-    if code in _AWAY:
+    if code in _AWAY or (code == errno.ENOENT and not root.exists()):
         return f"waiting for the disk of {root} ({os.strerror(code)}): make it writable or stop the run"
     return ""
 

@@ -111,7 +111,7 @@ def test_read_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
-    folder = RunFolder(tmp_path / "run")
+    folder = RunFolder(tmp_path)
     write_info(folder, make_info(SceneRef(path="/scene", fingerprint="f"), RunConfig(width=64)))
     with closing(Database(folder.database)) as database:
         database.append([RunBegan("host", 1, resumed=False)])

@@ -11,7 +11,7 @@ SCORES = np.array([[0.0, 1.5, 0.0], [1e-300, 0.0, 2.0]])
 
 
 def test_scores_survive_their_file(tmp_path: Path) -> None:
-    path = tmp_path / "partition" / "scores.npz"
+    path = tmp_path / "scores.npz"
     write_scores(path, (4, 7), SCORES)
     np.testing.assert_array_equal(read_scores(path, (4, 7), 3).toarray(), SCORES)
     np.testing.assert_array_equal(load_npz(path).toarray(), SCORES)  # with a library of others

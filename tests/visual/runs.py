@@ -361,6 +361,7 @@ def all_runs(root: Path, clock: Clock) -> Iterator[dict[str, RunFolder]]:
     }
     for days, (state, last) in enumerate(ended.items(), 2):
         with _written(root / NAMES[state], clock, days * 86_400, "2x1x1") as run:
+            run.folder.make(run.folder.outline.parent)
             write_json(run.folder.outline, town.plan("1x1x1", _CAMERAS)[0].to_json())
             town.write_model(run.folder.outline_points)
             run.add(_started(COARSE), after=12)

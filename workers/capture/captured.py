@@ -59,7 +59,6 @@ class Captured:
 
     def save(self, path: Path) -> None:
         """Writes it by atomic rename. Raises OSError if the disk takes no file."""
-        path.parent.mkdir(parents=True, exist_ok=True)
         with atomic(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **self._parts())
 

@@ -16,7 +16,7 @@ from panolog.orchestrator.engine.scheduling.pool import InProcess
 from panolog.orchestrator.engine.stages.partitioning import decide_plan, write_plan
 from panolog.orchestrator.engine.stages.scenes import learnt_scene, scene_of
 from panolog.orchestrator.runs.config import RunConfig, change
-from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.folder import RunFolder, make
 from panolog.orchestrator.runs.info import read_info
 from panolog.orchestrator.runs.machines.machine import cores, memory
 from panolog.orchestrator.runs.machines.nodes import Node
@@ -91,8 +91,9 @@ def repartition(
     plan = decide_plan(scene, means, scores, config)
     if output is not None:
         other = RunFolder(output)
-        write_plan_picture(other.plan_picture, plan, means)
+        make(output)
         write_plan(other, plan, scores)
+        write_plan_picture(other.plan_picture, plan, means)
     cameras, own = plan.assignment.counts, plan.gaussians
     blocks = {
         int(b): estimator.block(count, int(own[b]), int(cameras[b])) for b in np.flatnonzero(plan.trained)

@@ -175,7 +175,7 @@ class Preparation:
             for picture, given in zip(pictures, layers.get(MASKS, []), strict=False):
                 if given is not None:
                     kept = picture.layer(GIVEN)
-                    kept.parent.mkdir(parents=True, exist_ok=True)
+                    self.folder.make(kept.parent)
                     write_bytes(kept, given.read_bytes())
             self._mask(pictures)
             self.journal.until_done(lambda: write_mask_picture(notes.masks_picture(self.folder), pictures))

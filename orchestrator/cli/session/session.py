@@ -297,6 +297,7 @@ class _Beginning:
                 return
             from panolog.orchestrator.watch.views.plan_picture import write_plan_picture
 
+            folder.make(folder.plan_picture.parent)
             write_plan_picture(folder.plan_picture, plan, means)
 
         with on_signals() as stop:

@@ -211,7 +211,7 @@ class Specs:
         if faces:
             models[folder.seen_coarse(task)] = folder.model(COARSE)
         centers = np.concatenate([job.scene.centers[list(views)], looks.centers])
-        folder.seen(task).parent.mkdir(parents=True, exist_ok=True)
+        folder.make(folder.seen(task).parent)
         of_models = self._surroundings(*models.values(), detail=job.config.measured_detail)
         for path, surroundings in zip(models, of_models, strict=True):
             surroundings.write_seen(path, centers)
@@ -316,7 +316,7 @@ class Specs:
     def _reduced(self, task: TaskId, views: tuple[int, ...]) -> ScoreSpec:
         """The same with levels of detail of the Stage I model."""
         job, path = self._job, self._job.folder.seen(task)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        job.folder.make(path.parent)
         (surroundings,) = self._surroundings(job.folder.model(COARSE))
         labels = self._sharing.put(surroundings.write_seen(path, job.scene.centers[list(views)]))
         return replace(self._scored(task, views, path, labels), sizes=surroundings.sizes)
@@ -335,7 +335,7 @@ class Specs:
             return folder.model(whole)
         path = folder.initial(task)
         if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
+            folder.make(path.parent)
             (surroundings,) = self._surroundings(folder.model(whole))
             surroundings.write(path, blocks, views)
         return path

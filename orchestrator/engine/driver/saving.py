@@ -89,7 +89,7 @@ def save(folder: RunFolder, event: Event, scene: Scene, keep: int = 1) -> Record
 def make_outbox(folder: RunFolder, task: TaskId, attempt: int, token: str) -> Outbox:
     """Where an attempt may leave checkpoints, without what attempts before it have left. Raises OSError."""
     place = folder.of(task)
-    place.mkdir(parents=True, exist_ok=True)
+    folder.make(place)
     remove_partial(place)
     return Outbox(place, f"{token}-{attempt}", folder.presence, token)
 
@@ -167,7 +167,7 @@ class Usages:
 
 def _save_preview(folder: RunFolder, event: Preview) -> PreviewSaved:
     path = folder.preview(event.task, event.iteration)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    folder.make(path.parent)
     write_bytes(path, event.jpeg)
     kept = sorted(int(file.stem) for file in path.parent.glob("*.jpg") if file.stem.isdecimal())
     if (gone := thinning.surplus(kept, event.iteration)) is not None:
@@ -179,7 +179,7 @@ def _save_preview(folder: RunFolder, event: Preview) -> PreviewSaved:
 
 def _save_checkpoint(folder: RunFolder, event: Checkpoint, keep: int) -> CheckpointSaved:
     path = folder.checkpoint(event.task)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    folder.make(path.parent)
     _keep_last(folder, event.task, keep)
     checkpoint.save(path, event)
     _LOG.info("%s: saved a checkpoint at iteration %d", event.task, event.iteration)
@@ -229,7 +229,7 @@ def _iteration(path: Path) -> int | None:
 
 def _save_model(folder: RunFolder, event: Trained, scene: Scene) -> ModelSaved:
     path = folder.model(event.task)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    folder.make(path.parent)
     if event.captured is not None:
         if event.task == COARSE:
             save_captured(folder, event.captured, scene)
@@ -243,5 +243,6 @@ def _save_model(folder: RunFolder, event: Trained, scene: Scene) -> ModelSaved:
 
 def _save_scores(folder: RunFolder, event: Scored) -> ScoresSaved:
     path = folder.shard(event.task)
+    folder.make(path.parent)
     write_scores(path, event.cameras, event.scores.numpy())
     return ScoresSaved(event.task, folder.relative(path), len(event.cameras))

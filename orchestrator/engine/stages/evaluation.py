@@ -59,11 +59,11 @@ class Evaluation:
             if event.pose_fit is not None:
                 self.pose_fit[event.view] = event.pose_fit
             if self.folder is not None:
-                self._save_picture(self.folder.picture(event.view), event)
+                self._save_picture(self.folder, event)
         if isinstance(event, SeamMeasured):
             self.seams.append(event.seam)
             if self.folder is not None:
-                _save_pictures(self.folder.seam(*event.seam.blocks), event.pictures)
+                _save_pictures(self.folder, self.folder.seam(*event.seam.blocks), event.pictures)
 
     @cached_property
     def _held_out(self) -> set[str]:
@@ -79,6 +79,7 @@ class Evaluation:
         """Writes what a shard has measured, and returns the record of it. Raises OSError if it cannot."""
         path, seams = folder.shard(task), [seam.model_dump(mode="json") for seam in self.seams]
         measured = {"views": self.views, "left_out": self.left_out, "lpips_reason": self.lpips_reason}
+        folder.make(path.parent)
         write_json(path, measured | {"pose_fit": self.pose_fit, "seams": seams})
         return MeasuresSaved(task, folder.relative(path), len(self._held_out), len(seams))
 
@@ -125,23 +126,25 @@ class Evaluation:
         Raises OSError if one cannot be written.
         """
         report = self.report()
+        folder.make(folder.metrics.parent)
         if self.seams:
             write_json(folder.seams, SeamsFile.of(self.seams).model_dump(mode="json"))
         write_json(folder.metrics, report)
         mean: Metrics = report["mean"]
         return mean
 
-    def _save_picture(self, path: Path, event: Evaluated) -> None:
+    def _save_picture(self, folder: RunFolder, event: Evaluated) -> None:
         row = next(i for i in self.scene.test if self.scene.panoramas[i].name == event.view)
         truth = load_view(self.scene.panoramas[row], row, self.width).image.numpy()
         render = cv2.imdecode(np.frombuffer(event.png, np.uint8), cv2.IMREAD_COLOR)
         rule = np.full((_RULE, self.width, 3), 255, np.uint8)
         picture = np.concatenate([render, rule, cv2.cvtColor(truth, cv2.COLOR_RGB2BGR)])
         jpeg = bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
-        _save_pictures(path.parent, {path.name: jpeg})
+        path = folder.picture(event.view)
+        _save_pictures(folder, path.parent, {path.name: jpeg})
 
 
-def _save_pictures(folder: Path, pictures: Mapping[str, bytes]) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
+def _save_pictures(folder: RunFolder, place: Path, pictures: Mapping[str, bytes]) -> None:
+    folder.make(place)
     for name, content in pictures.items():
-        write_bytes(folder / name, content)
+        write_bytes(place / name, content)

@@ -79,7 +79,7 @@ def unite_blocks(folder: RunFolder, state: RunState, plan: Plan, task: TaskId) -
     """
     started = time.monotonic()
     output = folder.model(task)
-    output.parent.mkdir(parents=True, exist_ok=True)
+    folder.make(output.parent)
     count = merge(_block_plys(folder, state, plan), folder.model(COARSE), output)
     return _saved(folder, task, count, 0, started)
 
@@ -122,6 +122,7 @@ def join_districts(folder: RunFolder, scene: Scene, districts: Districts, iterat
             yield from (retained(piece, cell, 0.0) for piece in read_ply_chunks(path))
         yield sky
 
+    folder.make(folder.model(COARSE).parent)
     count = _write(folder.model(COARSE), parts, len(sky), files[0][0])
     return _saved(folder, COARSE, count, iterations, started)
 
@@ -226,7 +227,7 @@ def _keep_coarse(folder: RunFolder, plan: Plan, blocks: Sequence[int]) -> None:
     offset, exact = ply_offset(coarse), ply_exact(coarse)
     for block in blocks:
         path = folder.kept(block)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        folder.make(path.parent)
         join_ply(path, [(coarse, np.flatnonzero(labels == block))], sky=0, offset=offset, exact=exact)
 
 
@@ -248,7 +249,6 @@ def _write(path: Path, parts: Callable[[], Iterator[Gaussians]], sky: int, like:
     Args: parts is called twice, since the header, which comes first, has their number; sky, how many of them
     at the end are sky.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     count = sum(map(len, parts()))
     write_ply_parts(path, parts(), count=count, sky=sky, offset=ply_offset(like), exact=ply_exact(like))
     return count

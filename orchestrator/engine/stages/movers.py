@@ -26,13 +26,13 @@ def write_movers(folder: RunFolder, scene: Scene) -> None:
     """
     shares = {row: moving_share(scene.panoramas[row].movers) for row in scene.train}
     worst = sorted((row for row in scene.train if shares[row] > 0), key=lambda row: (-shares[row], row))
-    folder.movers.mkdir(parents=True, exist_ok=True)
+    folder.make(folder.movers)
     for row in worst:
         panorama = scene.panoramas[row]
         assert panorama.movers is not None
         mask = np.where(panorama.movers, 0, 255).astype(np.uint8)
         path = folder.mover_mask(panorama.name)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        folder.make(path.parent)
         write_bytes(path, bytes(cv2.imencode(".png", mask)[1]))
     pictured = list(_pictures(folder, [scene.panoramas[row] for row in worst[:PICTURES]]))
     content = {
@@ -59,7 +59,7 @@ def _pictures(folder: RunFolder, panoramas: list[Panorama]) -> Iterator[str]:
         except SceneError:  # it may have been damaged since: the run goes on without it, and so does this
             continue
         path = folder.mover_picture(panorama.name)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        folder.make(path.parent)
         picture = cv2.cvtColor(_tinted(photograph, panorama), cv2.COLOR_RGB2BGR)
         write_bytes(path, bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]))
         yield panorama.name

@@ -67,7 +67,7 @@ def _write(
         plan = make_plan(centers, points, scores, grid, partition, rows=rows, names=names)
     except InputError:
         return  # what is wrong is said where it matters
-    folder.outline.parent.mkdir(parents=True, exist_ok=True)
+    folder.make(folder.outline.parent)
     _write_points(folder.outline_points, points)
     _write_points(folder.outline_fixes, fixes)
     write_json(folder.outline, plan.to_json())

@@ -48,6 +48,7 @@ def decide_plan(scene: Scene, means: NDArray[np.float32], scores: csr_array, con
 
 def write_plan(folder: RunFolder, plan: Plan, scores: csr_array) -> None:
     """Writes scores.npz and plan.json. Args: scores (K, B) that the plan was made of."""
+    folder.make(folder.plan.parent)
     write_scores(folder.scores, plan.rows, scores)
     write_json(folder.plan, plan.to_json())
 

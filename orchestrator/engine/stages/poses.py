@@ -70,6 +70,7 @@ def _write_model(folder: RunFolder, learnt: Scene) -> None:
     }
     nothing = (np.zeros(0, np.int64), np.zeros((0, 2)))
     offset = np.array(learnt.offset)
+    folder.make(folder.sparse)
     write_colmap(
         folder.sparse,
         [(each.name, each.rotation, each.translation - each.rotation @ offset) for each in learnt.panoramas],

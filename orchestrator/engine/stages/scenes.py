@@ -69,6 +69,7 @@ def _with(path: Path, scene: Scene) -> Scene:
 
 def save_captured(folder: RunFolder, captured: Captured, scene: Scene) -> None:
     """Writes what Stage I has learnt, for later stages and to be read. Raises OSError if that fails."""
+    folder.make(folder.captured(COARSE).parent)
     captured.save(folder.captured(COARSE))
     learnt = captured.applied(scene)
     adjusted = Captured.load(folder.adjusted) if folder.adjusted.exists() else None

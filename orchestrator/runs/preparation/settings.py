@@ -100,6 +100,7 @@ def settings_path(folder: RunFolder) -> Path:
 
 def write_settings(folder: RunFolder, settings: Settings) -> None:
     """Writes the settings. Raises OSError if that is impossible."""
+    folder.make(folder.preparation)
     write_json(settings_path(folder), settings.model_dump(mode="json"))
 
 

@@ -35,7 +35,6 @@ def write_mask_picture(path: Path, panoramas: Sequence[PanoramaFile]) -> None:
         top, left = number // columns * (_WIDTH // 2 + _GAP), number % columns * (_WIDTH + _GAP)
         sheet[top : top + _WIDTH // 2, left : left + _WIDTH] = tile
     encoded = cv2.imencode(".jpg", sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, bytes(encoded))
 
 

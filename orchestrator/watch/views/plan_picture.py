@@ -21,7 +21,6 @@ _INK, _GREY = "#22272e", "#59616d"
 
 def write_plan_picture(path: Path, plan: Plan, points: NDArray[np.floating]) -> None:
     """Writes a picture of a plan, atomically: see `plan_figure`. Raises OSError if it cannot be written."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure = plan_figure(plan, points)
     with atomic(path) as temporary:
         figure.savefig(temporary, format="png")

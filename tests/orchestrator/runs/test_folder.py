@@ -30,6 +30,15 @@ def test_run_json_holds_the_resolved_settings(folder: RunFolder) -> None:
     assert json.loads(folder.info.read_text())["config"]["sky"]["count"] == 100_000
 
 
+def test_no_second_folder_of_a_run_is_made(folder: RunFolder) -> None:
+    folder.make(folder.seam(0, 1))
+    assert folder.seam(0, 1).is_dir()
+    folder.root.rename(folder.root.with_name("away"))
+    with pytest.raises(FileNotFoundError):
+        folder.make(folder.seam(0, 1))
+    assert not folder.root.exists()
+
+
 def test_a_3d_view_shows_the_latest_snapshot_while_stage_one_trains(folder: RunFolder) -> None:
     snapshot, last, block = folder.snapshot(COARSE), folder.checkpoint(COARSE), TaskId.block(0)
     snapshot.parent.mkdir()

@@ -146,6 +146,23 @@ def test_a_disk_that_is_full_in_the_preflight_is_waited_for(
     assert RunFolder(root).point_cloud.exists()
 
 
+def test_a_folder_that_is_gone_in_the_preflight_is_waited_for(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, away, write, times = tmp_path / "run", tmp_path / "away", run_folder.write_json, iter((1, 2))
+
+    def write_json(path: Path, content: Any) -> None:
+        if path == RunFolder(root).preflight and (time := next(times, 0)):
+            assert not (time == 2 and root.exists())  # nothing has taken its place
+            (root if time == 1 else away).rename(away if time == 1 else root)
+        write(path, content)
+
+    monkeypatch.setattr(run_folder, "write_json", write_json)
+    start(scene, root, config=load_config(flags={**SETTINGS, "disk.retry": 0.01}))
+    assert RunFolder(root).point_cloud.exists()
+    assert not away.exists()
+
+
 def test_a_resume_waits_for_a_disk_that_is_full_when_run_db_is_opened(
     killed: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -198,7 +198,7 @@ def test_a_run_whose_plan_knows_no_shards_is_evaluated_as_one_task(
 
 
 def test_seams_are_written_with_their_pictures_and_count_for_completeness(tmp_path: Path) -> None:
-    scene, folder = small_scene(tmp_path), RunFolder(tmp_path / "run")
+    scene, folder = small_scene(tmp_path), RunFolder(tmp_path)
     write_ply(tmp_path / "model.ply", scene_gaussians(scene))
     evaluation = Evaluation(scene, tmp_path / "model.ply", WIDTH, 0.0, folder, faces=1)
     evaluation.add(LeftOut(EVAL, "damaged", scene.panoramas[scene.test[0]].name))
@@ -213,7 +213,7 @@ def test_seams_are_written_with_their_pictures_and_count_for_completeness(tmp_pa
 
 
 def test_what_is_measured_at_fitted_poses_stands_next_to_the_metrics(tmp_path: Path) -> None:
-    scene, folder = small_scene(tmp_path), RunFolder(tmp_path / "run")
+    scene, folder = small_scene(tmp_path), RunFolder(tmp_path)
     write_ply(tmp_path / "model.ply", scene_gaussians(scene))
     shards, whole = [TaskId.measure(0), TaskId.measure(1)], replace(scene, test=(3, 4))
     for shard, row in zip(shards, whole.test, strict=True):

@@ -45,7 +45,7 @@ def scene(tmp_path: Path) -> Scene:
 
 
 def test_the_outline_of_a_place_is_a_plan_of_one_block(scene: Scene, tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path / "run")
+    folder = RunFolder(tmp_path)
     write_outline(folder, scene, CONFIG)
     plan = read_plan(folder.known_plan)
     assert (plan.grid.count, plan.rows) == (1, scene.train)
@@ -62,7 +62,7 @@ def test_the_outline_of_a_place_is_a_plan_of_one_block(scene: Scene, tmp_path: P
 
 def test_gps_in_the_files_is_in_the_world_of_the_run(scene: Scene, tmp_path: Path) -> None:
     """What is subtracted from coordinates, by the scene and on reading, is subtracted from it too."""
-    offset, far, folder = (5.0, -4.0, 3.0), (1000.0, 0.0, 0.0), RunFolder(tmp_path / "run")
+    offset, far, folder = (5.0, -4.0, 3.0), (1000.0, 0.0, 0.0), RunFolder(tmp_path)
     latitude, longitude = 47 + (22 + 39.12 / 60) / 60, 8 + 32.5 / 60
     origin = Origin(latitude=latitude - 0.001, longitude=longitude, altitude=400.0)
     write_offset(scene.root, Offset(offset=offset, frame="ENU", origin=origin))
@@ -82,7 +82,7 @@ def test_gps_in_the_files_is_in_the_world_of_the_run(scene: Scene, tmp_path: Pat
 
 
 def test_of_many_points_some_are_kept(scene: Scene, tmp_path: Path) -> None:
-    folder, many = RunFolder(tmp_path / "run"), scene.points.repeat(600, axis=0)
+    folder, many = RunFolder(tmp_path), scene.points.repeat(600, axis=0)
     write_outline(folder, replace(scene, points=many), CONFIG)
     assert 30_000 < len(read_points(folder.outline_points)) <= 50_000
 

@@ -22,7 +22,7 @@ SCENE = cast(Scene, None)  # no part of a checkpoint
 
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
-    return RunFolder(tmp_path / "run")
+    return RunFolder(tmp_path)
 
 
 def save(folder: RunFolder, iteration: int, keep: int) -> None:

@@ -267,6 +267,7 @@ def test_what_was_measured_and_its_pictures_are_of_the_run_alone(tmp_path: Path)
         path = f"/api/runs/{server.id('run')}/findings"
         assert not any(server.get(path).values())
         values = {"psnr": 20.0, "lpips": None}
+        folder.make(folder.metrics.parent)
         write_json(folder.metrics, {"mean": {"psnr": 20.0}, "views": {"a.jpg": values}})
         write_json(folder.mover_shares, {"panoramas": [{"name": f"{i}.jpg", "share": 0.1} for i in range(2)]})
         folder.mover_picture("0.jpg").parent.mkdir(parents=True)

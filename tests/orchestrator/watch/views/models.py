@@ -72,4 +72,5 @@ def save_plan(folder: RunFolder, names: Sequence[str] = NAMES, centers: np.ndarr
         rows=range(len(names)),
         names=list(names),
     )
+    folder.make(folder.plan.parent)
     write_json(folder.plan, plan.to_json())

@@ -167,6 +167,7 @@ def test_a_model_in_training_is_replaced_by_newer_ones_and_the_view_stays(
     monkeypatch.setattr(pages, "_SHARE", 1e6)  # as soon as there is one
     monkeypatch.setattr(making, "_IDLE_S", 600)  # one process makes all pages
     folder = write_run(tmp_path / "run")
+    folder.make(folder.outline.parent)
     write_json(folder.outline, plan().to_json())
     with lock.hold(folder.lock), serving(tmp_path) as served:
         page_of_run = f"/api/runs/{served.id('run')}"

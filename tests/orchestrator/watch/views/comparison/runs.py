@@ -49,6 +49,7 @@ def write(
     with closing(Database(folder.database)) as database:
         database.store([(_START + at, record) for at, record in (finished() if records is None else records)])
     if measured is not None:
+        folder.make(folder.metrics.parent)
         write_json(folder.metrics, measured)
     return folder
 

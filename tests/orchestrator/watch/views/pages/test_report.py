@@ -135,6 +135,7 @@ def test_other_peoples_words_stay_words(tmp_path: Path) -> None:
     begin(folder, SCRIPT)
     failed = TaskFailed(COARSE, 1, SCRIPT, final=True)
     append(folder, BEGAN, Noticed(COARSE, SCRIPT), failed)
+    folder.make(folder.metrics.parent)
     write_json(folder.metrics, {"views": {SCRIPT: {"psnr": 1.0}}, "lpips_reason": SCRIPT})
     report = Report(write_report(folder))
     assert "alert(1)</script>" not in report.text
