@@ -90,7 +90,9 @@ def why_waiting(error: BaseException, root: Path, size: int = 0) -> str:
     code = _code(error)
     if code in _FULL:
         return f"disk full, waiting: free {_missing(root, size)} on the disk of {root} or stop the run"
-    if code in _AWAY or (code == errno.ENOENT and not root.exists()):
+    if code in _AWAY | {errno.ENOENT} and not root.exists():
+        return f"waiting for {root}, which is gone: put it back or stop the run"
+    if code in _AWAY:
         return f"waiting for the disk of {root} ({os.strerror(code)}): make it writable or stop the run"
     return ""
 

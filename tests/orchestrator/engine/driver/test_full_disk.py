@@ -167,6 +167,9 @@ def test_reasons_say_what_to_do(tmp_path: Path) -> None:
     assert "Input/output error" in away
     for number in (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EROFS):
         assert why_waiting(OSError(number, "x"), tmp_path)
+    for number in (errno.ENOENT, errno.EROFS):  # the latter is what SQLite reports
+        assert "which is gone: put it back" in why_waiting(OSError(number, "x"), tmp_path / "gone")
+    assert why_waiting(FileNotFoundError(errno.ENOENT, "no"), tmp_path) == ""
     assert why_waiting(ValueError("no"), tmp_path) == ""
     assert why_waiting(PermissionError(errno.EACCES, "no"), tmp_path) == ""
 
