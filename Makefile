@@ -17,7 +17,7 @@ endif
 
 # Most tests wait for processes that they started: two more of them than cores keep two cores busy.
 WORKERS ?= 4
-PYTEST := $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
+PYTEST = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 # What pip cannot install, reported before anything is downloaded.
 define CHECK
@@ -47,6 +47,8 @@ demo: $(READY)  ## reconstruct a small town end to end, on the CPU, into runs/de
 test: $(READY)  ## run the tests
 	$(PYTEST) -m "not nightly" $(OPTIONS)
 
+# These compute: a process for each core.
+check: WORKERS = logical
 check: lint  ## lint, and run the unit tests: those without Ray, browser and whole runs
 	$(PYTEST) -m "not system and not nightly"
 
