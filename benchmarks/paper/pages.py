@@ -86,9 +86,8 @@ def write_docs(path: Path, study: Study) -> None:
     kept[study.name] = kept[study.name].joined(study) if study.name in kept else study
     studies = sorted(kept.values(), key=lambda it: (it.settings.width, it.settings.iterations, it.chosen))
     recipes = measured_recipes(studies)
-    for each in studies:
-        (folder / each.name).mkdir(parents=True, exist_ok=True)
-        each.save(folder / each.name)
+    (folder / study.name).mkdir(parents=True, exist_ok=True)
+    kept[study.name].save(folder / study.name)
     write_json(folder / RECIPES_FILE, {name: flat(RunConfig(recipe=name)) for name in recipes})
     links = {}
     for number, each in enumerate(studies):

@@ -48,7 +48,7 @@ class Result:
     settings: dict[str, Any] = field(default_factory=dict)  # resolved, by dotted key
     sources: str = ""  # fingerprint of the code that has measured it
     code: str = ""  # the same for readers
-    machine: str = ""  # that has measured it
+    machine: str = ""  # the hardware and versions that it was measured on
     same_as: str = ""  # the variant with the same training or the same plan, which has not run again
     failed: str = ""  # why there is nothing else
 
@@ -153,7 +153,7 @@ class Results:
 
     @property
     def machines(self) -> list[str]:
-        """Those that have measured them, that of the latest results last."""
+        """The machines that have measured the results, in the order of these."""
         return list(dict.fromkeys(result.machine for result in self.all if result.machine))
 
     def failure(self, scene: str, variant: str) -> str:

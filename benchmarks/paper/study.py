@@ -39,26 +39,18 @@ class Study:
 
     @property
     def name(self) -> str:
-        """Of its folder among those of a page: what all runs have in common, and the tables."""
+        """The name of the study's folder next to a page: what all runs have in common, and the tables."""
         given = self.settings
         parts = (given.width, given.iterations, given.blocks, *given.sets, *self.chosen)
         return "-".join(map(str, parts))
 
     @property
     def command(self) -> str:
-        """That which measures all of it, without the folders of a machine."""
-        given, scenes = self.settings, [Path(scene).name for scene in self.scenes]
+        """The command that measures the whole study, without the folders of a machine."""
+        given = self.settings
         seeds = 1 + max((result.seed for result in self.results.all), default=0)
-        words = [
-            "python",
-            "-m",
-            "benchmarks.paper",
-            *scenes,
-            "-o",
-            "FOLDER",
-            "--tables",
-            ",".join(self.chosen),
-        ]
+        words = ["python", "-m", "benchmarks.paper", *(Path(scene).name for scene in self.scenes)]
+        words += ["-o", "FOLDER", "--tables", ",".join(self.chosen)]
         words += ["--width", str(given.width), "--iterations", str(given.iterations)]
         words += ["--blocks", given.blocks, "--seeds", str(seeds)]
         words += [part for setting in given.sets for part in ("--set", setting)]
@@ -80,7 +72,7 @@ class Study:
         return ", ".join(parts) + (": each says which." if max(len(codes), len(machines)) > 1 else ".")
 
     def joined(self, later: "Study") -> "Study":
-        """With what a later study of the same name has measured, anew or in addition."""
+        """This study, with what a later one of the same name has measured anew or in addition."""
         results = {(it.scene, it.variant, it.seed): it for it in (*self.results.all, *later.results.all)}
         overlaps = {(it.scene, it.variant, it.tau): it for it in (*self.overlaps, *later.overlaps)}
         names = {Path(scene).name: scene for scene in (*self.scenes, *later.scenes)}

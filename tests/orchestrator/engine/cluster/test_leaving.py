@@ -44,9 +44,11 @@ class Spot:
         assert self.pool.ready(300) == [TASK]
         return self.pool.take(TASK)
 
-    def end(self, *, stop: bool = True) -> None:
-        if stop:
-            self.pool.stop(TASK)
+    def end(self) -> None:
+        self.pool.stop(TASK)
+        self.wait_for_the_end()
+
+    def wait_for_the_end(self) -> None:
         messages = [self.message()]
         while not isinstance(messages[-1], Ended):
             messages.append(self.message())
@@ -106,7 +108,7 @@ def test_a_provider_takes_a_node_away(spot: Spot) -> None:
     agent.suspend()
     spot.pool.stop(TASK)  # is lost with the agent, and requested again of the one that comes back
     agent.kill()
-    spot.end(stop=False)
+    spot.wait_for_the_end()
     assert spot.kind() == Leaving.PREEMPTION  # known as long as the node is there
 
 
