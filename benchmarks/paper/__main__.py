@@ -57,7 +57,11 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
         metavar="SCENE=KIND",
         help=f"what a scene's goals are: of {', '.join(KINDS)}; default: street",
     )
-    parser.add_argument("--finished", action="store_true", help="run nothing: report what has a result")
+    running = parser.add_mutually_exclusive_group()
+    running.add_argument(
+        "--only", metavar="VARIANTS", help="run only these, comma-separated; report what has a result"
+    )
+    running.add_argument("--finished", action="store_true", help="run nothing: report what has a result")
     parser.add_argument(
         "--docs", type=Path, metavar="FILE", help="add the results to this page of the documentation"
     )
@@ -67,6 +71,10 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
         parser.error(f"--tables: {', '.join(sorted(unknown))} is none of {', '.join(names)}")
     if parsed.seeds < 1:
         parser.error("--seeds: at least 1")
+    found = {variant.name for table in stages(given) for variant in table}
+    parsed.only = () if parsed.finished else parsed.only and tuple(parsed.only.split(","))
+    if unknown := set(parsed.only or ()) - found:
+        parser.error(f"--only: {', '.join(sorted(unknown))} is none of {', '.join(sorted(found))}")
     kinds = {scene: kind for scene, _, kind in (pair.partition("=") for pair in parsed.kinds)}
     for scene, kind in kinds.items():
         if scene not in {path.resolve().name for path in parsed.scenes} or kind not in KINDS:
@@ -130,7 +138,7 @@ def measure(options: argparse.Namespace, settings: Settings) -> Study:
             options.kinds,
         )
 
-    for result in run_all(benches, tables_of_variants, finished=options.finished):
+    for result in run_all(benches, tables_of_variants, options.only):
         done.append(result)
         so_far().save(options.output)
     made = so_far()

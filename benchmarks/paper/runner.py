@@ -7,7 +7,7 @@ other code is used, and its row says so. An unfinished run of other settings or 
 import json
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import rmtree
@@ -293,24 +293,23 @@ class Clock:
 
 
 def run_all(
-    benches: Sequence[Bench], stages: Sequence[Sequence[Variant]], *, finished: bool = False
+    benches: Sequence[Bench], stages: Sequence[Sequence[Variant]], only: Container[str] | None = None
 ) -> Iterable[Result]:
     """The results of all variants of all scenes and seeds.
 
     Stage by stage, each over all scenes; later seeds of what has a spread come last. So what is there after
-    an early end is what matters most. Args: finished, whether nothing runs: only what has a result is shown.
+    an early end is what matters most. Args: only, variants that may run; of others only results are shown.
     """
     first, later = ([b for b in benches if (b.seed == 0) == own] for own in (True, False))
     work = [(b, v) for stage in stages for b in first for v in stage]
     work += [
         (b, v) for b in sorted(later, key=lambda b: b.seed) for stage in stages for v in stage if v.spread
     ]
+    work = [(b, v) for b, v in work if only is None or v.name in only or b.known(v)]
     timer = Clock()
     for number, (bench, variant) in enumerate(work):
         if bench.known(variant):
             result = bench.result(variant)
-        elif finished:
-            continue
         else:
             units = _units(bench, variant)
             left = sum(_units(b, v) for b, v in work[number:] if not b.known(v))

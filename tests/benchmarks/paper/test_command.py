@@ -9,8 +9,8 @@ import pytest
 import panolog
 from benchmarks.paper import __main__ as command
 from benchmarks.paper.code import present
-from benchmarks.paper.results import Results, save
-from benchmarks.paper.runner import Bench
+from benchmarks.paper.results import Result, Results, save
+from benchmarks.paper.runner import Bench, run_all
 from benchmarks.paper.tables import main_tables
 from benchmarks.paper.variants import Settings, Variant, variants
 from tests.benchmarks.paper.made import result
@@ -55,6 +55,7 @@ def stored(bench: Bench) -> Callable[..., None]:
         (["{scene}", "{twin}"], "two scenes are named street"),
         (["{scene}", "--set", "sky.cuont=1"], "did you mean sky.count"),
         (["{scene}", "--tables", "main,mian"], "--tables: mian is none of main"),
+        (["{scene}", "--tables", "tau", "--only", "paper,tau-0.6"], "--only: tau-0.6 is none of paper"),
         (["{scene}", "--seeds", "0"], "--seeds: at least 1"),
         (["{scene}", "--kind", "town=flat"], "--kind town=flat: give the name of a scene"),
         (["{scene}", "--kind", "street=road"], "--kind street=road: give the name of a scene"),
@@ -111,6 +112,23 @@ def test_a_result_of_other_settings_is_refused(
     given = [str(bench.scene), "-o", str(bench.folder.parent), "--tables", "tau", *SMALL]
     assert command.main(given) == 2
     assert "settings that are not stored" in capsys.readouterr().err
+
+
+def test_only_some_variants_may_run_and_all_results_are_reported(
+    bench: Bench, stored: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[str] = []
+
+    def trained(self: Bench, variant: Variant) -> Result:
+        ran.append(variant.name)
+        return result(variant.name, 24.0)
+
+    stored("paper")
+    monkeypatch.setattr(Bench, "result", trained)
+    table = [KNOWN[name] for name in ("paper", "tau-0.7", "tau-0.8")]
+    for only, expected in ((None, 3), (["tau-0.8"], 2), ((), 1)):
+        assert len(list(run_all([bench], [table], only))) == expected
+    assert ran == ["paper", "tau-0.7", "tau-0.8", "paper", "tau-0.8", "paper"]
 
 
 def test_a_result_of_other_code_says_so(

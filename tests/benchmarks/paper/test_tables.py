@@ -107,11 +107,21 @@ def test_stage_one_is_compared_with_itself_on_its_way() -> None:
     runs = [result("paper-stage1", 24.0), result("panolog-stage1", 26.0, curve=worse)]
     found = {goal.name: (goal.measured, goal.met) for goal in goals.goals(Results(runs), {})}
     assert found["street: Stage I of panolog at its end"] == ("26.00 dB, at most 26.10 dB before", False)
-    gain = found["panolog against paper, Stage I alone, equal iterations: WS-PSNR"]
+    gain = found["panolog-stage1 against paper-stage1, equal iterations: WS-PSNR"]
     assert gain == ("mean +2.00 dB: street +2.00", True)
     rising = result("panolog-stage1", 26.0, curve=worse[::-1])
     (last,) = [goal for goal in goals.goals(Results([rising]), {}) if "at its end" in goal.name]
     assert last.met
+
+
+def test_the_time_to_the_quality_of_another_recipe_is_a_third_at_most() -> None:
+    sooner = (Point(10.0, 23.0, "coarse"), Point(20.0, 25.0, "coarse"), Point(100.0, 26.0, "merged"))
+    runs = [result("authors-stage1", 24.0), result("panolog-stage1", 26.0, curve=sooner)]
+    name = "street: panolog-stage1 reaches the final WS-PSNR of authors-stage1 (24.00 dB)"
+    for seconds, measured in ((40.0, "15 s of 40 s, 38 %"), (100.0, "15 s of 100 s, 15 %")):
+        runs[0] = replace(runs[0], seconds={"coarse": seconds})
+        found = {goal.name: (goal.measured, goal.met) for goal in goals.goals(Results(runs), {})}
+        assert found[name] == (measured, seconds == 100.0)
 
 
 def test_the_time_at_a_level_is_between_two_states() -> None:
