@@ -3,8 +3,9 @@
 Only the bounds of cells are used, so any partition into boxes has faces.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,7 @@ _CAMERAS = 3  # on each side of a face
 _FARTHEST = 10.0  # baselines from a face at which a camera still counts as near
 _AWAY = 3.0  # baselines from a face at which a block is within itself
 _PAIR = 4.0  # baselines between two cameras up to which a viewer may move from one to the other
+_PART = 1_000  # faces whose cameras are found at once
 _HELD = 8  # of so many cameras near a face one does not train what is near it but checks it
 _FEWEST = 4  # cameras of a block that has planes within
 _QUARTILES = (0.25, 0.5, 0.75)
@@ -51,13 +53,7 @@ class Plane:
 
     def distances(self, points: ArrayLike, aabb: Aabb) -> NDArray[np.float64]:
         """(N,) distances of world points (N, 3) from the part of the face in the AABB, in world units."""
-        low, high = (
-            aabb.lower + (np.clip(corner, *_BOX) - _BOX[0]) * 4 * aabb.half
-            for corner in (self.lower, self.upper)
-        )
-        positions = np.asarray(points, np.float64)
-        distances: NDArray[np.float64] = np.linalg.norm(positions - positions.clip(low, high), axis=1)
-        return distances
+        return _distances(np.asarray(points, np.float64), *_in_box([self], aabb))
 
 
 def planes_between(grid: Cells) -> tuple[Plane, ...]:
@@ -65,25 +61,35 @@ def planes_between(grid: Cells) -> tuple[Plane, ...]:
     bounds = [grid.bounds(block) for block in range(grid.count)]
     lower, upper = (np.array(corners) for corners in zip(*bounds, strict=True))  # (B, 3)
     found = []
-    for block, axis in np.ndindex(grid.count, 3):
-        low, high = np.maximum(lower, lower[block]), np.minimum(upper, upper[block])
-        touches = lower[:, axis] == upper[block, axis]
+    for axis in range(3):
         along = [other for other in range(3) if other != axis]
-        for above in np.flatnonzero(touches & (low < high)[:, along].all(axis=1)):
-            at = float(upper[block, axis])
-            found.append(_face(block, int(above), axis, at, low[above], high[above]))
-    return tuple(found)
+        for at in np.intersect1d(lower[:, axis], upper[:, axis]):
+            belows, aboves = np.flatnonzero(upper[:, axis] == at), np.flatnonzero(lower[:, axis] == at)
+            meet = np.full((len(belows), len(aboves)), True)
+            for other in along:
+                meet &= lower[belows, other][:, None] < upper[aboves, other]
+                meet &= lower[aboves, other] < upper[belows, other][:, None]
+            for i, j in np.argwhere(meet):
+                below, above = int(belows[i]), int(aboves[j])
+                low, high = np.maximum(lower[below], lower[above]), np.minimum(upper[below], upper[above])
+                found.append(_face(below, above, axis, float(at), low, high))
+    return tuple(sorted(found, key=lambda face: (face.below, face.axis, face.above)))
 
 
 def seams_of(plan: Plan) -> tuple[Plane, ...]:
     """The faces that are near cameras on both sides, with a trained block on either."""
-    trained = (face for face in planes_between(plan.grid) if plan.trained[[face.below, face.above]].any())
-    return tuple(face for face in trained if cameras_at(plan, face))
+    trained = [face for face in planes_between(plan.grid) if plan.trained[[face.below, face.above]].any()]
+    found: list[Plane] = []
+    for faces in _parts(trained):
+        index, cameras, _ = _near(plan, faces)
+        below, above = (set(index[side].tolist()) for side in _sides(plan, faces, index, cameras))
+        found += [face for i, face in enumerate(faces) if i in below and i in above]
+    return tuple(found)
 
 
 def most_seen(plan: Plan, faces: Sequence[Plane], most: int) -> tuple[Plane, ...]:
     """Of some faces the `most` that are near most cameras, in order."""
-    near = [len(_near(plan, face)[0]) for face in faces]
+    near = [n for part in _parts(faces) for n in np.bincount(_near(plan, part)[0], minlength=len(part))]
     chosen = sorted(range(len(faces)), key=lambda i: (-near[i], i))[:most]
     return tuple(faces[i] for i in sorted(chosen))
 
@@ -108,14 +114,10 @@ def cameras_at(plan: Plan, face: Plane) -> tuple[int, ...]:
 
     The nearest ones, and along a long face some far from these. None unless there are cameras on both sides.
     """
-    offsets = contract(plan.centers, plan.aabb)[:, face.axis] - face.at
-    sides = [
-        np.flatnonzero((plan.camera_blocks == block) & ((offsets >= 0) == above))
-        for block, above in ((face.below, False), (face.above, True))
-    ]
-    near, distances = _near(plan, face)
-    along = np.delete(plan.centers, face.axis, axis=1)
-    chosen = [_spread(along, distances, np.intersect1d(side, near).tolist()) for side in sides]
+    index, near, distances = _near(plan, (face,))
+    along = np.delete(plan.centers[near], face.axis, axis=1)
+    sides = _sides(plan, (face,), index, near)
+    chosen = [near[_spread(along, distances, np.flatnonzero(side).tolist())].tolist() for side in sides]
     return tuple(k for side in chosen for k in side) if all(chosen) else ()
 
 
@@ -126,9 +128,9 @@ def views_at(plan: Plan, face: Plane, checks: int) -> tuple[tuple[int, ...], tup
     `checks` of them, the nearest ones first; as many that train check too.
     """
     assigned = np.union1d(*map(plan.assignment.cameras_of, (face.below, face.above)))
-    near, distances = _near(plan, face)
-    training = np.intersect1d(near, assigned)
-    order = training[np.argsort(distances[training], kind="stable")]
+    _, near, distances = _near(plan, (face,))
+    order = near[np.argsort(distances, kind="stable")]
+    order = order[np.isin(order, assigned)]
     held = order[_HELD // 2 :: _HELD][:checks]
     trained = np.setdiff1d(order, held)
     nearest = [k for k in order if k not in held][: len(held)]
@@ -152,10 +154,54 @@ def between(plan: Plan, face: Plane, cameras: Sequence[int]) -> list[tuple[int, 
     return [(k, place) for (k, _), place in found.items()]
 
 
-def _near(plan: Plan, face: Plane) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The rows of `plan` of the cameras that are near a face, in order, and the distances (K,) of all."""
-    distances = face.distances(plan.centers, plan.aabb)
-    return np.flatnonzero(distances <= _FARTHEST * plan.baseline), distances
+def _parts(faces: Sequence[Plane]) -> Iterator[Sequence[Plane]]:
+    """So many faces at a time that what is near them takes little memory."""
+    return (faces[first : first + _PART] for first in range(0, len(faces), _PART))
+
+
+_Near = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
+
+
+def _near(plan: Plan, faces: Sequence[Plane]) -> _Near:
+    """The cameras that are near faces, by face and row: (N,) faces, rows of `plan`, and distances."""
+    low, high = _in_box(faces, plan.aabb)
+    farthest = _FARTHEST * plan.baseline
+    around = farthest + np.linalg.norm(high - low, axis=1) / 2  # of the middle of the face
+    found = plan.tree.query_ball_point((low + high) / 2, around * (1 + 1e-9), return_sorted=True)
+    index = np.repeat(np.arange(len(faces)), [len(rows) for rows in found])
+    rows = np.fromiter(chain.from_iterable(found), np.int64, len(index))
+    distances = _distances(plan.centers[rows], low[index], high[index])
+    near = distances <= farthest
+    return index[near], rows[near], distances[near]
+
+
+def _sides(
+    plan: Plan, faces: Sequence[Plane], index: NDArray[np.int64], cameras: NDArray[np.int64]
+) -> list[NDArray[np.bool_]]:
+    """(N,) which cameras are in the block below their face and below it, and which likewise above.
+
+    Args: index (N,) of each camera's face; cameras (N,) rows of `plan`.
+    """
+    axis, at = np.array([face.axis for face in faces], int), np.array([face.at for face in faces])
+    blocks = np.array([(face.below, face.above) for face in faces], int).reshape(-1, 2)[index]
+    over = contract(plan.centers, plan.aabb)[cameras, axis[index]] >= at[index]
+    own = plan.camera_blocks[cameras]
+    return [(own == blocks[:, above]) & (over == bool(above)) for above in (0, 1)]
+
+
+def _in_box(faces: Sequence[Plane], aabb: Aabb) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(F, 3) lower and upper corners, in world units, of the parts of faces that are in the AABB."""
+    corners = np.array([(face.lower, face.upper) for face in faces]).clip(*_BOX)
+    low, high = (aabb.lower + (corners[:, end] - _BOX[0]) * 4 * aabb.half for end in (0, 1))
+    return low, high
+
+
+def _distances(
+    positions: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(N,) distances of positions (N, 3) from boxes of which corners are given."""
+    distances: NDArray[np.float64] = np.linalg.norm(positions - positions.clip(low, high), axis=1)
+    return distances
 
 
 def _spread(along: NDArray[np.float64], distances: NDArray[np.float64], cameras: Sequence[int]) -> list[int]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
 
 from panolog.partition import plan_json
 from panolog.partition.assignment import Assignment, assign
@@ -113,6 +114,11 @@ class Plan:
         enough: NDArray[np.bool_] = self.assignment.counts >= self.config.min_cameras
         enough &= self.gaussians > self.config.min_share * self.gaussians.mean()
         return enough
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the centers of the cameras."""
+        return cKDTree(self.centers)
 
     def cameras(self, block: int) -> tuple[int, ...]:
         """The rows of Scene.panoramas that train a block, in the order of `rows`."""

@@ -103,11 +103,11 @@ class Sizes:
     def of(self, task: TaskId, state: RunState) -> int:
         """Those of one task. Args: state of the run, which has the plan when blocks are trained."""
         match task.stage:
+            case Stage.BLOCK | Stage.ROUND:
+                return self._of_blocks(state)[task.number]
             case Stage.DISTRICT | Stage.COARSE:
                 stage = self._estimate.stages[0]
                 return stage.device or stage.host
-            case Stage.BLOCK | Stage.ROUND:
-                return self._of_blocks(state)[task.number]
             case Stage.REPAIR:  # part of two blocks, on panoramas of both
                 return max(self._of_blocks(state).values())
             case Stage.SCORE if self._job.config.stage2.reduces:

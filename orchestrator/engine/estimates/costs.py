@@ -171,11 +171,11 @@ def in_all(samples: Sequence[BlockTime], blocks: Sequence[tuple[int, int]]) -> f
 
 def block_times(state: RunState) -> list[BlockTime]:
     """What the run has measured so far, in the order of the blocks."""
-    tasks = [(block, state.task(TaskId.block(block.block))) for block in state.plan or ()]
     return [
         BlockTime(block.cameras, block.gaussians, task.place, seconds)
-        for block, task in tasks
-        if (seconds := whole_seconds(task)) is not None
+        for block in state.plan or ()
+        if (task := state.tasks.get(TaskId.block(block.block))) is not None
+        and (seconds := whole_seconds(task)) is not None
     ]
 
 
