@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 
 from panolog.scene.model import Scene
 from panolog.workers.specs import Value
+from panolog.workers.training.checkpoint import SavedModel, save
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
 from panolog.workers.training.optimizer import Average
@@ -50,6 +52,16 @@ def test_the_model_is_the_mean_of_the_last_ones(scene: Scene) -> None:
         expected = torch.stack([state[name].double() for state in states]).mean(0)
         assert torch.allclose(found[name].double(), expected, rtol=1e-6, atol=1e-7)
         assert not torch.equal(found[name], last[name])
+
+
+def test_the_model_of_a_checkpoint_is_the_mean_so_far(scene: Scene, tmp_path: Path) -> None:
+    events = checkpoints(train(coarse_of(scene, config(0.25, **CALM))))
+    save(tmp_path / "last", events[-1])
+    pieces = [piece.tensors() for piece in SavedModel(tmp_path / "last").pieces(rows=100)]
+    for name in ("means", "shN", "opacities"):
+        expected = torch.stack([event.tensors[name].double() for event in events[-5:]]).mean(0)
+        found = torch.cat([piece[name] for piece in pieces]).double()
+        assert torch.allclose(found, expected, rtol=1e-6, atol=1e-7)
 
 
 def test_a_resume_does_not_change_what_it_started_from(scene: Scene) -> None:

@@ -81,6 +81,12 @@ def test_nothing_is_copied_where_nothing_lives() -> None:
     assert len(state.gaussians) == 0
 
 
+def test_nothing_is_copied_more_often_than_shares_are_known_for() -> None:
+    state = random_state(1, sky=0, faint=0)
+    relocate(state, quiet(state), STILL, everywhere(state, 500), np.random.default_rng(1))
+    assert len(state.gaussians) == MOST
+
+
 def test_copies_are_drawn_in_proportion_and_start_without_moments() -> None:
     state = random_state(3, sky=0, faint=0)
     for moments in (state.exp_avg, state.exp_avg_sq):
