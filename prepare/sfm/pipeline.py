@@ -111,7 +111,7 @@ def make_scene(
     made = any(panorama.path.is_relative_to(folder) for panorama in panoramas)
     link = settings.link and not made  # the workspace is removed, with the frames and whole panoramas in it
     for report in reversed(reports):  # the first stands for all: it comes last
-        _write(output, report, link, progress)
+        _write(output, folder, report, link, progress)
     shutil.rmtree(folder, ignore_errors=True)
     return reports[0]
 
@@ -133,9 +133,17 @@ def _report(
     return SfmReport(moved, world, notes, gathered.left_out, number, several)
 
 
-def _write(output: Path, report: SfmReport, link: bool, progress: StageProgress) -> None:
-    """Writes the scene of a part, with its report: the first in SCENE, the second in SCENE-2."""
+def _write(output: Path, folder: Path, report: SfmReport, link: bool, progress: StageProgress) -> None:
+    """Writes the scene of a part, with its report: the first in SCENE, the second in SCENE-2.
+
+    What an earlier call has written is not written again. Args: folder, the workspace, which knows that.
+    """
     scene = output if report.number == 1 else output.with_name(f"{output.name}-{report.number}")
+    begun = folder / f"{scene.name}.begun"
+    if begun.exists() and scene.exists():
+        return
+    require_new(scene)
+    begun.touch()
     new = _scene(report.found, report.world)
     write_scene(
         scene,

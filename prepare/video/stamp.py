@@ -32,7 +32,7 @@ def stamped(
     if fix is not None or taken is not None or exposure is not None:
         contents.append(_exif(fix, taken, exposure))
     if attitude is not None:
-        contents.append(XMP_HEAD + _packet(attitude))
+        contents.append(XMP_HEAD + attitude.packet)
     return with_segments(jpeg, *contents)
 
 
@@ -63,16 +63,3 @@ def _parts(angle: float) -> tuple[Fraction, Fraction, Fraction]:
     minutes, seconds = divmod(round(abs(angle) * 3600 * _SECOND), 60 * _SECOND)
     degrees, minutes = divmod(minutes, 60)
     return Fraction(degrees), Fraction(minutes), Fraction(seconds, _SECOND)
-
-
-def _packet(attitude: Attitude) -> bytes:
-    """The XMP with GPano's angles."""
-    angles = {"Pitch": attitude.pitch, "Roll": attitude.roll}
-    if attitude.heading is not None:
-        angles["Heading"] = attitude.heading
-    written = " ".join(f'GPano:Pose{name}Degrees="{angle:.4f}"' for name, angle in angles.items())
-    return (
-        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-        '<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
-        f'GPano:ProjectionType="equirectangular" {written}/></rdf:RDF></x:xmpmeta>'
-    ).encode()

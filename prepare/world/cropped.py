@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.provenance import MAX_BYTES
-from panolog.prepare.world.exif import Attitude, Crop, Exif, essential_exif, read_exif
+from panolog.prepare.world.exif import Crop, Exif, essential_exif, read_exif
 from panolog.prepare.world.image_blocks import EXIF_HEAD, XMP_HEAD, with_segments
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, stem_of
@@ -28,12 +28,6 @@ from panolog.scene.write import Progress, no_progress
 _THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama
 _HEADER = 33  # bytes of a PNG before its second chunk
 _QUALITY = 95  # of a JPEG
-_POSE = {"Heading": "heading", "Pitch": "pitch", "Roll": "roll"}
-_XMP = (
-    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-    '<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"{}/></rdf:RDF>'
-    "</x:xmpmeta>"
-)
 
 
 def complete_panoramas(
@@ -129,11 +123,11 @@ def write_derived(path: Path, exif: Exif, pixels: NDArray[np.uint8], output: Pat
         encoded = bytes(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
         chunks = b"" if block is None else _chunk(b"eXIf", block)
         if exif.attitude is not None:
-            chunks += _chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + _packet(exif.attitude))
+            chunks += _chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + exif.attitude.packet)
         encoded = encoded[:_HEADER] + chunks + encoded[_HEADER:]
     else:
         segments = [] if block is None else [EXIF_HEAD + block]
-        segments += [] if exif.attitude is None else [XMP_HEAD + _packet(exif.attitude)]
+        segments += [] if exif.attitude is None else [XMP_HEAD + exif.attitude.packet]
         encoded = bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
         encoded = with_segments(encoded, *segments)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -159,13 +153,6 @@ def _placed(path: Path, crop: Crop) -> NDArray[np.uint8]:
     full[top:bottom, left:right, :3] = pixels
     full[top:bottom, left:right, 3] = 255 if used is None else np.where(used, 255, 0)
     return full
-
-
-def _packet(attitude: Attitude) -> bytes:
-    """The XMP with GPano's angles."""
-    angles = {name: getattr(attitude, field) for name, field in _POSE.items()}
-    written = "".join(f' GPano:Pose{k}Degrees="{v!r}"' for k, v in angles.items() if v is not None)
-    return _XMP.format(written).encode()
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

@@ -28,6 +28,11 @@ from panolog.prepare.world.image_blocks import Bounded, read_blocks
 from panolog.scene.errors import SceneError
 
 _GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
+_XMP = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    '<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"'
+    ' GPano:ProjectionType="equirectangular"{}/></rdf:RDF></x:xmpmeta>'
+)
 _XMP_TAG = 700  # of TIFF
 _SPEEDS = (
     ExifTags.Base.ISOSpeedRatings,
@@ -79,6 +84,13 @@ class Attitude:
         return np.array(
             [-math.cos(pitch) * math.sin(roll), -math.cos(pitch) * math.cos(roll), math.sin(pitch)]
         )
+
+    @property
+    def packet(self) -> bytes:
+        """The XMP with GPano's angles, from which the same attitude is read."""
+        angles = {"Heading": self.heading, "Pitch": self.pitch, "Roll": self.roll}
+        known = {name: float(angle) for name, angle in angles.items() if angle is not None}
+        return _XMP.format("".join(f' GPano:Pose{k}Degrees="{v!r}"' for k, v in known.items())).encode()
 
 
 @dataclass(frozen=True)
