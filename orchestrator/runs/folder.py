@@ -60,6 +60,7 @@ class RunFolder:
     point_cloud = _At("point_cloud.ply")  # the merged model
     sky = _At("sky.ply")  # the sky of the merged model alone
     web = _At("web")  # the merged model for browsers: a page with its viewer, which any web server can serve
+    sog = _At("web/model.sog")  # that model as one file, which viewers open; absent if it is streamed
     page = _At("view.html")  # the merged model for browsers as one HTML file, which opens without a server
     adjusted = _At("adjusted.npz")  # poses before and after bundle adjustment, points; absent if they stay
     measured = _At("capture.npz")  # how panoramas were captured, before Stage I; absent if not modelled

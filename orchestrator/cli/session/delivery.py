@@ -10,7 +10,7 @@ from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.orchestrator.runs.info import installed_versions
 from panolog.orchestrator.runs.records import Delivered, Noticed, Record
-from panolog.orchestrator.watch.views.site.build import MODEL, Wanted, site_of_run, write_file
+from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_file
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_offset, read_sky, write_ply
 from panolog.workers.tasks import DELIVER
@@ -47,8 +47,7 @@ def _write(folder: RunFolder, place: Georeference, made_of: dict[str, Any]) -> N
     write_json(folder.georeference, place.as_json(made_of))
     shown = site_of_run(folder, Wanted(place=place))
     write_site(folder.web, shown.write_model, shown.page)
-    model = folder.web / MODEL
-    if model.is_file():
-        write_page(folder.page, model.read_bytes(), shown.page)
+    if folder.sog.is_file():
+        write_page(folder.page, folder.sog.read_bytes(), shown.page)
     else:
         write_file(site_of_run(folder, Wanted(most=MOST_IN_ONE, place=place)), folder.page)

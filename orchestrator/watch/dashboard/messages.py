@@ -35,6 +35,7 @@ class Results(ViewModel):
     model: bool
     report: bool
     view: bool = False  # a page in 3D of the model as one file
+    sog: bool = False  # the model for viewers, next to a report
     in_3d: bool = False
     map: bool = False  # whether cameras and points can be shown from above, also before there is a plan
     outline: str | None = None

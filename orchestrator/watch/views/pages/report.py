@@ -107,6 +107,7 @@ def _message(folder: RunFolder, view: RunView, *, next_to: bool) -> dict[str, An
             "model": next_to and folder.point_cloud.is_file(),
             "report": False,
             "view": next_to and folder.page.is_file(),
+            "sog": next_to and folder.sog.is_file(),
             "exposure": version_of(folder.exposure),
             "map": folder.known_plan.exists(),
             "findings": findings_version(folder),

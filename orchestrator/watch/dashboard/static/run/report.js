@@ -42,14 +42,15 @@ function made() {
 }
 
 /** What is next to the report. @param {RunPage["result"]} result */
-function links({ view, model }) {
+function links({ view, sog, model }) {
   /** @param {string} href @param {string} label @param {string} kind */
   const link = (href, label, kind, download = false) =>
     el("a", { href, class: kind, download: download ? "" : null }, label);
   byId("actions").replaceChildren(
     ...[
       view && link("view.html", "Open in 3D", "button primary"),
-      model && link("point_cloud.ply", "Save the model", "button", true),
+      sog && link("web/model.sog", "Save for viewers (SOG)", "button", true),
+      model && link("point_cloud.ply", "Save for training (PLY)", "button", true),
     ].filter((part) => part !== false),
   );
 }

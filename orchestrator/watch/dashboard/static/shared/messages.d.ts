@@ -357,6 +357,7 @@ export interface Results {
   model: boolean;
   report: boolean;
   view: boolean;
+  sog: boolean;
   in_3d: boolean;
   map: boolean;
   outline: string | null;

@@ -206,13 +206,19 @@ def test_a_finished_one_begins_with_a_picture_and_is_short(browser: Browser, tmp
         shutil.copy((folder.images / NAME).with_suffix(".jpg"), folder.picture(name))
     write_json(folder.metrics, {"mean": {"psnr": 20.0}, "views": views})
     folder.page.write_text("a page")
+    folder.web.mkdir()
+    folder.sog.write_text("a model")
+    folder.point_cloud.write_text("a model")
     append(folder, *(ViewEvaluated(EVAL, name, metrics) for name, metrics in views.items()))
     append(folder, EvaluationSaved("eval/metrics.json", {"psnr": 20.0}), RunEnded(Outcome.DONE))
     with opened(browser, write_report(folder, running=False).as_uri(), width=PHONE) as page:
         expect(page.locator("#lead .frames")).to_contain_text("better.jpg, held out: PSNR 26.00 dB")
         expect(page.locator("#verdict")).to_contain_text("From 3 places")
         expect(page.locator("#verdict")).to_contain_text("by 10.0 % of full brightness")
-        expect(page.get_by_role("link", name="Open in 3D")).to_have_attribute("href", "view.html")
+        links = page.locator("#actions a")
+        files = links.evaluate_all("them => them.map(it => it.getAttribute('href'))")
+        assert files == ["view.html", "web/model.sog", "point_cloud.ply"]
+        assert links.all_inner_texts() == ["Open in 3D", "Save for viewers (SOG)", "Save for training (PLY)"]
         expect(page.locator("#scene")).to_be_hidden()
         assert page.evaluate("document.documentElement.scrollHeight") <= 3000
         page.get_by_role("button", name="Show Curves").click()
