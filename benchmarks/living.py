@@ -23,13 +23,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from shutil import which
 from tempfile import TemporaryDirectory
 from threading import Condition, Thread
 from unittest.mock import Mock, patch
 
 import torch
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page
 
 from panolog.orchestrator.engine.driver.job import Job, Specs
 from panolog.orchestrator.engine.driver.saving import save
@@ -47,11 +46,12 @@ from panolog.workers.tasks import COARSE
 from panolog.workers.training import trainer
 from panolog.workers.training.task_config import PreviewConfig
 from panolog.workers.training.trainer import TrainSpec, train
+from tests.export.browser import SOFTWARE
+from tests.orchestrator.watch.dashboard.browser import chromium
 
 _TURN = 20  # iterations
 _NOTHING = PreviewConfig(every=10**9)
 _WAIT_S = 600.0
-_SOFTWARE = "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist"
 
 
 def load() -> str:
@@ -86,10 +86,8 @@ def watch(scene: Path, root: Path, options: argparse.Namespace) -> None:
         print(f"{time.monotonic() - began:6.1f} s  {what} ({load()})", flush=True)
 
     say("start")
-    with dashboard_of([*command, "--dashboard"]) as url, sync_playwright() as playwright:
+    with dashboard_of([*command, "--dashboard"]) as url, chromium(SOFTWARE) as browser:
         say("the dashboard's address")
-        path = which("chromium") or which("google-chrome")
-        browser = playwright.chromium.launch(executable_path=path, args=_SOFTWARE.split())
         context = browser.new_context(viewport={"width": 1440, "height": 1000})
         context.set_default_timeout(1000 * _WAIT_S)
         page = context.new_page()
@@ -114,7 +112,6 @@ def watch(scene: Path, root: Path, options: argparse.Namespace) -> None:
             view.wait_for_function(changed, arg=before)
             say("the next: " + view.locator("#count").inner_text())
             shot(view, options.shots, f"view-{number}")
-        browser.close()
 
 
 def shot(page: Page, folder: Path | None, name: str) -> None:
