@@ -114,9 +114,10 @@ def cameras_at(plan: Plan, face: Plane) -> tuple[int, ...]:
 
     The nearest ones, and along a long face some far from these. None unless there are cameras on both sides.
     """
-    index, near, distances = _near(plan, (face,))
+    faces = (face,)
+    index, near, distances = _near(plan, faces)
     along = np.delete(plan.centers[near], face.axis, axis=1)
-    sides = _sides(plan, (face,), index, near)
+    sides = _sides(plan, faces, index, near)
     chosen = [near[_spread(along, distances, np.flatnonzero(side).tolist())].tolist() for side in sides]
     return tuple(k for side in chosen for k in side) if all(chosen) else ()
 
@@ -184,7 +185,8 @@ def _sides(
     """
     axis, at = np.array([face.axis for face in faces], int), np.array([face.at for face in faces])
     blocks = np.array([(face.below, face.above) for face in faces], int).reshape(-1, 2)[index]
-    over = contract(plan.centers, plan.aabb)[cameras, axis[index]] >= at[index]
+    places = contract(plan.centers[cameras], plan.aabb)
+    over = places[np.arange(len(index)), axis[index]] >= at[index]
     own = plan.camera_blocks[cameras]
     return [(own == blocks[:, above]) & (over == bool(above)) for above in (0, 1)]
 
