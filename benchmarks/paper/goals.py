@@ -102,7 +102,7 @@ def _sooner(results: Results) -> Iterator[Goal]:
 
 
 def _sooner_than(results: Results, scene: str, base: str, names: Sequence[str]) -> Iterator[Goal]:
-    """The same for one variant. Args: names, variants of panolog, of which the first to reach it counts."""
+    """Whether the first of some variants to reach the final quality of `base` takes a third of its time."""
     slower = results.first(scene, base)
     final = slower.metric("ws_psnr") if slower else None
     curves = [run for name in names if (run := results.first(scene, name)) and run.curve]
