@@ -170,8 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.docs:
             pages.write_docs(options.docs, made)
         failed = any(result.failed for result in made.results.all)
-        links = {name: name for name in pages.pictures(made)}
-        return report.Report(made.to_json(), pages.markdown([made], links), passed=not failed)
+        return report.Report(made.to_json(), pages.markdown([made]), passed=not failed)
 
     try:
         return report.run("paper", options, work)

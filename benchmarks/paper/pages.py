@@ -10,14 +10,10 @@ from benchmarks.paper.goals import table as goal_table
 from benchmarks.paper.runner import other_settings
 from benchmarks.paper.study import Study, load
 from benchmarks.paper.tables import csv_rows
-from benchmarks.paper.variants import flat, variants
-from panolog.orchestrator.runs.config import RunConfig
-from panolog.orchestrator.runs.folder import write_json
+from benchmarks.paper.variants import variants
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
-from panolog.workers.training.recipes import Recipe
 
-RECIPES_FILE = "recipes.json"
 FIRST_LINE = "<!-- Written by `python -m benchmarks.paper … --docs`: do not edit. -->"
 _METHOD = (
     "**Runs.** Where those of a section are not of one machine and one version of the code, each row says of"
@@ -47,29 +43,29 @@ def pictures(study: Study) -> dict[str, str]:
     return made | ({"overlap.svg": overlap} if overlap else {})
 
 
-def write(folder: Path, study: Study) -> str:
-    """Writes report.md, results.csv and the pictures; returns the Markdown."""
-    drawn = pictures(study)
-    for name, svg in drawn.items():
-        write_bytes(folder / name, standalone(svg).encode())
-    text = markdown([study], {name: name for name in drawn})
-    write_bytes(folder / "report.md", text.encode())
+def write(folder: Path, study: Study) -> None:
+    """Writes report.md, results.csv and the pictures."""
+    _draw(folder, study)
+    write_bytes(folder / "report.md", markdown([study]).encode())
     sheet = io.StringIO()
     csv.writer(sheet, lineterminator="\n").writerows(csv_rows(study.results.all))
     write_bytes(folder / "results.csv", sheet.getvalue().encode())
-    return text
 
 
-def markdown(studies: Sequence[Study], links: dict[str, str]) -> str:
-    """All studies as one document. Args: links, paths of pictures by name, as the document sees them."""
+def _draw(folder: Path, study: Study) -> None:
+    for name, svg in pictures(study).items():
+        write_bytes(folder / name, standalone(svg).encode())
+
+
+def markdown(studies: Sequence[Study], folder: str = "") -> str:
+    """All studies as one document. Args: folder that has a folder of each study with its pictures."""
     parts = ["# Quality"]
-    for number, study in enumerate(studies):
+    for study in studies:
         parts += [f"## {study.title}", f"    {study.command}", study.place]
         if found := study.goals:
             parts.append(goal_table(found).markdown())
-        prefix = f"{number}-" if len(studies) > 1 else ""
-        drawn = [name for name in pictures(study) if prefix + name in links]
-        parts += [f"![{name.removesuffix('.svg')}]({links[prefix + name]})" for name in drawn]
+        where = f"{folder}/{study.name}/" if folder else ""
+        parts += [f"![{name.removesuffix('.svg')}]({where}{name})" for name in pictures(study)]
         parts += [table.markdown() for table in study.tables]
     return "\n\n".join([*parts, "## How it was measured", _METHOD, _CURVES]) + "\n"
 
@@ -77,30 +73,28 @@ def markdown(studies: Sequence[Study], links: dict[str, str]) -> str:
 def write_docs(path: Path, study: Study) -> None:
     """Adds a study to a page of the documentation.
 
-    A folder next to the page has its pictures, the results of all studies that it shows, each in a folder of
-    its own, and the settings of the recipes in them, recipes.json. Raises InputError if a result is of other
-    settings than its variant has now.
+    Next to the page, a folder for each study that it shows has its results and pictures. Raises InputError if
+    a result is of other settings than its variant has now.
     """
-    folder = path.with_suffix("")
-    kept = {it.name: it for it in map(load, sorted(file.parent for file in folder.glob("*/results.json")))}
+    kept = {it.name: it for it in studies_of(path)}
     kept[study.name] = kept[study.name].joined(study) if study.name in kept else study
     studies = sorted(kept.values(), key=lambda it: (it.settings.width, it.settings.iterations, it.chosen))
-    recipes = measured_recipes(studies)
-    (folder / study.name).mkdir(parents=True, exist_ok=True)
-    kept[study.name].save(folder / study.name)
-    write_json(folder / RECIPES_FILE, {name: flat(RunConfig(recipe=name)) for name in recipes})
-    links = {}
-    for number, each in enumerate(studies):
-        for name, svg in pictures(each).items():
-            own = f"{number}-{name}" if len(studies) > 1 else name
-            write_bytes(folder / own, standalone(svg).encode())
-            links[own] = f"{folder.name}/{own}"
-    write_bytes(path, (FIRST_LINE + "\n\n" + markdown(studies, links)).encode())
+    check_settings(studies)
+    folder = path.with_suffix("") / study.name
+    folder.mkdir(parents=True, exist_ok=True)
+    kept[study.name].save(folder)
+    _draw(folder, kept[study.name])
+    text = markdown(studies, path.stem)
+    write_bytes(path, (FIRST_LINE + "\n\n" + text).encode())
 
 
-def measured_recipes(studies: Sequence[Study]) -> list[Recipe]:
-    """The recipes of all results, in the order of the tables. Raises InputError as `write_docs`."""
-    found: dict[Recipe, None] = {}
+def studies_of(path: Path) -> list[Study]:
+    """The studies that a page of the documentation shows."""
+    return [load(file.parent) for file in sorted(path.with_suffix("").glob("*/results.json"))]
+
+
+def check_settings(studies: Sequence[Study]) -> None:
+    """Raises InputError if a result is of other settings than its variant has now."""
     for study in studies:
         for result in study.results.all:
             if result.failed:
@@ -109,5 +103,3 @@ def measured_recipes(studies: Sequence[Study]) -> list[Recipe]:
             if changes := other_settings(result.settings, now):
                 where = f"{result.variant} of {result.scene} in {study.name}"
                 raise InputError(f"{where} has {changes}: measure it again, or remove its results")
-            found[now["recipe"]] = None
-    return list(found)

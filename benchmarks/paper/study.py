@@ -73,7 +73,8 @@ class Study:
 
     def joined(self, later: "Study") -> "Study":
         """This study, with what a later one of the same name has measured anew or in addition."""
-        results = {(it.scene, it.variant, it.seed): it for it in (*self.results.all, *later.results.all)}
+        both = sorted((*self.results.all, *later.results.all), key=lambda it: not it.failed)
+        results = {(it.scene, it.variant, it.seed): it for it in both}
         overlaps = {(it.scene, it.variant, it.tau): it for it in (*self.overlaps, *later.overlaps)}
         names = {Path(scene).name: scene for scene in (*self.scenes, *later.scenes)}
         return replace(
