@@ -66,7 +66,7 @@ def test_the_list_has_a_row_for_each_run(tmp_path: Path) -> None:
 def test_the_page_of_a_run_has_its_results_and_settings(served: Served) -> None:
     run = served.get(f"/api/runs/{served.id('run')}")
     assert run["result"].pop("findings") == "- - - -"
-    made = {"model": True, "report": True, "view": False, "in_3d": True}
+    made = {"model": True, "report": True, "view": False, "sog": False, "in_3d": True}
     assert run["result"] == made | {"map": True, "outline": None, "exposure": None}
     settings = {setting["key"]: setting for setting in run["config"]}
     assert settings["iterations"]["changed"]
