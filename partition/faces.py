@@ -51,10 +51,6 @@ class Plane:
         offsets = (contracted[:, self.axis] - self.at) * 4 * aabb.half[self.axis]
         return np.where(outside, np.nan, offsets)
 
-    def distances(self, points: ArrayLike, aabb: Aabb) -> NDArray[np.float64]:
-        """(N,) distances of world points (N, 3) from the part of the face in the AABB, in world units."""
-        return _distances(np.asarray(points, np.float64), *_in_box([self], aabb))
-
 
 def planes_between(grid: Cells) -> tuple[Plane, ...]:
     """All faces between two blocks of a grid, by `below`, axis and `above`."""
@@ -156,7 +152,7 @@ def between(plan: Plan, face: Plane, cameras: Sequence[int]) -> list[tuple[int, 
 
 
 def _parts(faces: Sequence[Plane]) -> Iterator[Sequence[Plane]]:
-    """So many faces at a time that what is near them takes little memory."""
+    """The faces in parts whose near cameras take little memory."""
     return (faces[first : first + _PART] for first in range(0, len(faces), _PART))
 
 
@@ -165,13 +161,13 @@ _Near = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
 
 def _near(plan: Plan, faces: Sequence[Plane]) -> _Near:
     """The cameras that are near faces, by face and row: (N,) faces, rows of `plan`, and distances."""
-    low, high = _in_box(faces, plan.aabb)
+    low, high = in_box(faces, plan.aabb)
     farthest = _FARTHEST * plan.baseline
     around = farthest + np.linalg.norm(high - low, axis=1) / 2  # of the middle of the face
     found = plan.tree.query_ball_point((low + high) / 2, around * (1 + 1e-9), return_sorted=True)
     index = np.repeat(np.arange(len(faces)), [len(rows) for rows in found])
     rows = np.fromiter(chain.from_iterable(found), np.int64, len(index))
-    distances = _distances(plan.centers[rows], low[index], high[index])
+    distances = distances_from(plan.centers[rows], low[index], high[index])
     near = distances <= farthest
     return index[near], rows[near], distances[near]
 
@@ -184,24 +180,24 @@ def _sides(
     Args: index (N,) of each camera's face; cameras (N,) rows of `plan`.
     """
     axis, at = np.array([face.axis for face in faces], int), np.array([face.at for face in faces])
-    blocks = np.array([(face.below, face.above) for face in faces], int).reshape(-1, 2)[index]
+    blocks = np.array([(face.below, face.above) for face in faces], int)[index]
     places = contract(plan.centers[cameras], plan.aabb)
     over = places[np.arange(len(index)), axis[index]] >= at[index]
     own = plan.camera_blocks[cameras]
     return [(own == blocks[:, above]) & (over == bool(above)) for above in (0, 1)]
 
 
-def _in_box(faces: Sequence[Plane], aabb: Aabb) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def in_box(faces: Sequence[Plane], aabb: Aabb) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(F, 3) lower and upper corners, in world units, of the parts of faces that are in the AABB."""
     corners = np.array([(face.lower, face.upper) for face in faces]).clip(*_BOX)
     low, high = (aabb.lower + (corners[:, end] - _BOX[0]) * 4 * aabb.half for end in (0, 1))
     return low, high
 
 
-def _distances(
+def distances_from(
     positions: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(N,) distances of positions (N, 3) from boxes of which corners are given."""
+    """(N,) distances of positions (N, 3) from boxes with these lower and upper corners (N, 3)."""
     distances: NDArray[np.float64] = np.linalg.norm(positions - positions.clip(low, high), axis=1)
     return distances
 

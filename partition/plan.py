@@ -117,7 +117,7 @@ class Plan:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of the centers of the cameras."""
+        """The camera centers as a tree, which finds those that are near a place."""
         return cKDTree(self.centers)
 
     def cameras(self, block: int) -> tuple[int, ...]:

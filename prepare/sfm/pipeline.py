@@ -136,7 +136,8 @@ def _report(
 def _write(output: Path, folder: Path, report: SfmReport, link: bool, progress: StageProgress) -> None:
     """Writes the scene of a part, with its report: the first in SCENE, the second in SCENE-2.
 
-    What an earlier call has written is not written again. Args: folder, the workspace, which knows that.
+    A scene that an earlier call has written is not written again. Args: folder, the workspace, which notes
+        what scenes are of this job.
     """
     scene = output if report.number == 1 else output.with_name(f"{output.name}-{report.number}")
     begun = folder / f"{scene.name}.begun"

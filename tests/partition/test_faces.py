@@ -10,6 +10,8 @@ from panolog.partition.contraction import contract, expand
 from panolog.partition.faces import (
     between,
     cameras_at,
+    distances_from,
+    in_box,
     most_seen,
     planes_between,
     planes_within,
@@ -58,7 +60,7 @@ def test_an_offset_is_in_world_units_and_missing_outside_of_the_face() -> None:
 def test_the_distance_is_that_from_the_face_in_the_box() -> None:
     plane = planes_between(Grid((2, 2, 1)))[0]
     points = np.array([[3.0, -1.0, 0.0], [0.0, 2.0, 0.0], [3.0, -1.0, 8.0]])
-    np.testing.assert_allclose(plane.distances(points, BOX), [3.0, 2.0, 5.0], rtol=1e-12)
+    np.testing.assert_allclose(distances_from(points, *in_box([plane], BOX)), [3.0, 2.0, 5.0], rtol=1e-12)
 
 
 def walk(cells: Cells, seen: int = 1, cameras: int = 25) -> Plan:
