@@ -15,8 +15,8 @@ ifeq ($(TORCH),cpu)
 export PIP_EXTRA_INDEX_URL := $(PIP_EXTRA_INDEX_URL) https://download.pytorch.org/whl/cpu
 endif
 
-# Most tests wait for processes that they started: two more of them than cores keep two cores busy.
-WORKERS ?= 4
+# Most tests wait for processes that they started: four more of them than cores keep two cores busy.
+WORKERS ?= 6
 PYTEST = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 # What pip cannot install, reported before anything is downloaded.
