@@ -37,7 +37,7 @@ export CHECK
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: setup demo test check nightly stress lint types wheel wheel-check bench clean help
+.PHONY: setup demo test check unit nightly stress lint types wheel wheel-check bench clean help
 
 setup: $(READY)  ## make .venv with everything to run, test and lint (TORCH=cpu: without CUDA)
 
@@ -47,9 +47,12 @@ demo: $(READY)  ## reconstruct a small town end to end, on the CPU, into runs/de
 test: $(READY)  ## run the tests
 	$(PYTEST) -m "not nightly" $(OPTIONS)
 
+check:  ## lint, and run the unit tests: those without Ray, browser and whole runs
+	@$(MAKE) --jobs=2 lint unit
+
 # These compute: a process for each core.
-check: WORKERS = logical
-check: lint  ## lint, and run the unit tests: those without Ray, browser and whole runs
+unit: WORKERS = logical
+unit: $(READY)
 	$(PYTEST) -m "not system and not nightly"
 
 nightly: $(READY) $(if $(findstring tests/deploy,$(or $(FILES),tests/deploy)),$(PEERS))  ## run the heavy tests that `make test` leaves out (FILES=... some of them)

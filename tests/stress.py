@@ -61,7 +61,7 @@ def load() -> Iterator[None]:
 def run(variant: str, seed: int, arguments: Sequence[str]) -> list[str]:
     """Runs the tests once. Returns the names of those that failed, also in a fixture."""
     parts, failed = variant.split("+"), list[str]()
-    workers = os.environ.get("WORKERS", "4")
+    workers = os.environ.get("WORKERS", "6")
     command = [sys.executable, "-m", "pytest", "-m", "not nightly", f"--numprocesses={workers}"]
     command += ["--dist=loadfile", "--no-loadscope-reorder", *arguments]
     if "random" in parts:

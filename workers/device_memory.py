@@ -51,20 +51,23 @@ def _sorting(held: int, view: int) -> _Moment:
     return _Moment(held + _SPLAT + 1 + 4 + 8 + 8, view, pairs)  # state, depth; rows by depth, ends of pairs
 
 
-def _iteration(held: int, view: int, kept: int, room: float = 1.0) -> tuple[_Moment, _Moment, _Moment]:
-    """Of a pass forward and backward: its binning, its loss, its end, where all gradients are.
+def _iteration(
+    held: int, view: int, kept: int, gradients: int, room: float = 1.0
+) -> tuple[_Moment, _Moment, _Moment]:
+    """Of a pass forward and backward: its binning, its loss, its end.
 
-    Args: `kept` of a Gaussian after the binning besides its splat; `room` for pairs, over how many there are.
+    Args: `kept` of a Gaussian after the binning besides its splat; `gradients` of its parameters at the end;
+    `room` for pairs, over how many there are.
     """
     visible, sorting = held + _SPLAT + kept, _sorting(held, view)
     loss = _Moment(visible, view + _IMAGES + 3 * 12 + 12, 4 * room)
-    end = _Moment(visible + 52 + VALUES + 8, view + 2 * _IMAGES, 4 * room)
+    end = _Moment(visible + 52 + gradients + 8, view + 2 * _IMAGES, 4 * room)
     return replace(sorting, pair=sorting.pair * room), loss, end
 
 
 # kept: state, depth, ends of pairs; the views of all iterations that are launched
-_TRAINING = _iteration(_STATE + 8, AHEAD * (_VIEW + _TARGET), kept=1 + 4 + 8, room=MARGIN)
-_SCORING = _iteration(VALUES + 8, _VIEW, kept=2)  # visible, invalid
+_TRAINING = _iteration(_STATE + 8, AHEAD * (_VIEW + _TARGET), kept=1 + 4 + 8, gradients=0, room=MARGIN)
+_SCORING = _iteration(VALUES + 8, _VIEW, kept=2, gradients=VALUES)  # visible, invalid
 _RENDERING = (_sorting(VALUES + 8, _VIEW), _Moment(VALUES, _VIEW + 3 * 12, 0))  # at last colours as bytes
 
 

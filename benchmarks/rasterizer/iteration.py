@@ -10,11 +10,10 @@ from torch import Tensor
 
 from benchmarks.rasterizer.cases import Case, TrainingView
 from panolog.renderer import _core, ops
-from panolog.renderer.adam import BETAS, EPSILON, Moving
-from panolog.renderer.cuda.iteration import Problem, gradients
-from panolog.renderer.cuda.parts import Launch, adam_step
+from panolog.renderer.adam import Moving
+from panolog.renderer.cuda import iteration as cuda
+from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.iteration import backward, forward, loss_of, take
-from panolog.renderer.losses import photometric_loss
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.training.config import TrainConfig
@@ -104,11 +103,9 @@ class TrainingStep:
         if launch is None:
             take(problem, self.moving(), 1, screen=True)
             return
-        status = torch.zeros(1, dtype=torch.int32, device=self.view.target.device)
-        found = gradients(launch, problem, status, self.room)
+        found = cuda.take(launch, problem, self.moving(), 1, cuda.Status(self.view.target.device), self.room)
         if self.room is None:
             self.room = int(1.25 * float(found.report[2])) + 1
-        adam_step(launch, found.gradients, self.moving(), *BETAS, EPSILON, 1, status)
 
     def forward(self) -> tuple[Gaussians, Render]:
         """The model as leaves of autograd, and its image."""
@@ -132,35 +129,30 @@ class TrainingStep:
 
     def parts(self) -> Iterator[float]:
         """Seconds of forward, loss with its gradient, and backward with Adam of one iteration."""
-        launch, problem, moving = ops.launcher(self.view.target.device), self.problem(), self.moving()
-        if launch is not None:
-            yield from self._parts_on_card(launch, problem)
-            return
-        start = self.now()
-        seen = forward(problem)
-        yield self.now() - start
-        start = self.now()
-        loss = loss_of(problem, seen.color, seen.inverse_depth)
-        yield self.now() - start
-        start = self.now()
-        backward(problem, seen, loss, moving, 1, screen=True)
-        yield self.now() - start
+        passes = self._passes()
+        for _ in range(3):
+            start = self.now()
+            next(passes)
+            yield self.now() - start
 
-    def _parts_on_card(self, launch: Launch, problem: Problem) -> Iterator[float]:
-        """Seconds of forward pass, loss and backward pass through autograd, as an iteration is one launch."""
-        start = self.now()
-        leaves, rendered = self.forward()
-        yield self.now() - start
-        start = self.now()
-        color = rendered.color.detach().requires_grad_()
-        loss = photometric_loss(color, problem.image, problem.mask, problem.lambda_ssim).loss
-        (loss if problem.share is None else loss * problem.share).backward()  # type: ignore[no-untyped-call]
-        yield self.now() - start
-        start = self.now()
-        rendered.color.backward(color.grad)  # type: ignore[no-untyped-call]
-        found = {name: leaf.grad for name, leaf in leaves.tensors().items() if leaf.grad is not None}
-        adam_step(launch, found, self.moving(), *BETAS, EPSILON, 1)
-        yield self.now() - start
+    def _passes(self) -> Iterator[None]:
+        """Takes one iteration in its three parts, each when the next item is requested."""
+        launch, problem, moving = ops.launcher(self.view.target.device), self.problem(), self.moving()
+        if launch is None:
+            seen = forward(problem)
+            yield
+            loss = loss_of(problem, seen.color, seen.inverse_depth)
+            yield
+            backward(problem, seen, loss, moving, 1, screen=True)
+            yield
+            return
+        status = cuda.Status(self.view.target.device)
+        there = cuda.forward(launch, problem, self.room)
+        yield
+        found = cuda.loss_of(launch, problem, there, status)
+        yield
+        cuda.backward(launch, problem, there, found, moving, 1, status)
+        yield
 
     def now(self) -> float:
         """Seconds on a clock, read after the device has finished its work."""

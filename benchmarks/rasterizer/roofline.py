@@ -131,8 +131,9 @@ def launched(work: Work) -> dict[str, Launched]:
         "loss_similarity": Launched("loss", warps, (*[0.0] * 5, 3, *halo, *[0.0] * 4, 6), 51 * px),
         "loss_gradient": Launched("loss", warps, (3, *(*halo, 6.0) * 3), 63 * px),
         "composite_backward": Launched("composite", warps, tested, lists + 40 * px + 80 * n),
-        "project_backward": Launched("project", each, (*copy, 3, 3, 11, 1, 0, 0, *copy), n * (344 + 244)),
-        "adam_step": Launched("adam", 59 * each, (), n * 59 * 28),
+        "project_step": Launched(
+            "project", each, (*copy, 3, 3, 11, 1, 0, 0, *copy), n * (116 + 59 * 24 + 180)
+        ),
         "iteration_statistics": Launched("iteration", each, (), n * 45),
     }
 

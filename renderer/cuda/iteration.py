@@ -1,8 +1,10 @@
-"""The gradients of one training iteration on a card, without autograd and without a wait of the host.
+"""One training iteration on a card, without autograd and without a wait of the host.
 
 What the host wants to know of an iteration the device writes into a report, which it reads later. Where a
-step may not be taken, the device notes that in a status: then Adam and the statistics of densification do
-nothing, in this iteration and in all that were launched after it.
+step may not be taken, the device notes that in a status: then no Gaussian moves and the statistics of
+densification stay, in this iteration and in all that were launched after it. As on the CPU the backward pass
+takes the step: gradients of the parameters are never in memory. One that is not finite is found when others
+have moved: then the model is invalid.
 """
 
 from collections.abc import Mapping
@@ -12,14 +14,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from panolog.renderer.adam import Moving
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import losses, parts
 from panolog.renderer.cuda.motion import room_for, with_motion
 from panolog.renderer.cuda.parts import Launch
+from panolog.scene.gaussians import PARAMETERS
 
 REPORT = 4  # values: loss, mean squared error, pairs of splats and tiles, status; then motion
-NO_ROOM, BROKEN_GRADIENT, BROKEN_LOSS = 1, 2, 4  # Status in csrc/cuda/common.cuh
+NO_ROOM, BROKEN_LOSS, BROKEN_GRADIENT = 1, 2, 4  # Status in csrc/cuda/common.cuh
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,10 +54,61 @@ class Problem:
         return parts.Exterior.of(arrays, self.camera.width, self.camera.height, self.exact)
 
 
+def not_finite(status: int) -> str:
+    """What is not finite where an iteration that had room ended with this status."""
+    if status & BROKEN_LOSS:
+        return "loss"
+    broken = [name for place, name in enumerate(PARAMETERS) if status & BROKEN_GRADIENT << place]
+    return f"gradient of {broken[0]}"
+
+
+class Status:
+    """Why no step may be taken any more, on a device."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._both = torch.zeros(2, dtype=torch.int32, device=device)
+
+    @property
+    def known(self) -> Tensor:
+        """(1,) int32, by the iterations before, by this one's room and loss, at its end by its gradients."""
+        return self._both[:1]
+
+    @property
+    def broken(self) -> Tensor:
+        """(1,) int32, of the gradients of the step that is taken."""
+        return self._both[1:]
+
+    def clear(self) -> None:
+        """From here on steps may be taken again."""
+        self._both.zero_()
+
+
+class Seen(NamedTuple):
+    """What a camera sees of a problem's model, on the device."""
+
+    camera: bytes  # `parts.camera_struct`
+    around: parts.Exterior | None
+    projected: parts.Projected
+    pairs: parts.Pairs
+    color: Tensor  # (H, W, 3)
+    alpha: Tensor  # (H, W)
+    inverse_depth: Tensor  # (H, W)
+
+
+class LossOf(NamedTuple):
+    """Eq. 6 of an image, on the device."""
+
+    report: Tensor  # (4,) float64, its last value after the step
+    by_color: Tensor  # (H, W, 3) the gradient
+    by_inverse_depth: Tensor  # (H, W)
+    exposure: Tensor | None  # (3, 5) float64 as `PhotometricLoss.exposure`
+
+
 class Found(NamedTuple):
     """What an iteration found; on the device."""
 
-    gradients: dict[str, Tensor]  # shaped as the parameters; `screen` (N, 2) per pixel, and `absolute`
+    screen: Tensor  # (N, 2) gradients per pixel
+    absolute: Tensor | None  # (N, 2) absolute ones, where the problem has them
     state: Tensor  # (N,) uint8, State in csrc/formulas.h
     report: Tensor  # (4,) float64, or (4 + 27,)
     color: Tensor  # (H, W, 3) rendered
@@ -61,46 +116,47 @@ class Found(NamedTuple):
     exposure: Tensor | None  # (3, 5) float64 as `PhotometricLoss.exposure`
 
 
-def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None) -> Found:
-    """Forward and backward pass of eq. 6.
+def take(
+    launch: Launch,
+    problem: Problem,
+    moving: Mapping[str, Moving],
+    step: int,
+    status: Status,
+    room: int | None,
+) -> Found:
+    """Forward and backward pass of eq. 6, and a step of what moves of the problem's model, in place.
 
-    Args: status (1,) int32, receives why a step may not be taken; room for pairs of splats and tiles, without
-    it the host waits for their number. Raises RunError where it waits and there are more than 2³¹.
+    Args: moving, by the names of the model's parameters, which share its memory; step, 1 for the first one;
+    status, receives why a step may not be taken; room, for pairs of splats and tiles, without it the host
+    waits for their number. Raises RunError where it waits and there are more than 2³¹.
     """
-    at, degree = problem.camera, problem.sh_degree
+    seen = forward(launch, problem, room)
+    return backward(launch, problem, seen, loss_of(launch, problem, seen, status), moving, step, status)
+
+
+def forward(launch: Launch, problem: Problem, room: int | None) -> Seen:
+    """The image of the problem's model. Args and errors: as of `take`."""
+    at = problem.camera
     size = (at.width, at.height)
     camera = parts.camera_struct(at.rotation, at.translation, *size, problem.near, problem.exact)
     screen = problem.model["means"].new_zeros(len(problem.model["means"]), 2)
     angles = parts.half_pixels(*size, screen.device) if problem.exact else None
-    around, motion = problem.surroundings(), room_for(problem.model["means"], problem.moving)
-    projected = parts.project(launch, problem.model, screen, camera, degree, angles, around)
+    around = problem.surroundings()
+    projected = parts.project(launch, problem.model, screen, camera, problem.sh_degree, angles, around)
     pairs = parts.list_pairs(launch, projected, *size, room, around)
-    splats, rays = projected.splats, projected.rays
-    color, alpha, inverse_depth = parts.composite(launch, splats, rays, pairs, *size, around)
-    images = color, problem.image, problem.mask, problem.lambda_ssim, problem.rows
-    sums, samples, grad_color, by_exposure = losses.photometric_sums(
+    images = parts.composite(launch, projected.splats, projected.rays, pairs, *size, around)
+    return Seen(camera, around, projected, pairs, *images)
+
+
+def loss_of(launch: Launch, problem: Problem, seen: Seen, status: Status) -> LossOf:
+    """Eq. 6 of a rendered image, and whether a step may be taken by it."""
+    images = seen.color, problem.image, problem.mask, problem.lambda_ssim, problem.rows
+    sums, samples, by_color, exposure = losses.photometric_sums(
         launch, *images, problem.exposure, problem.share
     )
-    depth_sum, depth_samples, grad_depth = _depth_loss(launch, problem, inverse_depth)
-    listed = splats, rays, pairs.entries, pairs.starts
-    by_splat = parts.composite_backward(
-        launch,
-        *listed,
-        *size,
-        len(screen),
-        around,
-        absolute=problem.absolute,
-        color=color,
-        alpha=alpha,
-        inverse_depth=inverse_depth,
-        grad_color=grad_color,
-        grad_alpha=torch.zeros_like(alpha),
-        grad_inverse_depth=grad_depth,
-    )
-    found = parts.project_backward(
-        launch, problem.model, camera, degree, splats, projected.tile_counts, by_splat, status, motion
-    )
-    report = torch.empty(REPORT, dtype=torch.float64, device=status.device)
+    depth_sum, depth_samples, by_depth = _depth_loss(launch, problem, seen.inverse_depth)
+    pairs = seen.pairs
+    report = torch.empty(REPORT, dtype=torch.float64, device=by_color.device)
     launch(
         "iteration_guard",
         (1, 1),
@@ -115,11 +171,49 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         depth_weight=float(problem.depth_weight),
         pairs=pairs.counts[-1:] if len(pairs.counts) else None,
         room=len(pairs.entries),
-        status=status,
+        status=status.known,
         report=report,
     )
-    whole = with_motion(launch, report, motion)
-    return Found(found, projected.state, whole, color, inverse_depth, by_exposure)
+    return LossOf(report, by_color, by_depth, exposure)
+
+
+def backward(
+    launch: Launch,
+    problem: Problem,
+    seen: Seen,
+    loss: LossOf,
+    moving: Mapping[str, Moving],
+    step: int,
+    status: Status,
+) -> Found:
+    """The backward pass of an image, and a step of Adam of what moves, in place. Args: as of `take`."""
+    at, projected = problem.camera, seen.projected
+    motion = room_for(problem.model["means"], problem.moving)
+    sums = parts.composite_backward(
+        launch,
+        projected.splats,
+        projected.rays,
+        seen.pairs.entries,
+        seen.pairs.starts,
+        at.width,
+        at.height,
+        len(projected.state),
+        seen.around,
+        absolute=problem.absolute,
+        color=seen.color,
+        alpha=seen.alpha,
+        inverse_depth=seen.inverse_depth,
+        grad_color=loss.by_color,
+        grad_alpha=torch.zeros_like(seen.alpha),
+        grad_inverse_depth=loss.by_inverse_depth,
+    )
+    frame = parts.Frame(seen.camera, problem.sh_degree, projected.splats, projected.tile_counts, sums, motion)
+    known, broken = status.known, status.broken
+    out = parts.project_step(launch, problem.model, moving, step, frame, known, broken)
+    launch("iteration_end", (1, 1), 32, broken=broken, status=known, report=loss.report)
+    report = with_motion(launch, loss.report, motion)
+    images = seen.color, seen.inverse_depth
+    return Found(out["screen"], out.get("absolute"), projected.state, report, *images, loss.exposure)
 
 
 def _depth_loss(
@@ -136,7 +230,7 @@ def _depth_loss(
 def add_statistics(
     launch: Launch,
     found: Found,
-    status: Tensor,
+    status: Status,
     problem: Problem,
     gradient: Tensor,
     views: Tensor,
@@ -156,14 +250,14 @@ def add_statistics(
         (-(-count // parts.THREADS), 1),
         parts.THREADS,
         count=count,
-        screen=found.gradients["screen"],
-        absolute=found.gradients.get("absolute"),
+        screen=found.screen,
+        absolute=found.absolute,
         state=found.state,
         means=problem.model["means"],
         camera=parts.camera_struct(at.rotation, at.translation, *size, problem.near, problem.exact),
         angle=int(angle),
         contribution=int(contribution),
-        status=status,
+        status=status.known,
         gradient=gradient,
         views=views,
         absolute_sum=absolute,

@@ -9,6 +9,7 @@ from panolog.renderer.cuda.losses import absolute_sum, photometric_sums
 from panolog.renderer.cuda.motion import motion_sums, room_for
 from panolog.renderer.cuda.parts import (
     Exterior,
+    Frame,
     Launch,
     Rays,
     camera_struct,
@@ -74,8 +75,8 @@ def rasterize_backward(launch: Launch, **given: Any) -> tuple[Tensor, ...]:
         **images,
     )
     motion = room_for(means, given.get("moving", False))
-    seen = parameters, camera, given["sh_degree"], splats, tile_counts
-    out = project_backward(launch, *seen, sums, motion=motion)
+    frame = Frame(camera, given["sh_degree"], splats, tile_counts, sums, motion)
+    out = project_backward(launch, parameters, frame)
     if absolute:
         out["screen"] = torch.cat([out["screen"], out.pop("absolute")], 1)
     found = means.new_empty(0, dtype=torch.float64) if motion is None else motion_sums(launch, motion)

@@ -35,7 +35,6 @@ MODULES: dict[str, dict[str, bool]] = {
     "bin": {"fma": False},
     "composite": {"use_fast_math": True},
     "loss": {},
-    "adam": {},
     "iteration": {},
 }
 

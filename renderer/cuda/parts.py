@@ -13,8 +13,9 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from panolog.renderer.adam import Moving
+from panolog.renderer.adam import BETAS, EPSILON, Moving
 from panolog.scene.errors import RunError
+from panolog.scene.gaussians import PARAMETERS
 
 TILE = 16  # kTile in csrc/cuda/common.cuh
 SPAN = 128  # Gaussians in a block of project.cu
@@ -25,7 +26,6 @@ SUMS = {"": 10, "_absolute": 12, "_ray": 13}  # k…GradientFloats in csrc, by n
 MAX_PAIRS = 2**31 - 1  # of splats and tiles, counted in int32
 NARROW_TILES = 2**16  # below so many their numbers fit int16, which sorts in half the time
 NARROW_FIRST = -(2**15)  # the number of the first of them
-MOST_SEGMENTS = 6  # kMostSegments in csrc/cuda/adam.cu
 
 Argument = Tensor | int | float | bytes | None
 
@@ -291,89 +291,85 @@ def composite_backward(
     return sums
 
 
-def project_backward(
-    launch: Launch,
-    parameters: Mapping[str, Tensor],
-    camera: bytes,
-    sh_degree: int,
-    splats: Tensor,
-    tile_counts: Tensor,
-    sums: Tensor,
-    status: Tensor | None = None,
-    motion: Tensor | None = None,
-) -> dict[str, Tensor]:
-    """The gradients of the parameters, of `screen` and, if summed, `absolute` ones, both (N, 2).
+class Frame(NamedTuple):
+    """What the backward projection takes besides the model: what was seen, and what the pixels say of it."""
 
-    Args: sums, by `composite_backward`, whose columns say of what; status (1,) int32, notes a gradient that
-    is not finite; motion (N, 6), receives the parts of the Gaussians in the gradient of the camera's pose.
-    """
-    count = len(sums)
-    (kind,) = (kind for kind, floats in SUMS.items() if floats == sums.shape[1])
-    out = {name: torch.empty_like(tensor) for name, tensor in parameters.items()}
-    out |= {name: splats.new_empty(count, 2) for name in ("screen", "absolute")[: 1 + (kind == "_absolute")]}
-    launch(
-        f"project{kind}_backward",
-        (math.ceil(count / SPAN), 1),
-        SPAN,
-        **parameters,
-        camera=camera,
-        sh_count=(sh_degree + 1) ** 2,
-        count=count,
-        splats=splats,
-        tile_counts=tile_counts,
-        sums=sums,
-        **{f"out_{name}": tensor for name, tensor in out.items()},
-        out_motion=motion,
-        status=status,
-    )
+    camera: bytes  # `camera_struct`
+    sh_degree: int
+    splats: Tensor  # (16 (N + M),)
+    tile_counts: Tensor  # (N + M,)
+    sums: Tensor  # (N, 10), (N, 12) or (N, 13) by `composite_backward`
+    motion: Tensor | None  # (N, 6), receives the parts of the Gaussians in the gradient of the camera's pose
+
+    @property
+    def kind(self) -> str:
+        """Of which projection the sums are, as kernels have it in their names."""
+        (kind,) = (kind for kind, floats in SUMS.items() if floats == self.sums.shape[1])
+        return kind
+
+    def screen(self) -> dict[str, Tensor]:
+        """Room for the gradients of `screen` and, if summed, `absolute` ones, both (N, 2)."""
+        names = ("screen", "absolute")[: 1 + (self.kind == "_absolute")]
+        return {name: self.splats.new_empty(len(self.sums), 2) for name in names}
+
+    def launch(self, launch: Launch, kernel: str, out: Mapping[str, Tensor], **arguments: Argument) -> None:
+        """Launches the kernel of this projection, a thread for each Gaussian."""
+        launch(
+            f"project{self.kind}_{kernel}",
+            (math.ceil(len(self.sums) / SPAN), 1),
+            SPAN,
+            camera=self.camera,
+            sh_count=(self.sh_degree + 1) ** 2,
+            count=len(self.sums),
+            splats=self.splats,
+            tile_counts=self.tile_counts,
+            sums=self.sums,
+            **{f"out_{name}": tensor for name, tensor in out.items()},
+            out_motion=self.motion,
+            **arguments,
+        )
+
+
+def project_backward(launch: Launch, parameters: Mapping[str, Tensor], frame: Frame) -> dict[str, Tensor]:
+    """The gradients of the parameters, and those of `Frame.screen`."""
+    out = {name: torch.empty_like(tensor) for name, tensor in parameters.items()} | frame.screen()
+    frame.launch(launch, "backward", out, **parameters)
     return out
 
 
-def adam_step(
+def project_step(
     launch: Launch,
-    gradients: Mapping[str, Tensor],
+    parameters: Mapping[str, Tensor],
     moving: Mapping[str, Moving],
-    beta1: float,
-    beta2: float,
-    eps: float,
     step: int,
-    status: Tensor | None = None,
-) -> None:
-    """One step of up to six parameters, in place, by one launch; none if `status` (1,) int32 is not 0.
+    frame: Frame,
+    status: Tensor,
+    broken: Tensor,
+) -> dict[str, Tensor]:
+    """One step of Adam of a model, in place, by gradients that are never in memory; those of `Frame.screen`.
 
-    Args: gradients, contiguous, at least of what moves.
+    Args: moving, of the model's parameters those that move; step, 1 for the first one; status (1,) int32, no
+    step unless it is 0; broken (1,) int32, receives kBrokenGradient of what is not finite: the model is then
+    invalid.
     """
-    if len(moving) > MOST_SEGMENTS:
-        raise ValueError(f"{len(moving)} parameters are more than {MOST_SEGMENTS}")
-    bias = 1 - beta1**step
-    blocks, segments = 0, b""
-    for name, (*tensors, count, lr, units) in moving.items():
-        pointers = (0 if it is None else it.data_ptr() for it in (gradients[name], *tensors, units))
-        values = 1 if units is None else tensors[0].numel() // max(1, units.numel())
-        segments += _SEGMENT.pack(*pointers, count, blocks, lr / bias, values)
-        blocks += math.ceil(count / THREADS)
-    segments += _SEGMENT.pack(0, 0, 0, 0, 0, 0, blocks, 0, 0) * (MOST_SEGMENTS - len(moving))
-    given = Struct(segments)
-    given.tensors = {f"gradient of {name}": gradients[name] for name in moving} | {
-        f"{what} of {name}": tensor
-        for name, it in moving.items()
-        for what, tensor in it._asdict().items()
-        if isinstance(tensor, Tensor)
-    }
-    launch(
-        "adam_step",
-        (blocks, 1),
-        THREADS,
-        segments=given,
-        root=1 / math.sqrt(1 - beta2**step),
-        beta1=beta1,
-        beta2=beta2,
-        eps=eps,
-        status=status,
-    )
+    packed, pointed = b"", dict(parameters)
+    for name in PARAMETERS:
+        found = moving.get(name)
+        if found is None:
+            packed += _MOVING.pack(parameters[name].data_ptr(), 0, 0, 0, 0, 0.0)
+            continue
+        needed = {"exp_avg": found.exp_avg, "exp_avg_sq": found.exp_avg_sq, "units": found.units}
+        pointers = (0 if it is None else it.data_ptr() for it in (parameters[name], *needed.values()))
+        packed += _MOVING.pack(*pointers, found.values, found.lr / (1 - BETAS[0] ** step))
+        pointed |= {f"{what} of {name}": it for what, it in needed.items() if it is not None}
+    given = Struct(packed + _CONSTANTS.pack(1 / math.sqrt(1 - BETAS[1] ** step), *BETAS, EPSILON))
+    given.tensors = pointed
+    out = frame.screen()
+    frame.launch(launch, "step", out, step=given, status=status, broken=broken)
+    return out
 
 
-_SEGMENT = struct.Struct("=5Q2qfi")  # Segment in csrc/cuda/adam.cu
+_MOVING, _CONSTANTS = struct.Struct("=4Qqf4x"), struct.Struct("=4f")  # Moving and Step in csrc/cuda/adam.cuh
 
 
 def camera_struct(

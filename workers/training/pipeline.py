@@ -2,9 +2,9 @@
 
 The host never waits for all that it launched on a card, only, when it is `AHEAD` iterations ahead, for the
 oldest of these. The buffers for pairs of splats and tiles have the size that the same view needed before,
-with a margin. Where that was too small, or a loss or gradient is not finite, the device skips the step of
-that iteration and of all that follow (`renderer.cuda.iteration`). The host then repeats them from that one
-on: the model is as if each had been done once, in order.
+with a margin. Where that was too small, or a loss is not finite, the device skips the step of that iteration
+and of all that follow (`renderer.cuda.iteration`). The host then repeats them from that one on: the model is
+as if each had been done once, in order.
 """
 
 import math
@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from panolog.renderer import ops
-from panolog.renderer.adam import BETAS, EPSILON
 from panolog.renderer.cuda import iteration, parts
-from panolog.renderer.cuda.iteration import Found, Problem
+from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.cuda.parts import Launch
 from panolog.renderer.iteration import take
 from panolog.renderer.motion import MOTION_SUMS
@@ -124,7 +123,7 @@ class Pipeline:
         self._cuda = device.type == "cuda"
         self._finished = finished
         self._broken = broken
-        self._status = torch.zeros(1, dtype=torch.int32, device=device)
+        self._status = iteration.Status(device)
         length = iteration.REPORT + MOTION_SUMS
         self._reports = torch.zeros(AHEAD, length, dtype=torch.float64, pin_memory=self._cuda)
         self._launched: deque[_Launched] = deque()
@@ -161,11 +160,10 @@ class Pipeline:
         count = len(plan.state.gaussians)
         return min(_LEAST + math.ceil(density * count), parts.MAX_PAIRS)
 
-    def _enqueue(self, plan: Plan, room: int | None) -> Found:
+    def _enqueue(self, plan: Plan, room: int | None) -> None:
         """Launches all of an iteration."""
-        found = iteration.gradients(self._launch, plan.problem, self._status, room)
         moving = plan.state.moving(plan.rates, plan.rows)
-        parts.adam_step(self._launch, found.gradients, moving, *BETAS, EPSILON, plan.iteration, self._status)
+        found = iteration.take(self._launch, plan.problem, moving, plan.iteration, self._status, room)
         plan.state.widen(plan.least)
         if plan.statistics is not None:
             into = plan.statistics
@@ -181,7 +179,7 @@ class Pipeline:
                 contribution=into.config.views == "contribution",
             )
         if plan.learning is not None:
-            visit = plan.visit(found.color, found.inverse_depth, found.exposure, self._status)
+            visit = plan.visit(found.color, found.inverse_depth, found.exposure, self._status.known)
             plan.learning.step(visit)
         report = self._reports[plan.iteration % AHEAD, : len(found.report)]
         report.copy_(found.report, non_blocking=True)
@@ -189,19 +187,23 @@ class Pipeline:
         if event is not None:
             event.record()
         self._launched.append(_Launched(plan, report, event))
-        return found
 
     def _over(self, launched: _Launched) -> bool:
         return launched.event is not None and bool(launched.event.query())  # type: ignore[no-untyped-call]
 
     def _read(self) -> None:
-        """Reads the oldest iteration when it is over; repeats it and all later ones if it took no step."""
+        """Reads the oldest iteration when it is over; repeats it and all later ones if it took no step.
+
+        Raises RunError if it took one by a gradient that is not finite: then the state is invalid.
+        """
         plans = [launched.plan for launched in self._launched]
-        if self._note() == 0:
+        if (status := self._note()) == 0:
             return
         while self._launched:  # none of them took a step
             self._note()
-        self._status.zero_()
+        self._status.clear()
+        if status >= iteration.BROKEN_GRADIENT:
+            raise self._broken(iteration.not_finite(status), plans[0])
         self._carefully(plans[0])
         for plan in plans[1:]:
             self.run(plan)
@@ -222,14 +224,7 @@ class Pipeline:
 
     def _carefully(self, plan: Plan) -> None:
         """One iteration for which the host waits. Raises RunError with the name of what is not finite."""
-        found = self._enqueue(plan, None)
+        self._enqueue(plan, None)
         if status := self._note():
-            self._status.zero_()
-            raise self._broken(_not_finite(status, found.gradients), plan)
-
-
-def _not_finite(status: int, gradients: dict[str, Tensor]) -> str:
-    if status & iteration.BROKEN_LOSS:
-        return "loss"
-    names = [name for name, tensor in gradients.items() if not bool(torch.isfinite(tensor).all())]
-    return f"gradient of {names[0]}" if names else "gradient"
+            self._status.clear()
+            raise self._broken(iteration.not_finite(status), plan)

@@ -13,8 +13,8 @@ constexpr uint32_t kAllLanes = 0xffffffffu;
 // Why no step of the optimiser may be taken any more, until the host has read it.
 enum Status : int32_t {
   kNoRoom = 1,          // there were more pairs of splats and tiles than room
-  kBrokenGradient = 2,  // one was not finite
-  kBrokenLoss = 4,      // it was not finite
+  kBrokenLoss = 2,      // it was not finite
+  kBrokenGradient = 4,  // one of the first parameter was not finite; of the others the bits above
 };
 
 // Of an azimuth or an elevation. Kernels read them for every half pixel: those of centres, and of middles between them.

@@ -1,4 +1,4 @@
-// The end of a training iteration: whether its step may be taken, what the host reads later, and the statistics of
+// Around the step of a training iteration: whether it may be taken, what the host reads later, and the statistics of
 // densification.
 #include "common.cuh"
 
@@ -10,8 +10,8 @@ __device__ __forceinline__ bool is_finite(double value) { return 0 * value == 0;
 }  // namespace
 }  // namespace panolog
 
-// One thread. Adds to status (1) why no step may be taken, and writes report (4): loss, mean squared error, pairs of
-// splats and tiles, status.
+// One thread. Adds to status (1) why no step may be taken, and writes of report (4): loss, mean squared error, pairs of
+// splats and tiles.
 //
 // sums (3): of |x - y|, SSIM and (x - y)² over `samples` ()
 // depth_sum (), depth_samples (): of the depth loss, null without it
@@ -30,7 +30,16 @@ extern "C" __global__ void __launch_bounds__(32)
   if (listed > room) found |= panolog::kNoRoom;
   if (!panolog::is_finite(loss)) found |= panolog::kBrokenLoss;
   *status = found;
-  report[0] = loss, report[1] = squared, report[2] = double(listed), report[3] = found;
+  report[0] = loss, report[1] = squared, report[2] = double(listed);
+}
+
+// One thread, after the step. Adds to status (1) what `broken` (1) has of it, for which no later step may be taken, and
+// writes the last value of report (4).
+extern "C" __global__ void __launch_bounds__(32) iteration_end(int32_t* broken, int32_t* status, double* report) {
+  if (threadIdx.x) return;
+  const int32_t found = *status | *broken;
+  *status = found, *broken = 0;
+  report[3] = found;
 }
 
 // Adds one view to the first `count` rows of the statistics, unless status (1) is not 0. `angle`: lengths in half turns

@@ -1,6 +1,7 @@
 // Forward and backward projection of N Gaussians, one thread for each: affine (eq. 2, appendix B), and exact (rays.h).
 // Of a Gaussian's 59 floats 45 lie in one row; they pass through shared memory, so that a warp moves whole lines.
 // Compiled without contraction into fused multiply-adds: bin.cu must find the same tiles to the bit.
+#include "adam.cuh"
 #include "raytiles.cuh"
 
 namespace panolog {
@@ -65,41 +66,114 @@ __device__ __forceinline__ void write_splat(const Splat& s, Visibility<float> se
   out.tile_counts[i] = met;
 }
 
+// The gradients of one Gaussian, but for shN.
+struct Row {
+  float mean[3], quat[4], scale[3], opacity[1], sh0[3];
+};
+
+// take.one(parameter, place, row, gradient) for each value of a row.
+template <class Take>
+__device__ __forceinline__ void take_row(const Take& take, int64_t i, const Row& g) {
+#pragma unroll
+  for (int k = 0; k < 3; ++k) take.one(kMean, 3 * i + k, i, g.mean[k]);
+#pragma unroll
+  for (int k = 0; k < 4; ++k) take.one(kQuat, 4 * i + k, i, g.quat[k]);
+#pragma unroll
+  for (int k = 0; k < 3; ++k) take.one(kScale, 3 * i + k, i, g.scale[k]);
+  take.one(kOpacity, i, i, g.opacity[0]);
+#pragma unroll
+  for (int k = 0; k < 3; ++k) take.one(kSh0, 3 * i + k, i, g.sh0[k]);
+}
+
+// Which gradients of a row are not finite, a bit for each parameter.
+__device__ __forceinline__ int32_t broken_of(const Row& g, const float* rest, int rest_count, const float* screen) {
+  const bool sound[kParameters] = {finite(g.mean, 3) && finite(screen, 2),
+                                   finite(g.quat, 4),
+                                   finite(g.scale, 3),
+                                   finite(g.opacity, 1),
+                                   finite(g.sh0, 3),
+                                   finite(rest, rest_count)};
+  int32_t found = 0;
+#pragma unroll
+  for (int k = 0; k < kParameters; ++k) found |= sound[k] ? 0 : kBrokenGradient << k;
+  return found;
+}
+
+// What all Gaussians receive in the backward pass besides the gradients of their parameters. `absolute` and `motion`
+// may be null.
+struct Seen {
+  float *screen, *absolute, *motion;
+};
+
 // `rest`: shared memory for shN, replaced by its gradient. Where no splat is drawn the gradients are 0.
-template <class Sums>
-__device__ __forceinline__ void write_gradients(const Model& model, const float* shN, const Camera& camera,
-                                                int64_t sh_count, int64_t count, const Splat* splats,
-                                                const int32_t* tile_counts, const Sums* sums,
-                                                const ParameterGradients<float>& all, float* rest, int32_t* status) {
+template <class Sums, class Take>
+__device__ __forceinline__ void take_gradients(const Model& model, const float* shN, const Camera& camera,
+                                               int64_t sh_count, int64_t count, const Splat* splats,
+                                               const int32_t* tile_counts, const Sums* sums, const Seen& seen,
+                                               float* rest, const Take& take) {
   const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
+  const int rest_count = 3 * (int(sh_count) - 1);
   float* const own = rest + kRest * threadIdx.x;
   if (sh_count > 1) copy_rest(shN + begin * kRest, rest, begin, count);
   __syncthreads();
   const bool drawn = i < count && tile_counts[i] > 0;
+  Row g = {};
   if (drawn) {
-    const ParameterGradients<float> out = {all.mean + 3 * i,
-                                           all.quat + 4 * i,
-                                           all.scale + 3 * i,
-                                           all.opacity + i,
-                                           all.sh0 + 3 * i,
+    const ParameterGradients<float> out = {g.mean,
+                                           g.quat,
+                                           g.scale,
+                                           g.opacity,
+                                           g.sh0,
                                            own,
-                                           all.screen + 2 * i,
-                                           all.absolute ? all.absolute + 2 * i : nullptr,
-                                           all.motion ? all.motion + kMotion * i : nullptr};
+                                           seen.screen + 2 * i,
+                                           seen.absolute ? seen.absolute + 2 * i : nullptr,
+                                           seen.motion ? seen.motion + kMotion * i : nullptr};
     project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
-    const bool sound = finite(out.mean, 3) && finite(out.quat, 4) && finite(out.scale, 3) && finite(out.opacity, 1) &&
-                       finite(out.sh0, 3) && finite(own, 3 * (int(sh_count) - 1)) && finite(out.screen, 2);
-    if (status && !sound) atomicOr(status, kBrokenGradient);
+    take.note(g, own, rest_count, out.screen);
   } else if (i < count) {
-    for (int k = 0; k < 3; ++k) all.mean[3 * i + k] = all.scale[3 * i + k] = all.sh0[3 * i + k] = 0;
-    for (int k = 0; k < 4; ++k) all.quat[4 * i + k] = 0;
-    all.opacity[i] = all.screen[2 * i] = all.screen[2 * i + 1] = 0;
-    if (all.absolute) all.absolute[2 * i] = all.absolute[2 * i + 1] = 0;
-    for (int k = 0; all.motion && k < kMotion; ++k) all.motion[kMotion * i + k] = 0;
+    seen.screen[2 * i] = seen.screen[2 * i + 1] = 0;
+    if (seen.absolute) seen.absolute[2 * i] = seen.absolute[2 * i + 1] = 0;
+    for (int k = 0; seen.motion && k < kMotion; ++k) seen.motion[kMotion * i + k] = 0;
   }
-  for (int k = drawn ? 3 * (int(sh_count) - 1) : 0; k < kRest; ++k) own[k] = 0;
+  if (i < count) take_row(take, i, g);
+  for (int k = drawn ? rest_count : 0; k < kRest; ++k) own[k] = 0;
   __syncthreads();
-  copy_rest(rest, all.shN + begin * kRest, begin, count);
+  const int floats = int(count - begin < kSpan ? count - begin : kSpan) * kRest;
+  for (int k = int(threadIdx.x); k < floats; k += kSpan) take.one(kShN, begin * kRest + k, begin + k / kRest, rest[k]);
+}
+
+// Gradients as an op returns them.
+struct Written {
+  float* to[kParameters];
+
+  __device__ __forceinline__ void one(int parameter, int64_t at, int64_t, float g) const { to[parameter][at] = g; }
+  __device__ __forceinline__ void note(const Row&, const float*, int, const float*) const {}
+};
+
+// A step of the optimiser.
+struct Stepped {
+  const Step& step;
+  int32_t* broken;
+
+  __device__ __forceinline__ void one(int parameter, int64_t at, int64_t row, float g) const {
+    step.move(parameter, at, row, g);
+  }
+  __device__ __forceinline__ void note(const Row& g, const float* rest, int rest_count, const float* screen) const {
+    const int32_t found = broken_of(g, rest, rest_count, screen);
+    if (found) atomicOr(broken, found);
+  }
+};
+
+// Values change while those of other Gaussians are read: a row is of one thread, the coefficients of one block.
+template <class Sums>
+__device__ __forceinline__ void take_step(const Step& step, const Camera& camera, int64_t sh_count, int64_t count,
+                                          const Splat* splats, const int32_t* tile_counts, const Sums* sums,
+                                          const Seen& seen, float* rest, const int32_t* status, int32_t* broken) {
+  if (*status) return;
+  const Moving* of = step.of;
+  const Model model = {of[kMean].values, of[kQuat].values, of[kScale].values, of[kOpacity].values, of[kSh0].values};
+  take_gradients(model, of[kShN].values, camera, sh_count, count, splats, tile_counts, sums, seen, rest,
+                 Stepped{step, broken});
 }
 
 }  // namespace
@@ -175,19 +249,17 @@ extern "C" __global__ void __launch_bounds__(128)
 
 // sums (N): gradients from the pixels. Writes every row of the gradients, zeros for splats without tiles.
 // out_motion (N, 6), may be null: parts in the gradient of the camera's pose.
-// status (1), may be null: receives kBrokenGradient if one is not finite.
 extern "C" __global__ void __launch_bounds__(128)
     project_backward(const float* means, const float* quats, const float* scales, const float* opacities,
                      const float* sh0, const float* shN, panolog::Camera camera, int64_t sh_count, int64_t count,
                      const panolog::Splat* splats, const int32_t* tile_counts, const panolog::SplatGradient* sums,
                      float* out_means, float* out_quats, float* out_scales, float* out_opacities, float* out_sh0,
-                     float* out_shN, float* out_screen, float* out_motion, int32_t* status) {
+                     float* out_shN, float* out_screen, float* out_motion) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];
-  const ParameterGradients<float> out = {out_means, out_quats,  out_scales, out_opacities, out_sh0,
-                                         out_shN,   out_screen, nullptr,    out_motion};
-  write_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums, out,
-                  rest, status);
+  take_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums,
+                 {out_screen, nullptr, out_motion}, rest,
+                 Written{{out_means, out_quats, out_scales, out_opacities, out_sh0, out_shN}});
 }
 
 // The same with absolute gradients, out_absolute (N, 2).
@@ -197,13 +269,12 @@ extern "C" __global__ void __launch_bounds__(128)
                               int64_t count, const panolog::Splat* splats, const int32_t* tile_counts,
                               const panolog::AbsoluteGradient* sums, float* out_means, float* out_quats,
                               float* out_scales, float* out_opacities, float* out_sh0, float* out_shN,
-                              float* out_screen, float* out_absolute, float* out_motion, int32_t* status) {
+                              float* out_screen, float* out_absolute, float* out_motion) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];
-  const ParameterGradients<float> out = {out_means, out_quats,  out_scales,   out_opacities, out_sh0,
-                                         out_shN,   out_screen, out_absolute, out_motion};
-  write_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums, out,
-                  rest, status);
+  take_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums,
+                 {out_screen, out_absolute, out_motion}, rest,
+                 Written{{out_means, out_quats, out_scales, out_opacities, out_sh0, out_shN}});
 }
 
 extern "C" __global__ void __launch_bounds__(128)
@@ -211,13 +282,45 @@ extern "C" __global__ void __launch_bounds__(128)
                          const float* sh0, const float* shN, panolog::Camera camera, int64_t sh_count, int64_t count,
                          const panolog::Splat* splats, const int32_t* tile_counts, const panolog::RayGradient* sums,
                          float* out_means, float* out_quats, float* out_scales, float* out_opacities, float* out_sh0,
-                         float* out_shN, float* out_screen, float* out_motion, int32_t* status) {
+                         float* out_shN, float* out_screen, float* out_motion) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];
-  const ParameterGradients<float> out = {out_means, out_quats,  out_scales, out_opacities, out_sh0,
-                                         out_shN,   out_screen, nullptr,    out_motion};
-  write_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums, out,
-                  rest, status);
+  take_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums,
+                 {out_screen, nullptr, out_motion}, rest,
+                 Written{{out_means, out_quats, out_scales, out_opacities, out_sh0, out_shN}});
+}
+
+// The gradients of the parameters are a step of Adam at once: they never are in memory. No step unless status (1) is 0;
+// broken (1) receives kBrokenGradient of each parameter that has a gradient which is not finite.
+extern "C" __global__ void __launch_bounds__(128)
+    project_step(panolog::Step step, panolog::Camera camera, int64_t sh_count, int64_t count,
+                 const panolog::Splat* splats, const int32_t* tile_counts, const panolog::SplatGradient* sums,
+                 float* out_screen, float* out_motion, const int32_t* status, int32_t* broken) {
+  using namespace panolog;
+  __shared__ float rest[kSpan * kRest];
+  take_step(step, camera, sh_count, count, splats, tile_counts, sums, {out_screen, nullptr, out_motion}, rest, status,
+            broken);
+}
+
+extern "C" __global__ void __launch_bounds__(128)
+    project_absolute_step(panolog::Step step, panolog::Camera camera, int64_t sh_count, int64_t count,
+                          const panolog::Splat* splats, const int32_t* tile_counts,
+                          const panolog::AbsoluteGradient* sums, float* out_screen, float* out_absolute,
+                          float* out_motion, const int32_t* status, int32_t* broken) {
+  using namespace panolog;
+  __shared__ float rest[kSpan * kRest];
+  take_step(step, camera, sh_count, count, splats, tile_counts, sums, {out_screen, out_absolute, out_motion}, rest,
+            status, broken);
+}
+
+extern "C" __global__ void __launch_bounds__(128)
+    project_ray_step(panolog::Step step, panolog::Camera camera, int64_t sh_count, int64_t count,
+                     const panolog::Splat* splats, const int32_t* tile_counts, const panolog::RayGradient* sums,
+                     float* out_screen, float* out_motion, const int32_t* status, int32_t* broken) {
+  using namespace panolog;
+  __shared__ float rest[kSpan * kRest];
+  take_step(step, camera, sh_count, count, splats, tile_counts, sums, {out_screen, nullptr, out_motion}, rest, status,
+            broken);
 }
 
 // Sums of motion (N, 6) over the Gaussians of each block, sums (blocks, kMotionSums): of the values, and of their

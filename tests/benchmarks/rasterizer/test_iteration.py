@@ -12,7 +12,7 @@ from tests.renderer.cuda.stubbed import stubbed
 
 LAUNCHES = [
     *("project_forward", "bin_narrow", "composite_forward", "loss_similarity", "loss_gradient"),
-    *("loss_absolute", "composite_backward", "project_backward", "iteration_guard", "adam_step"),
+    *("loss_absolute", "iteration_guard", "composite_backward", "project_step", "iteration_end"),
     "iteration_statistics",
 ]
 

@@ -115,9 +115,9 @@ def test_kernels_are_timed_one_by_one_and_compared() -> None:
         "iteration_statistics"
     }  # which is not a part of a benchmark's step
     assert min(took.values()) > 0
-    table = roofline.comparison({"adam_step": 2.0, "iteration_guard": 1.0}, {"adam_step": 0.5})
+    table = roofline.comparison({"project_step": 2.0, "iteration_guard": 1.0}, {"project_step": 0.5})
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
-    assert rows[0][0] == "adam_step" and float(rows[0][3]) == 25 and rows[1][2] == "–"
+    assert rows[0][0] == "project_step" and float(rows[0][3]) == 25 and rows[1][2] == "–"
 
 
 def test_a_clock_that_waits_gives_each_kernel_its_own_time() -> None:

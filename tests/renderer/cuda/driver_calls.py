@@ -21,7 +21,7 @@ from panolog.renderer.cuda import iteration, launches, nvrtc, parts
 from panolog.renderer.cuda.card import Kernels
 from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.cuda.parts import Argument
-from tests.renderer.cuda.machine import surrounded
+from tests.renderer.cuda.machine import arguments, results, surrounded
 from tests.renderer.hard_scenes import camera, cloud
 
 STREAM = 0x5EED
@@ -89,7 +89,7 @@ def every_kernel(launch: Checked) -> None:
     at, scene = camera(), cloud(40)
     image = torch.zeros(at.height, at.width, 3, dtype=torch.uint8)
     mask, depth = torch.ones(at.height, at.width, dtype=torch.bool), torch.zeros(at.height, at.width)
-    status = torch.zeros(1, dtype=torch.int32)
+    status, some = iteration.Status(torch.device("cpu")), {"means": scene.means, "scales": scene.scales}
     moments = [torch.zeros_like(scene.means) for _ in range(2)]
     own = torch.arange(20)
     around = [surrounded(replace(scene, exact=exact), at, own)[1] for exact in (False, True)]
@@ -115,14 +115,19 @@ def every_kernel(launch: Checked) -> None:
             absolute=absolute,
             exposure=torch.ones(2, 3) if full else None,
         )
+        moving = (
+            {name: Moving(it, moments[0], moments[1], 30, 0.125) for name, it in some.items()} if full else {}
+        )
         with mock.patch.object(parts, "NARROW_TILES", narrow):
-            found = iteration.gradients(launch, problem, status, room)
+            found = iteration.take(launch, problem, moving, 3, status, room)
         into, more = [torch.zeros(30), torch.zeros(30)], torch.zeros(30) if absolute else None
         iteration.add_statistics(launch, found, status, problem, *into, absolute=more, angle=full)
-        names = ("means", "scales")[: 1 + full]
-        moving = {name: Moving(scene.means, moments[0], moments[1], 30, 0.125) for name in names}
-        parts.adam_step(launch, found.gradients, moving, 0.9, 0.999, 1e-15, 3, status if full else None)
     launches.absolute_difference(launch, depth, depth, mask)
+    for columns in (2, 4):  # without and with absolute gradients
+        for exact in (False, True)[: 4 // columns]:
+            given = arguments(replace(scene, exact=exact), at) | {"screen": torch.zeros(40, columns)}
+            made = launches.rasterize(launch, **given)
+            launches.rasterize_backward(launch, **given, **results(made, list(made[:3])))
 
 
 def main() -> None:

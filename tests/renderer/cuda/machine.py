@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,17 +10,18 @@ import torch
 from torch import Tensor
 
 from panolog.renderer import ops
-from panolog.renderer.adam import BETAS, EPSILON, Moving
+from panolog.renderer.adam import BETAS, Moving
 from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches
+from panolog.renderer.cuda.iteration import REPORT, Problem, Status, take
 from panolog.renderer.cuda.motion import motion_sums
-from panolog.renderer.cuda.parts import Launch, adam_step
-from panolog.renderer.motion import MOTION, Motion
-from panolog.scene.gaussians import Gaussians
-from tests.renderer.agreement import IMAGES, NEAR, check_gradients, check_images, random_weights
+from panolog.renderer.cuda.parts import Launch
+from panolog.renderer.motion import MOTION, MOTION_SUMS, Motion
+from panolog.scene.gaussians import PARAMETERS, Gaussians
+from tests.renderer.agreement import IMAGES, NEAR, certain, check_gradients, check_images, random_weights
 from tests.renderer.cuda.emulation import EmulatedLaunch
-from tests.renderer.test_adam import defined
+from tests.renderer.test_adam import by_autograd, clones, defined, grads, moving_of, problem_of
 
 AFFINE = torch.tensor([[0.7, 1.0, 1.3], [0.02, 0.0, -0.03]])  # an exposure
 
@@ -35,15 +36,16 @@ class Machine:
 
     def run(self, op: Callable[..., Any], **arguments: Any) -> Any:
         """One of the sequences of `renderer.cuda` with the arguments of its op: here and back."""
-        moved = {name: self._moved(argument, self.device) for name, argument in arguments.items()}
+        moved = {name: self.moved(argument) for name, argument in arguments.items()}
         with self.watching():
             result = op(self.launch, **moved)
         return None if result is None else [tensor.cpu() for tensor in result]
 
-    def _moved(self, argument: Any, device: str) -> Any:
-        if isinstance(argument, list):
-            return [self._moved(each, device) for each in argument]
-        return argument.to(device) if isinstance(argument, Tensor) else argument
+    def moved(self, argument: Any) -> Any:
+        """A tensor, or those of a sequence, here; anything else as it is."""
+        if type(argument) in (list, tuple):
+            return type(argument)(self.moved(each) for each in argument)
+        return argument.to(self.device) if isinstance(argument, Tensor | Baked) else argument
 
 
 def emulated(launch: EmulatedLaunch) -> Machine:
@@ -142,25 +144,53 @@ def check_absolute_difference(machine: Machine, share: float) -> None:
     assert torch.allclose(our_gradient, gradient)
 
 
-def check_adam(machine: Machine, moving: int, *, apart: bool = False) -> None:
-    """Steps of the first of 200 rows of 3 values, at rates `apart` or at one; the others stay."""
-    rng = torch.Generator().manual_seed(0)
-    ours = [tensor.to(machine.device) for tensor in torch.rand(3, 200, 3, generator=rng)]
-    theirs = [tensor.cpu().clone() for tensor in ours]
-    units = torch.linspace(0, 1, 200) if apart else None
-    at = None if units is None else units.to(machine.device)
-    for step in range(1, 6):
-        gradient = torch.randn(200, 3, generator=rng)
-        mine = {"some": Moving(ours[0], ours[1], ours[2], moving, 0.01, at)}
-        adam_step(machine.launch, {"some": gradient.to(machine.device)}, mine, *BETAS, EPSILON, step)
-        after = defined(
-            {"some": Moving(theirs[0], theirs[1], theirs[2], moving, 0.01, units)}, {"some": gradient}, step
-        )["some"]
-        for state, found in zip(theirs, after, strict=True):
-            state.view(-1)[:moving] = found.float().view(-1)[:moving]
-    for one, two in zip(ours, theirs, strict=True):
-        assert torch.allclose(one.cpu(), two, atol=1e-6)
-        assert torch.equal(one.cpu().flatten()[moving:], two.flatten()[moving:])
+def check_step(
+    machine: Machine, scene: Gaussians, exterior: Baked | None = None, *, absolute: bool = False
+) -> None:
+    """A step of some rows by the gradients of autograd: they are found in what the first moments become.
+
+    Args: exterior, of `camera()`; absolute, whether the problem has absolute gradients.
+    """
+    rows = len(scene) // 2 + 30
+    units = {name: torch.linspace(0.5, 2, len(scene)) for name in ("means", "shN")}
+    problem = problem_of(scene, exterior=exterior, moving=True, absolute=absolute)
+    keep, valid = certain(scene, problem.camera), problem.depth
+    assert problem.mask is not None and valid is not None
+    problem = replace(problem, mask=problem.mask & keep, depth=(valid[0], valid[1] & keep))
+    screen = torch.zeros(len(scene), 4 if problem.absolute else 2, requires_grad=True)
+    motion = torch.zeros(MOTION_SUMS, dtype=torch.float64, requires_grad=True)
+    expected = grads(by_autograd(problem, screen=screen, motion=motion)[0])
+    before = moving_of(scene, rows, **units)
+    mine = {name: Moving(*(machine.moved(part) for part in it)) for name, it in clones(before).items()}
+    there = {name: machine.moved(value) for name, value in vars(problem).items() if name != "camera"}
+    there |= {"model": {name: it.parameter for name, it in mine.items()}, "rows": None}
+    status = Status(torch.device(machine.device))
+    with machine.watching():
+        given = Problem(**there, camera=problem.camera)
+        found = take(machine.launch, given, mine, 7, status, None)
+    after = {name: [part.cpu() for part in it[:3]] for name, it in mine.items()}
+    seen = {  # rounded to a ten-millionth of what a moment was before
+        name: (moment.double() - BETAS[0] * before[name].exp_avg.double()) / (1 - BETAS[0])
+        for name, (_, moment, _) in after.items()
+    }
+    check_gradients(
+        [*(seen[name][:rows] for name in PARAMETERS), found.screen.cpu()],
+        [*(expected[name][:rows] for name in PARAMETERS), by(screen)[:, :2]],
+    )
+    if found.absolute is not None:
+        assert torch.allclose(found.absolute.cpu(), by(screen)[:, 2:], rtol=1e-3, atol=1e-9)
+    check_motion(found.report[REPORT:].cpu(), by(motion))
+    assert int(found.report[REPORT - 1]) == int(status.known) == int(status.broken) == 0
+    for name, wanted in defined(before, seen, 7).items():
+        for ours, then, now in zip(after[name], before[name][:3], wanted, strict=True):
+            assert (ours - now)[:rows].abs().max() <= 2e-6 * now.abs().max(), name
+            assert torch.equal(ours[rows:], then[rows:]), name
+
+
+def by(leaf: Tensor) -> Tensor:
+    """The gradient of a leaf of autograd."""
+    assert leaf.grad is not None
+    return leaf.grad
 
 
 def check_motion_sums(machine: Machine, count: int) -> None:

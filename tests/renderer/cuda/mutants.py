@@ -44,12 +44,12 @@ PATTERNS = (
         "a part of a warp", r"(?<=kAllLanes = 0x)ffffffff", "7fffffff", "not for all lanes", "cuda/*.cuh"
     ),
     # bounds of threads
-    Pattern("one too many", r"if \((i|threadIdx\.x) >= (own\.count|count|kCount)\b", r"if (\1 > \2", LOST),
+    Pattern("one too many", r"if \((i|threadIdx\.x) >= (count|kCount)\b", r"if (\1 > \2", LOST),
     Pattern("no bound among others", r"i >= count \|\| ", "", LOST),
-    Pattern("a step after a fault", r"if \(status && \*status\) return;|\*status \|\|", "", VALUES),
+    Pattern("a step after a fault", r"if \(\*status\) return;|(?<=count \|\| )\*status \|\|", "", VALUES),
     Pattern("no only thread", r"if \(threadIdx\.x\) return;", "", "race"),
     # projection
-    Pattern("a float too many", r"i < floats\b", "i <= floats", LOST),
+    Pattern("a float too many", r"(i|k) < floats\b", r"\1 <= floats", LOST),
     Pattern("a block is always full", r"\(count - begin < kSpan \? count - begin : kSpan\)", "kSpan", LOST),
     Pattern("a float less in shared memory", r"\[kSpan \* kRest\]", "[kSpan * kRest - 1]", "out of bounds"),
     Pattern(
@@ -58,10 +58,18 @@ PATTERNS = (
     Pattern("rows that keep what was there", r"own\[k\] = 0;", ";", VALUES),
     Pattern("no bound in a condition", r"\bi < count && (?=tile_counts)", "", LOST),
     Pattern("no bound of the rest", r"else if \(i < count\)", "else", LOST),
-    Pattern("an output without a value", r"all\.opacity\[i\] = (?=all\.screen)", "", VALUES),
+    Pattern("no bound of a row", r"if \(i < count\) (?=take_row)", "", LOST),
+    Pattern("an output without a value", r"seen\.screen\[2 \* i\] = (?=seen\.screen)", "", VALUES),
     Pattern("a count without a value", r"(?=out\.tile_counts\[i\] = met;)", "if (met) ", VALUES),
     Pattern("rays without values", r"rays\[i\] = ray;", "", VALUES),
     Pattern("tiles of the box", r"(count \+=|mine = .+ &&) may_meet_tile\(.+\);", r"\1 true;", VALUES),
+    # a step of Adam
+    Pattern("values that should stay", r"if \(at >= p\.count\) return;", "", files=SOURCES),
+    Pattern("a moment that stays", r"p\.exp_avg\[at\] = m, |, p\.exp_avg_sq\[at\] = s", "", files=SOURCES),
+    Pattern("the unit of another row", r"(?<=p\.units\[)row", "0", files=SOURCES),
+    Pattern("the row of a block", r"begin \+ k / kRest", "begin"),
+    Pattern("another parameter", r"kBrokenGradient << k", "kBrokenGradient"),
+    Pattern("a fault that stays", r", \*broken = 0", ""),
     # motion
     Pattern("a row of motion too many", r"n < here \* kMotion", "n <= here * kMotion", LOST),
     Pattern("a thread without a part", r"if \(part < kMotionParts\) (?=parts)", "", LOST),
@@ -69,7 +77,7 @@ PATTERNS = (
     Pattern("another product", r"j \+= i;", ""),
     Pattern("no only thread for a sum", r"if \(threadIdx\.x >= kMotionSums\) return;", "", LOST),
     Pattern("a sum that goes on", r"(?<=  )total = 0;", ""),
-    Pattern("motion that keeps what was there", r"all\.motion\[kMotion \* i \+ k\] = 0;", ";", f"{UNSET}"),
+    Pattern("motion that keeps what was there", r"seen\.motion\[kMotion \* i \+ k\] = 0;", ";", f"{UNSET}"),
     # lists of tiles
     Pattern("one past its pairs", r"(tiles|rows)\[(at \+ k|to)\] =", r"\1[\2 + 1] =", LOST),
     Pattern("a pair too many", r"k < run\.count", "k <= run.count", LOST),

@@ -1,24 +1,16 @@
 """What stands between the ops and a card: messages without one, training, streams and refusals on one."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
-from panolog.renderer import ops
-from panolog.renderer.adam import BETAS, EPSILON
 from panolog.renderer.cuda import nvrtc
-from panolog.renderer.cuda.iteration import gradients
-from panolog.renderer.cuda.parts import adam_step
-from panolog.renderer.iteration import take
 from panolog.renderer.render import render
 from panolog.scene.errors import InputError
 from tests.on_device import needs_a_card
 from tests.renderer.agreement import NEAR
 from tests.renderer.hard_scenes import camera, cloud
-from tests.renderer.test_adam import moving_of, problem_of
 
 pytest.importorskip("cuda.core", reason="CUDA: no cuda-core")
 from cuda.bindings import driver
@@ -39,36 +31,6 @@ def test_a_driver_that_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "cuDriverGetVersion", lambda: (0, 12080))
     with pytest.raises(InputError, match=r"driver is of CUDA 12\.8, .* update the driver"):
         card.check_driver()
-
-
-@needs_a_card
-@pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
-def test_a_training_step_is_that_of_the_cpu(exact: bool) -> None:
-    """Render, loss, gradients, Adam."""
-    model = replace(cloud(200), exact=exact)
-    moments = {name: it.to("cuda") for name, it in model.tensors().items()}
-    one = moving_of(model)
-    two = {
-        name: it._replace(
-            parameter=moments[name], exp_avg=it.exp_avg.to("cuda"), exp_avg_sq=it.exp_avg_sq.to("cuda")
-        )
-        for name, it in one.items()
-    }
-    on_card = {"model": {name: it.parameter for name, it in two.items()}}
-    given = problem_of(model)
-    images: dict[str, Any] = {
-        name: value.to("cuda") for name, value in vars(given).items() if isinstance(value, Tensor)
-    }
-    assert given.depth is not None
-    images["depth"] = tuple(each.to("cuda") for each in given.depth)
-    take(given, one, 5, screen=False)
-    launch = ops.launcher(torch.device("cuda"))
-    assert launch is not None
-    status = torch.zeros(1, dtype=torch.int32, device="cuda")
-    found = gradients(launch, problem_of(model, **on_card, **images), status, None)
-    adam_step(launch, found.gradients, two, *BETAS, EPSILON, 5, status)
-    for name, it in one.items():
-        assert torch.allclose(it.parameter, two[name].parameter.cpu(), atol=1e-3), name
 
 
 @needs_a_card

@@ -71,7 +71,7 @@ def test_the_driver_copies_what_each_kernel_takes(
         sizes |= parameters(nvrtc.code(module, ARCH))
         nvrtc.code(module, arch)  # the stubbed driver of the other process lacks calls that NVRTC makes
     assert sizes["project_forward"] == [8] * 7 + [64] + [8] * 6
-    assert sizes["adam_step"] == [6 * 64, 4, 4, 4, 4, 8]
+    assert sizes["project_step"] == [6 * 48 + 16, 64] + [8] * 9
     command = [sys.executable, "-m", "tests.renderer.cuda.driver_calls", arch, repr(sizes)]
     done = subprocess.run(
         command, env=environment, cwd=HERE.parents[2], check=False, capture_output=True, text=True
@@ -116,9 +116,9 @@ def test_a_driver_that_refuses_is_named(environment: dict[str, str]) -> None:
     code = (
         "from panolog.renderer.cuda import card, nvrtc\n"
         "nvrtc.code = lambda module, arch: b'no code'\n"
-        "card.Kernels('sm_89').launch(1, 'adam_step', (1, 1), 256, {})"
+        "card.Kernels('sm_89').launch(1, 'loss_absolute', (1, 1), 256, {})"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, check=False, capture_output=True, text=True
     )
-    assert "RunError: loading adam failed on the GPU: CUDA_ERROR_INVALID_IMAGE" in done.stderr
+    assert "RunError: loading loss failed on the GPU: CUDA_ERROR_INVALID_IMAGE" in done.stderr

@@ -21,10 +21,10 @@ from tests.renderer.cuda.machine import (
     Machine,
     arguments,
     check_absolute_difference,
-    check_adam,
     check_against_cpu,
     check_motion_sums,
     check_photometric,
+    check_step,
     check_tiles,
     emulated,
     results,
@@ -258,6 +258,11 @@ def test_absolute_difference(share: float, machine: Machine) -> None:
     check_absolute_difference(machine, share)
 
 
-@pytest.mark.parametrize("apart", [False, True])
-def test_adam_on_the_first_values(machine: Machine, apart: bool) -> None:
-    check_adam(machine, 500, apart=apart)
+@pytest.mark.parametrize("kind", ["affine", "absolute", "exact", "among an exterior"])
+def test_a_step_is_that_of_the_gradients_of_autograd(kind: str, machine: Machine) -> None:
+    """Of some rows, in three blocks."""
+    scene, at = replace(cloud(300), exact=kind not in ("affine", "absolute")), camera()
+    if kind == "among an exterior":
+        check_step(machine, *surrounded(scene, at, torch.arange(0, 300, 2)))
+    else:
+        check_step(machine, scene, absolute=kind == "absolute")

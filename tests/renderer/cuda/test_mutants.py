@@ -9,26 +9,27 @@ import pytest
 import torch
 
 from panolog.renderer import ops
-from panolog.renderer.adam import Moving
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
+from panolog.renderer.cuda.iteration import BROKEN_GRADIENT
 from panolog.scene.gaussians import Gaussians, concatenate
 from tests.renderer.agreement import NEAR, certain
 from tests.renderer.cuda.emulation import EmulatedLaunch, KernelError
 from tests.renderer.cuda.machine import (
     arguments,
     check_absolute_difference,
-    check_adam,
     check_against_cpu,
     check_motion_sums,
     check_photometric,
+    check_step,
     check_tiles,
     emulated,
     surrounded,
 )
 from tests.renderer.cuda.mutants import PATTERNS, mutants
 from tests.renderer.hard_scenes import camera, directions, placed, scenes
+from tests.renderer.test_adam import moving_of
 
 pytestmark = pytest.mark.system
 
@@ -89,9 +90,15 @@ def one_projection(launch: EmulatedLaunch, exact: bool) -> None:
         sums = torch.full((len(gaussians), parts.SUMS["_ray" if exact else ""]), torch.inf)
         status = torch.zeros(1, dtype=torch.int32)
         counts = projected.tile_counts
-        parts.project_backward(launch, parameters, pose, 3, projected.splats, counts, sums, status)
-    assert status.item() != 0
+        frame = parts.Frame(pose, 3, projected.splats, counts, sums, None)
+        parts.project_step(launch, parameters, {}, 1, frame, status, broken := torch.zeros_like(status))
+    assert broken.item() == BROKEN_GRADIENT * 0b111111 and status.item() == 0  # all parameters have one
     check_motion_sums(emulated(launch), 4300)
+    for absolute in (False,) if exact else (False, True):
+        check_step(emulated(launch), gaussians, absolute=absolute)
+    moving, before = moving_of(gaussians), gaussians.means.clone()
+    parts.project_step(launch, parameters, moving, 1, frame, broken, status)
+    assert torch.equal(gaussians.means, before)  # no step after a fault
 
 
 def losses(launch: EmulatedLaunch) -> None:
@@ -99,17 +106,6 @@ def losses(launch: EmulatedLaunch) -> None:
     for masked, rows, exposed in ((False, False, False), (True, False, True), (False, True, True)):
         check_photometric(machine, (20, 40), masked=masked, weight=0.2, rows=rows, exposed=exposed)
     check_absolute_difference(machine, 0.5)
-
-
-def adam(launch: EmulatedLaunch) -> None:
-    for moving in (600, 500):
-        check_adam(emulated(launch), moving, apart=moving == 500)
-    parameter, gradient, exp_avg, exp_avg_sq = torch.rand(4, 600, generator=torch.Generator().manual_seed(0))
-    before = parameter.clone()
-    all_of_it = {"some": Moving(parameter, exp_avg, exp_avg_sq, 600, 0.01)}
-    broken = torch.ones(1, dtype=torch.int32)
-    parts.adam_step(launch, {"some": gradient}, all_of_it, 0.9, 0.999, 1e-15, 4, broken)
-    assert torch.equal(parameter, before)  # no step after a fault
 
 
 def iteration(launch: EmulatedLaunch) -> None:
@@ -132,9 +128,12 @@ def iteration(launch: EmulatedLaunch) -> None:
         status=status,
         report=report,
     )
-    assert torch.allclose(report, torch.tensor([1.3, 1, 7, 0], dtype=torch.float64))
+    broken = torch.tensor([8], dtype=torch.int32)
+    launch("iteration_end", (1, 1), 32, broken=broken, status=status, report=report)
+    assert torch.allclose(report, torch.tensor([1.3, 1, 7, 8], dtype=torch.float64))
+    assert (status.item(), broken.item()) == (8, 0)
     gradient, views, absolute = torch.zeros(3, 300)
-    for broken in (0, 1):  # nothing is added after a fault
+    for fault in (0, 1):  # nothing is added after a fault
         launch(
             "iteration_statistics",
             (2, 1),
@@ -147,7 +146,7 @@ def iteration(launch: EmulatedLaunch) -> None:
             camera=parts.camera_struct(torch.eye(3), torch.zeros(3), 6, 8, 0.0, False),
             angle=0,
             contribution=0,
-            status=status.fill_(broken),
+            status=status.fill_(fault),
             gradient=gradient,
             views=views,
             absolute_sum=absolute,
@@ -161,7 +160,6 @@ EXERCISES: dict[str, Callable[[EmulatedLaunch], None]] = {
     "bin": rasterize,
     "composite": rasterize,
     "loss": losses,
-    "adam": adam,
     "iteration": iteration,
 }
 

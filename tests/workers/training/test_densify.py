@@ -11,7 +11,7 @@ import torch
 from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import iteration
-from panolog.renderer.cuda.iteration import Found, Problem
+from panolog.renderer.cuda.iteration import Found, Problem, Status
 from panolog.renderer.render import render
 from panolog.scene.gaussians import logit
 from panolog.workers.training.config import DensifyConfig
@@ -239,10 +239,10 @@ def test_a_card_measures_the_same(measure: str, views: str, more: bool) -> None:
     zero = torch.zeros(0)
     layers: dict[str, Any] = {"image": zero, "mask": None, "depth": None, "rows": None}
     unused = layers | dict.fromkeys(("depth_weight", "lambda_ssim", "sh_degree", "near"), 0)
-    gradients = {"screen": screen[:, :2].contiguous(), "absolute": screen[:, 2:].contiguous()}
-    found = Found(gradients if more else {"screen": gradients["screen"]}, state, zero, zero, zero, None)
+    kinds = screen[:, :2].contiguous(), screen[:, 2:].contiguous() if more else None
+    found = Found(*kinds, state, zero, zero, zero, None)
     problem = Problem(model={"means": means}, camera=camera, **unused)
-    given = EmulatedLaunch(), found, torch.zeros(1, dtype=torch.int32), problem, ours.gradient, ours.views
+    given = EmulatedLaunch(), found, Status(torch.device("cpu")), problem, ours.gradient, ours.views
     iteration.add_statistics(
         *given,
         absolute=ours.absolute,
