@@ -50,7 +50,7 @@ PATTERNS = (
     Pattern("no only thread", r"if \(threadIdx\.x\) return;", "", "race"),
     # projection
     Pattern("a float too many", r"(i|k) < floats\b", r"\1 <= floats", LOST),
-    Pattern("a block is always full", r"\(count - begin < kSpan \? count - begin : kSpan\)", "kSpan", LOST),
+    Pattern("a block is always full", r"\(count - begin < kSpan \? count - begin : kSpan\)", "(kSpan)", LOST),
     Pattern("a float less in shared memory", r"\[kSpan \* kRest\]", "[kSpan * kRest - 1]", "out of bounds"),
     Pattern(
         "the next thread's row", r"(?<=rest \+ kRest \* )threadIdx\.x", "(threadIdx.x + 1)", f"{LOST}|{UNSET}"
