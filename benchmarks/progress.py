@@ -1,13 +1,16 @@
 """The progress that a run shows against the share of its time that is over, from its records.
 
     python -m benchmarks.progress RUN [RUN ...] [--svg FILE] [--json]
+    python -m benchmarks.progress RUN --follow
 
 Each record is replayed, and what the page, the terminal and the notifications would have shown at its time
 is compared with the time until then over that of the whole run, waits left out of both. The goal is that it
-is never more than 10 points away once a minute is over, in any run.
+is never more than 10 points away once a minute is over, in any run. Of a preparation the records say nothing:
+`--follow` looks at a run every two seconds until it ends.
 """
 
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,15 +20,19 @@ from matplotlib.axes import Axes
 from benchmarks import report
 from benchmarks.paper.curves import standalone, svg
 from benchmarks.runs import history
+from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Stored
 from panolog.orchestrator.runs.state import RunState, apply, replay
 from panolog.orchestrator.watch.views.palette import BLOCK_COLORS
+from panolog.orchestrator.watch.views.preparation import view_preparation
+from panolog.orchestrator.watch.views.summary import summarize
 from panolog.orchestrator.watch.views.timing import elapsed, progress_of
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
 
 GOAL = 0.1  # of progress, 0 to 1
 SETTLED_S = 60.0  # seconds of work after which the goal holds
+_LOOK_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -57,6 +64,21 @@ def moments(records: Sequence[Stored]) -> list[Moment]:
     return found
 
 
+def followed(root: Path) -> list[Moment]:
+    """A run from now until its end, as the page shows it. Raises InputError if it does not end well."""
+    folder, shown, state = RunFolder(root), list[tuple[float, float]](), RunState()
+    while state.outcome is None:
+        time.sleep(_LOOK_S)
+        if folder.database.exists():
+            state = replay(list(history(root)))
+            made = view_preparation(folder, state, running=True)
+            summary = summarize(state, running=True, prepared=made.over if made else None)
+            shown += [(summary.seconds, summary.progress)] if summary.seconds else []
+    if state.outcome != "done":
+        raise InputError("the run has not ended well")
+    return [Moment(seconds, seconds / shown[-1][0], progress) for seconds, progress in shown[:-1]]
+
+
 def worst(found: Sequence[Moment]) -> Moment | None:
     """The moment with the largest error once `SETTLED_S` are over; None of a shorter run."""
     return max((it for it in found if it.seconds > SETTLED_S), key=lambda it: abs(it.error), default=None)
@@ -86,6 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The program; returns its exit code."""
     parser = report.parser("progress", __doc__, quick=False)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a finished run")
+    parser.add_argument("--follow", action="store_true", help="of runs that begin now, one after another")
     parser.add_argument("--svg", type=Path, metavar="FILE", help="draw the progress of all runs here")
     options = parser.parse_args(arguments)
 
@@ -93,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         runs: dict[str, list[Moment]] = {}
         for root in options.runs:
             try:
-                runs[str(root)] = moments(list(history(root)))
+                runs[str(root)] = followed(root) if options.follow else moments(list(history(root)))
             except InputError as error:
                 raise InputError(f"{root}: {error}") from error
         if options.svg:

@@ -206,7 +206,7 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     from panolog.orchestrator.runs.state import replay
     from panolog.orchestrator.runs.storage.state import read_state
     from panolog.orchestrator.runs.store import read_milestones
-    from panolog.orchestrator.watch.views.preparation import prepared_share, view_preparation, with_step
+    from panolog.orchestrator.watch.views.preparation import view_preparation, with_step
     from panolog.orchestrator.watch.views.summary import summarize
 
     folder = RunFolder(root)
@@ -218,8 +218,8 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     if running and not state.waiting:  # a full disk takes no record of it
         state = replace(state, waiting=presence.waiting(folder.presence))
     prepared = view_preparation(folder, state, running=running)
-    state, done = with_step(state, prepared), prepared_share(prepared) if prepared else None
-    summary = summarize(state, running=running, root=run, prepared=done)
+    state = with_step(state, prepared)
+    summary = summarize(state, running=running, root=run, prepared=prepared.over if prepared else None)
     if as_json:
         head = {"run": run, "scene": scene, "width": width}
         head |= {"preparation": prepared.model_dump(mode="json")} if prepared else {}

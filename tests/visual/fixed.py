@@ -16,6 +16,8 @@ from unittest.mock import patch
 
 import matplotlib as mpl
 
+from panolog.orchestrator.runs.preparation import forecast
+
 NOW = datetime(2026, 3, 14, 15, 9, 26, tzinfo=timezone.utc)
 HOST = "atlas"
 _FONTCONFIG = """<?xml version="1.0"?>
@@ -46,9 +48,14 @@ class Clock:
 
 @contextmanager
 def fixed_machine() -> Iterator[Clock]:
-    """This process has one host name, and the time of the clock, while the context lasts."""
+    """This process has one host name, eight cores, no GPU and the clock's time while the context lasts."""
     clock = Clock()
-    with patch.object(time, "time", lambda: clock.now), patch.object(socket, "gethostname", lambda: HOST):
+    with (
+        patch.object(time, "time", lambda: clock.now),
+        patch.object(socket, "gethostname", lambda: HOST),
+        patch.object(forecast, "cores", lambda: 8),
+        patch.object(forecast, "DRIVER", Path("none")),
+    ):
         yield clock
 
 

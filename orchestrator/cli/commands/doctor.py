@@ -14,7 +14,7 @@ import torch
 
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.machines.machine import cores, memory
-from panolog.orchestrator.runs.units import gib
+from panolog.orchestrator.runs.units import duration, gib
 from panolog.renderer.unused_gpu import unused_gpu
 from panolog.scene.errors import PACKAGES, InputError, command_for, installed
 
@@ -98,7 +98,7 @@ def diagnose(
 
     new = preparing.found(source, config, Options())
     if new.settings is not None:
-        return Diagnosis([*findings, *_source(new.settings)])
+        return Diagnosis([*findings, *_source(new.settings, new.config)])
     assert new.scene is not None  # that it is one of both is what `found` checks
     preflight = session.estimate_run(new.scene, new.config, address, prices)
     return Diagnosis([*findings, *_needs(new.scene, preflight)], preflight)
@@ -142,8 +142,9 @@ def _package(module: str) -> Finding:
     return Finding(module, "missing", ok=False, fix=f"some commands need it: {command_for(module)}")
 
 
-def _source(settings: "Settings") -> Iterator[Finding]:
+def _source(settings: "Settings", config: RunConfig) -> Iterator[Finding]:
     """What a run makes its scene of. Raises OSError if a panorama is gone meanwhile."""
+    from panolog.orchestrator.runs.preparation import forecast
     from panolog.orchestrator.watch.views.preparation import STEPS
 
     kind = "frames of a video, of which a part is used" if settings.video else "panoramas"
@@ -152,8 +153,11 @@ def _source(settings: "Settings") -> Iterator[Finding]:
     of = f"{len(settings.sources)} sources: " if settings.others else ""
     yield Finding("source", f"{of}{settings.panoramas:,} {kind}, {settings.width}x{settings.width // 2}")
     yield Finding("preparation", ", ".join(STEPS[step] for step in settings.steps()))
-    later = "is known once there are poses: the run says it before it trains, and refuses what does not fit"
-    yield Finding("the job", later)
+    making, training = sum(forecast.parts_of(settings).values()), forecast.training(config, settings.width)
+    what = f"{duration(making)} to make the scene and {duration(training)} to train"
+    yield Finding("time of the job", f"roughly {what}, by what other captures took")
+    later = "known once there are poses: the run says it before it trains, and refuses what does not fit"
+    yield Finding("the job", f"its memory and disk are {later}")
 
 
 def _needs(scene: "Scene", preflight: "Preflight") -> Iterator[Finding]:

@@ -79,6 +79,7 @@ class Preparation:
     journal: Journal
     _shown: float = 0.0  # time.monotonic() of the last report of progress
     _what: str = ""  # that it was about
+    _panoramas: int = 0  # of which features are found, once that is known
     _lines: list[str] = field(default_factory=list)  # of the step
     _counts: Counts | None = None  # of the reconstruction
 
@@ -251,13 +252,16 @@ class Preparation:
             if what == self._what and now - self._shown < _SHOWN_S and done != total:
                 return
             self._shown, self._what = now, what
+            if what == "features":
+                self._panoramas = total
             self._note(step, what, max(0, done), max(0, total))
 
         return show
 
     def _note(self, step: Step, what: str, done: int = 0, total: int = 0) -> None:
         """Shows progress, here and to other processes; a disk that takes nothing does not matter."""
-        note = StepProgress(step=step, what=what, done=done, total=total, time=time.time())
+        now, count = time.time(), self._panoramas
+        note = StepProgress(step=step, what=what, done=done, total=total, time=now, panoramas=count)
         with suppress(OSError):
             notes.write_note(notes.progress_path(self.folder), note)
         self.journal.show_step(str(note))

@@ -32,6 +32,7 @@ class StepProgress(_Model):
     done: _Count = 0
     total: _Count = 0
     time: float = 0.0  # seconds since the epoch; 0 = not known
+    panoramas: _Count = 0  # of which features are found; 0 = not known yet
 
     def __str__(self) -> str:
         return f"{self.what} {self.done:,} of {self.total:,}" if self.total else self.what

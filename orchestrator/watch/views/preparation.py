@@ -6,23 +6,16 @@ from pathlib import Path
 from typing import Literal
 
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.preparation import notes
+from panolog.orchestrator.runs.info import read_info
+from panolog.orchestrator.runs.preparation import forecast, notes
 from panolog.orchestrator.runs.preparation.notes import Counts, StepProgress, StepResult
-from panolog.orchestrator.runs.preparation.settings import Step, read_settings, settings_path
+from panolog.orchestrator.runs.preparation.settings import Settings, Step, read_settings, settings_path
 from panolog.orchestrator.runs.state import RunState
 from panolog.orchestrator.watch.views.summary import Text, ViewModel
 from panolog.scene.errors import InputError
 
 STEPS = {Step.MASKS: "masks", Step.SFM: "poses and points", Step.DEPTH: "depth", Step.CHECK: "check"}
 _LINES = 12  # of a step that are shown
-_BEFORE_MASKS = ("frames", "stitching", "metadata", "sizes")  # parts of finding poses
-_PARTS: dict[str, tuple[str, ...]] = {  # of steps, in order, as they name them in their progress
-    Step.MASKS: ("static regions", "masks"),
-    Step.SFM: (
-        *_BEFORE_MASKS,
-        *("features", "visual words", "look-alikes", "matches", "poses", "scene"),
-    ),
-}
 PICTURES = {"sfm": "Poses from above", "masks": "Masks, in red"}
 
 
@@ -60,6 +53,8 @@ class PreparationView(ViewModel):
     weak_links: int | None
     contradictions: int | None
     latest: float | None  # when it last made progress, in seconds since the epoch
+    progress: float  # how much of its time is over, 0 to 1
+    over: float  # the same of the whole run, with a training of which nothing is measured yet
     steps: tuple[StepView, ...]
     pictures: tuple[PictureView, ...]
 
@@ -96,6 +91,9 @@ def view_preparation(folder: RunFolder, state: RunState, *, running: bool) -> Pr
     active = running and state.preparing and not state.prepared
     made = results.get(Step.SFM)
     counts = made.counts if made else None
+    steps = [_step(step, result, progress, active) for step, result in results.items()]
+    chosen = counts.panoramas if counts else progress.panoramas if progress else 0
+    done, whole = _progress(settings, steps, chosen or None)
     return PreparationView(
         source=settings.source,
         others=settings.others,
@@ -103,26 +101,31 @@ def view_preparation(folder: RunFolder, state: RunState, *, running: bool) -> Pr
         frames=settings.panoramas,
         **{name: getattr(counts, name, None) for name in Counts.model_fields},
         latest=progress.time or None if progress else None,
-        steps=tuple(_step(step, result, progress, active) for step, result in results.items()),
+        progress=done / whole,
+        over=done / (whole + _training(folder, settings.width)),
+        steps=tuple(steps),
         pictures=tuple(_pictures(folder)),
     )
 
 
-def prepared_share(view: PreparationView) -> float:
-    """How much of a preparation is done, 0 to 1: each step counts as much as any other, as do its parts."""
-    begun = any(step.name == Step.MASKS and step.status != "waiting" for step in view.steps)
-    return sum(_share(step, begun) for step in view.steps) / len(view.steps) if view.steps else 0.0
-
-
-def _share(step: StepView, masks: bool) -> float:
-    """How much of a step is done, 0 to 1. Args: masks, whether these have begun: amid finding poses."""
-    if step.status == "done":
-        return 1.0
-    parts, within = _PARTS.get(step.name, ()), min(1.0, step.done / step.total) if step.total else 0.0
-    if not parts:
-        return within
-    done = parts.index(step.what) + within if step.what in parts else 0.0
-    return max(done, len(_BEFORE_MASKS) if masks and step.name == Step.SFM else 0) / len(parts)
+def _progress(settings: Settings, steps: Sequence[StepView], chosen: int | None) -> tuple[float, float]:
+    """Seconds that are over as forecast, and those of all."""
+    parts = forecast.parts_of(settings, chosen)
+    began_masks = any(step.name == Step.MASKS and step.status != "waiting" for step in steps)
+    done = 0.0
+    for step in steps:
+        own = {part: took for (of, part), took in parts.items() if of == step.name}
+        names = list(own)
+        at = names.index(step.what) if step.what in names else 0
+        if step.status == "done":
+            at = len(names)
+        elif step.name == Step.SFM and began_masks:
+            at = max(at, len(forecast.BEFORE_MASKS))
+        done += sum(own[name] for name in names[:at])
+        if at < len(names) and step.what == names[at] and step.total:
+            within = forecast.REPEATED.get(step.what, min(1.0, step.done / step.total))
+            done += own[step.what] * within
+    return done, sum(parts.values())
 
 
 def with_step(state: RunState, view: PreparationView | None) -> RunState:
@@ -134,6 +137,14 @@ def with_step(state: RunState, view: PreparationView | None) -> RunState:
     return replace(
         state, step=str(StepProgress(step=Step(step.name), what=step.what, done=step.done, total=step.total))
     )
+
+
+def _training(folder: RunFolder, width: int) -> float:
+    """Seconds of what follows the preparation, as forecast; none if run.json cannot be read."""
+    try:
+        return forecast.training(read_info(folder).config, width)
+    except InputError:
+        return 0.0
 
 
 def _step(step: Step, result: StepResult | None, progress: StepProgress | None, active: bool) -> StepView:

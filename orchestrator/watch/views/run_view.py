@@ -14,7 +14,7 @@ from panolog.orchestrator.runs.folder import flat
 from panolog.orchestrator.runs.machines.gpus import GpuUsage
 from panolog.orchestrator.runs.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.watch.views.history import History, Span
-from panolog.orchestrator.watch.views.preparation import PreparationView, prepared_share
+from panolog.orchestrator.watch.views.preparation import PreparationView
 from panolog.orchestrator.watch.views.summary import (
     STAGES,
     LeavingView,
@@ -126,7 +126,7 @@ def view_run(
     """
     state, now = history.state, time.time()
     state = replace(state, waiting=state.waiting or waiting)
-    prepared = prepared_share(preparation) if preparation else None
+    prepared = preparation.over if preparation else None
     summary = summarize(state, running=running, now=now, root=root, prepared=prepared)
     stages = _stages(history, info, running=running, now=now)
     return RunView(
@@ -179,10 +179,10 @@ def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: fl
 
 
 def _with_share(stage: StageView, preparation: PreparationView | None) -> StageView:
-    """The stage; of the preparation how many of its steps are done."""
+    """The stage; of the preparation how much of its time is over."""
     if stage.name != Stage.PREPARE or preparation is None or stage.status == Status.DONE:
         return stage
-    return stage.model_copy(update={"progress": prepared_share(preparation)})
+    return stage.model_copy(update={"progress": preparation.progress})
 
 
 def _stage(

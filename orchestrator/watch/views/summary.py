@@ -199,7 +199,7 @@ def summarize(
         resume=command_line("resume", root) if idle and root is not None else None,
         progress=progress,
         seconds=elapsed(state, end),
-        eta=run_eta(state, end) if running else None,
+        eta=run_eta(state, end, prepared) if running else None,
         paused=state.held_blocks(),
         training_gaussians=_training(state),
         kept_gaussians=_kept(state),

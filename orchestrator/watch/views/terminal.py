@@ -41,7 +41,7 @@ from panolog.orchestrator.runs.records import (
 )
 from panolog.orchestrator.runs.state import OnChange, RunState, Status
 from panolog.orchestrator.runs.units import duration, gib
-from panolog.orchestrator.watch.views.preparation import prepared_share, view_preparation
+from panolog.orchestrator.watch.views.preparation import view_preparation
 from panolog.orchestrator.watch.views.summary import (
     METRICS,
     STAGES,
@@ -227,7 +227,7 @@ def progress(console: Console, root: Path) -> Iterator[OnChange]:
     def render() -> RenderableType:  # called from a thread of the display
         running = latest.outcome is None
         made = view_preparation(RunFolder(root), latest, running=running)
-        summary = summarize(latest, running=running, prepared=prepared_share(made) if made else None)
+        summary = summarize(latest, running=running, prepared=made.over if made else None)
         return table(summary, root=root, wide=console.width >= WIDE)
 
     def show(state: RunState, news: Sequence[Stored]) -> None:

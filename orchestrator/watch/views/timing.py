@@ -8,7 +8,7 @@ from panolog.workers.tasks import COARSE, Stage, TaskId
 
 _WELL = 0.25  # of its iterations after which the mean rate of a task alone says how long it takes
 _SLOWEST = 4.0  # times the estimate: beyond, it was not of this machine
-_PREPARED = 0.1  # share of a run that making its scene is taken for: what follows is not known before
+_FORECAST = 0.02  # of a run's time from which on what is over says how long the rest takes
 
 
 def tasks_of(state: RunState) -> list[TaskState]:
@@ -60,13 +60,18 @@ def seconds_of(task: TaskState, now: float) -> float | None:
     return task.spent + (task.seconds or 0.0) or None
 
 
-def run_eta(state: RunState, now: float) -> float | None:
+def run_eta(state: RunState, now: float, prepared: float | None = None) -> float | None:
     """Seconds until a run is done: its tasks at their present rates, what is to come as estimated before.
 
-    Args: now, epoch seconds. None if the run has ended or waits, or if a stage that trains has neither a rate
-    nor an estimate.
+    Args: as `progress_of`. None if the run has ended or waits, or if a stage that trains has neither a rate
+    nor an estimate, nor a preparation that has gone on for a while.
     """
-    return None if state.outcome is not None or state.waiting else _time_left(state, now)
+    if state.outcome is not None or state.waiting:
+        return None
+    left, spent = _time_left(state, now), elapsed(state, now)
+    if left is None and spent is not None and prepared is not None and prepared >= _FORECAST:
+        return spent * (1 - prepared) / prepared
+    return left
 
 
 def elapsed(state: RunState, now: float) -> float | None:
@@ -77,18 +82,17 @@ def elapsed(state: RunState, now: float) -> float | None:
 def progress_of(state: RunState, now: float, prepared: float | None = None) -> float:
     """How much of a run's time is over, 0 to 1: elapsed ÷ (elapsed + left).
 
-    It stands still while the run waits. Before the preflight, which estimates what is left, it is 0, with a
-    preparation at most `_PREPARED`.
+    It stands still while the run waits. Before the preflight, which estimates what is left, it is what the
+    preparation says, or 0.
 
-    Args: now, epoch seconds; prepared, how much of the preparation is done, None of a run that was given a
-    scene.
+    Args: now, epoch seconds; prepared, `PreparationView.over`, None of a run that was given a scene.
     """
     if state.outcome == "done":
         return 1.0
     end = state.ended or (state.latest if state.waiting and state.latest is not None else now)
     spent, left = elapsed(state, end), _time_left(state, end)
     if spent is None or left is None:
-        return _PREPARED * (prepared or 0.0)
+        return prepared or 0.0
     return spent / (spent + left) if left > 0 else min(spent, 1.0)
 
 

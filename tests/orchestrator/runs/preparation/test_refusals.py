@@ -215,6 +215,7 @@ def test_doctor_says_of_panoramas_what_it_can(raw: Path) -> None:
     findings = {it["what"]: it["value"] for it in shown("doctor", raw)["findings"]}
     assert findings["source"] == "9 panoramas, 64x32"
     assert findings["preparation"] == "masks, poses and points, check"
+    assert re.match(r"roughly \d:\d\d to make the scene and [\d:]+ to train,", findings["time of the job"])
     assert "the panoramas have 64 pixels" in one_line(call("doctor", raw, "--width", 128))
 
 

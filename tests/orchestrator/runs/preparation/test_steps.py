@@ -138,7 +138,9 @@ def test_status_shows_how_far_the_preparation_is_and_no_other_process_joins(
     sfm.at = look
     start(raw, root)
     ((text, status),) = seen
-    assert text.startswith("preparing: poses 0 of 10 · 6%")
+    over = status["preparation"]["over"]
+    assert text.startswith(f"preparing: poses 0 of 10 · {over:.0%}")
+    assert 0 < over == status["progress"] < status["preparation"]["progress"] < 1
     assert "masks: " in text
     assert (status["status"], status["label"], status["stage"]) == ("running", "preparing", "prepare")
     (masks, step, check) = status["preparation"]["steps"]

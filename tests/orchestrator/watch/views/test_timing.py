@@ -240,10 +240,14 @@ def test_progress_is_the_share_of_the_time_that_is_over(records: list[Timed], no
     assert summarize(state([*records, (now, RunEnded(Outcome.DONE))]), running=False).progress == 1.0
 
 
-def test_a_run_without_an_estimate_has_no_progress_but_that_of_its_preparation() -> None:
+def test_a_run_without_an_estimate_has_no_progress_but_what_its_preparation_says() -> None:
     early = STAGE_ONE[:3]
-    assert summarize(state(early), running=True, now=9).progress == 0
-    assert 0 < summarize(state(early), running=True, now=9, prepared=0.5).progress < 0.1
+    none, little, more = (
+        summarize(state(early), running=True, now=9, prepared=over) for over in (None, 0.001, 0.25)
+    )
+    assert (none.progress, none.eta) == (0, None)
+    assert (little.progress, little.eta) == (0.001, None)  # too early to say
+    assert more.seconds is not None and (more.progress, more.eta) == (0.25, 3 * more.seconds)
 
 
 def test_the_more_of_a_task_is_done_the_more_its_own_pace_counts() -> None:

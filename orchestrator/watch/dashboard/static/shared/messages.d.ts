@@ -303,6 +303,8 @@ export interface PreparationView {
   weak_links: number | null;
   contradictions: number | null;
   latest: number | null;
+  progress: number;
+  over: number;
   steps: Array<StepView>;
   pictures: Array<PictureView>;
 }
