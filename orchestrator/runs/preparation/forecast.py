@@ -21,9 +21,9 @@ PARTS: dict[Step, tuple[str, ...]] = {  # of steps, in order, as they name them 
     Step.DEPTH: ("depth",),
     Step.CHECK: ("check",),
 }
-_OF_FRAME, _KEPT = 0.03, 30  # of a video; of so many one becomes a panorama
+_OF_FRAME, _KEPT = 0.06, 30  # of a video; of so many one becomes a panorama
 _OF_PANORAMA = {"visual words": 0.1, "poses": 0.6, "scene": 0.03, "check": 0.15}
-_OF_MEGAPIXEL = {"static regions": 0.05, "masks": 0.05, "features": 1.4}
+_OF_MEGAPIXEL = {"static regions": 0.05, "masks": 0.05, "features": 1.4, "frames": 0.005}
 _NETWORK = 5.0  # for a panorama
 _PAIR, _PAIRS = 0.065, 7  # to match two panoramas; so many pairs for each
 _SERIAL = ("poses", "scene")  # parts of one process
@@ -46,7 +46,7 @@ def parts_of(settings: Settings, chosen: int | None = None) -> dict[tuple[Step, 
         for step in settings.steps()
         for part in PARTS[step]
     }
-    found[Step.SFM, "frames"] = frames * _OF_FRAME
+    found[Step.SFM, "frames"] = frames * (_OF_FRAME + size * _OF_MEGAPIXEL["frames"])
     found[Step.SFM, "matches"] = _PAIR * min(_PAIRS * count, count * (count - 1) // 2)
     if settings.mask_model:
         found[Step.MASKS, "masks"] += count * _NETWORK
