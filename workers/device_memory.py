@@ -54,7 +54,7 @@ def _sorting(held: int, view: int) -> _Moment:
 def _iteration(
     held: int, view: int, kept: int, gradients: int, room: float = 1.0
 ) -> tuple[_Moment, _Moment, _Moment]:
-    """Of a pass forward and backward: its binning, its loss, its end.
+    """The largest moments of a pass forward and backward: its binning, its loss and its end.
 
     Args: `kept` of a Gaussian after the binning besides its splat; `gradients` of its parameters at the end;
     `room` for pairs, over how many there are.

@@ -303,7 +303,7 @@ class Frame(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """Of which projection the sums are, as kernels have it in their names."""
+        """The part of a kernel's name that says for which projection its sums are."""
         (kind,) = (kind for kind, floats in SUMS.items() if floats == self.sums.shape[1])
         return kind
 

@@ -21,9 +21,10 @@ PARTS: dict[Step, tuple[str, ...]] = {  # of steps, in order, as they name them 
     Step.DEPTH: ("depth",),
     Step.CHECK: ("check",),
 }
-_OF_FRAME, _KEPT = 0.06, 30  # of a video; of so many one becomes a panorama
+_FRAME, _FRAME_MEGAPIXEL = 0.06, 0.005  # of a video
+_KEPT = 30  # frames, of which one becomes a panorama
 _OF_PANORAMA = {"visual words": 0.1, "poses": 0.6, "scene": 0.03, "check": 0.15}
-_OF_MEGAPIXEL = {"static regions": 0.05, "masks": 0.05, "features": 1.4, "frames": 0.005}
+_OF_MEGAPIXEL = {"static regions": 0.05, "masks": 0.05, "features": 1.4}
 _NETWORK = 5.0  # for a panorama
 _PAIR, _PAIRS = 0.065, 7  # to match two panoramas; so many pairs for each
 _SERIAL = ("poses", "scene")  # parts of one process
@@ -46,13 +47,14 @@ def parts_of(settings: Settings, chosen: int | None = None) -> dict[tuple[Step, 
         for step in settings.steps()
         for part in PARTS[step]
     }
-    found[Step.SFM, "frames"] = frames * (_OF_FRAME + size * _OF_MEGAPIXEL["frames"])
+    found[Step.SFM, "frames"] = frames * (_FRAME + size * _FRAME_MEGAPIXEL)
     found[Step.SFM, "matches"] = _PAIR * min(_PAIRS * count, count * (count - 1) // 2)
     if settings.mask_model:
         found[Step.MASKS, "masks"] += count * _NETWORK
     if settings.depth_model:
         found[Step.DEPTH, "depth"] = count * _NETWORK
-    return {key: took / (1 if key[1] in _SERIAL else cores()) for key, took in found.items()}
+    together = cores()
+    return {key: took / (1 if key[1] in _SERIAL else together) for key, took in found.items()}
 
 
 def training(config: RunConfig, width: int) -> float:

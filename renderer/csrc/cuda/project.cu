@@ -28,10 +28,16 @@ __device__ __forceinline__ Parameters<float> parameters(const Model& m, int64_t 
   return {m.means + 3 * i, m.quats + 4 * i, m.scales + 3 * i, m.opacities[i], m.sh0 + 3 * i, shN};
 }
 
-// Copies the rows of this block's Gaussians between device and shared memory, all threads together.
-__device__ __forceinline__ void copy_rest(const float* from, float* to, int64_t begin, int64_t count) {
-  const int64_t floats = (count - begin < kSpan ? count - begin : kSpan) * kRest;
-  for (int64_t i = threadIdx.x; i < floats; i += kSpan) to[i] = from[i];
+// visit(k) for each float of the rows of this block's Gaussians, all threads together.
+template <class Visit>
+__device__ __forceinline__ void each_of_rest(int64_t begin, int64_t count, Visit visit) {
+  const int floats = int(count - begin < kSpan ? count - begin : kSpan) * kRest;
+  for (int k = int(threadIdx.x); k < floats; k += kSpan) visit(k);
+}
+
+// Copies these rows from device to shared memory.
+__device__ __forceinline__ void load_rest(const float* shN, float* rest, int64_t begin, int64_t count) {
+  each_of_rest(begin, count, [&](int k) { rest[k] = shN[begin * kRest + k]; });
 }
 
 __device__ __forceinline__ int tiles_met(const Splat& s, const Camera& camera) {
@@ -114,7 +120,7 @@ __device__ __forceinline__ void take_gradients(const Model& model, const float* 
   const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
   const int rest_count = 3 * (int(sh_count) - 1);
   float* const own = rest + kRest * threadIdx.x;
-  if (sh_count > 1) copy_rest(shN + begin * kRest, rest, begin, count);
+  if (sh_count > 1) load_rest(shN, rest, begin, count);
   __syncthreads();
   const bool drawn = i < count && tile_counts[i] > 0;
   Row g = {};
@@ -138,8 +144,7 @@ __device__ __forceinline__ void take_gradients(const Model& model, const float* 
   if (i < count) take_row(take, i, g);
   for (int k = drawn ? rest_count : 0; k < kRest; ++k) own[k] = 0;
   __syncthreads();
-  const int floats = int(count - begin < kSpan ? count - begin : kSpan) * kRest;
-  for (int k = int(threadIdx.x); k < floats; k += kSpan) take.one(kShN, begin * kRest + k, begin + k / kRest, rest[k]);
+  each_of_rest(begin, count, [&](int k) { take.one(kShN, begin * kRest + k, begin + k / kRest, rest[k]); });
 }
 
 // Gradients as an op returns them.
@@ -187,7 +192,7 @@ extern "C" __global__ void __launch_bounds__(128)
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];
   const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
-  if (sh_count > 1) copy_rest(shN + begin * kRest, rest, begin, count);
+  if (sh_count > 1) load_rest(shN, rest, begin, count);
   __syncthreads();
   if (i >= count) return;
   const Model model = {means, quats, scales, opacities, sh0};
@@ -206,7 +211,7 @@ extern "C" __global__ void __launch_bounds__(128)
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];
   const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
-  if (sh_count > 1) copy_rest(shN + begin * kRest, rest, begin, count);
+  if (sh_count > 1) load_rest(shN, rest, begin, count);
   __syncthreads();
   if (i >= count) return;
   const Model model = {means, quats, scales, opacities, sh0};

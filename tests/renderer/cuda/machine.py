@@ -163,7 +163,7 @@ def check_step(
     before = moving_of(scene, rows, **units)
     mine = {name: Moving(*(machine.moved(part) for part in it)) for name, it in clones(before).items()}
     there = {name: machine.moved(value) for name, value in vars(problem).items() if name != "camera"}
-    there |= {"model": {name: it.parameter for name, it in mine.items()}, "rows": None}
+    there["model"] = {name: it.parameter for name, it in mine.items()}
     status = Status(torch.device(machine.device))
     with machine.watching():
         given = Problem(**there, camera=problem.camera)

@@ -260,7 +260,7 @@ def test_absolute_difference(share: float, machine: Machine) -> None:
 
 @pytest.mark.parametrize("kind", ["affine", "absolute", "exact", "among an exterior"])
 def test_a_step_is_that_of_the_gradients_of_autograd(kind: str, machine: Machine) -> None:
-    """Of some rows, in three blocks."""
+    """The model has three blocks of Gaussians, of which a part moves."""
     scene, at = replace(cloud(300), exact=kind not in ("affine", "absolute")), camera()
     if kind == "among an exterior":
         check_step(machine, *surrounded(scene, at, torch.arange(0, 300, 2)))
