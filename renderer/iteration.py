@@ -1,7 +1,7 @@
 """One training iteration on the CPU, without autograd: that of a card is in `renderer.cuda.iteration`.
 
 The gradients of the parameters exist for a thousand Gaussians at a time: the backward pass moves these
-before it goes on, while all is in a cache. A step of its own would write and read 236 bytes of each Gaussian.
+before the next thousand, while all is in a cache. A step of its own would write and read 236 bytes of each.
 """
 
 import math

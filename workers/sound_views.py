@@ -35,7 +35,7 @@ def open_cache(
 class SoundViews:
     """The views of a task; a panorama that cannot be decoded is left out from its first use on.
 
-    A file that cannot be read is no such panorama: that may pass, and a task that went on without it would
+    A file that cannot be read is no such panorama: that may pass, and a task that continued without it would
     not be repeatable.
     """
 

@@ -21,7 +21,7 @@ class Lasting:
     """A text stream that drops what cannot be written.
 
     Its reader may have ended (`panolog run … 2>&1 | tee`, Ctrl-C), its terminal may be closed, the disk under
-    it may be full: a run goes on, and saves its checkpoints when it is stopped for the same reason.
+    it may be full: a run continues, and saves its checkpoints when it is stopped for the same reason.
     """
 
     def __init__(self, stream: TextIO) -> None:

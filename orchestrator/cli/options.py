@@ -72,7 +72,7 @@ PricesOption = Annotated[
 ]
 AcceptOption = Annotated[
     bool,
-    flag("Go on with other settings in run.json than those that the run was begun with.", "--accept-changes"),
+    flag("Continue with the settings of a run.json that was edited since.", "--accept-changes"),
 ]
 AtEndOption = Annotated[
     str | None,

@@ -193,7 +193,7 @@ class _JsonText:
             except (ValueError, RecursionError) as error:
                 raise _no_json(self._path, error) from error
             else:
-                if end <= len(self._text) - _LITERAL or self._ended:  # else a number may go on
+                if end <= len(self._text) - _LITERAL or self._ended:  # else a number may continue
                     break
             wanted = max(2 * (len(self._text) - self._at), 2 * wanted)
         if keep:

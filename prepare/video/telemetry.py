@@ -65,7 +65,7 @@ class Series:
 class Telemetry:
     """Samples of a video's sensors."""
 
-    places: Series  # degrees north; degrees east, which go on beyond 180; metres, or NaN
+    places: Series  # degrees north; degrees east, which continue beyond 180; metres, or NaN
     ups: Series  # x, y, z against gravity, of any length, in the picture's axes: right, down, forward
     window: float  # seconds before and after over which `ups` are averaged
     shutter: Series  # seconds of exposure
@@ -227,7 +227,7 @@ class _Collected:
 
 
 def _on_earth(times: Array, places: Array) -> Series:
-    """Places (N, 3) without what cannot be; degrees east go on beyond 180."""
+    """Places (N, 3) without what cannot be; degrees east continue beyond 180."""
     on_earth = (np.abs(places[:, :2]) <= (90, 180)).all(axis=1)
     found = Series(times, places).only(np.flatnonzero(on_earth & places[:, :2].any(axis=1)))
     north, east, height = found.values.T

@@ -20,7 +20,7 @@ CODE = (".py", ".js", ".css", ".html", ".cpp", ".h", ".cu", ".cuh")
 TEXT = (*CODE, ".md", ".pyi", ".j2", ".toml", ".yaml", ".yml", ".sh", ".txt", ".env", ".ts")
 # Words, then phrases that users read before a word of the trade replaced them.
 DIALECT = re.compile(
-    r"\b(told|tells|asks|asked|hears|nobody|whoever|somebody|beside|mend)\b"
+    r"\b(told|tells|asks|asked|hears|nobody|whoever|somebody|beside|mend|(?:go|goes|went|going) on)\b"
     r"|\b(from afar|limits, honestly|last sign|a place is free|fewer will do|judge this|gradients added)\b"
     r"|\b((?:above|below|from) the truth|its truth|above truth|there already; give)\b"
     r"|(--most\b)",  # an option's former name

@@ -146,7 +146,7 @@ def _steps(face: Plane, strip: Strip, residual: Array, side: float) -> tuple[flo
     """The steps of the residual (S, 3) at a face, each weighed by its area, and the sum of weights.
 
     The face is cut into square patches. A step is the difference of the mean residuals on both sides of one:
-    what the photograph does there, and errors that go on across the face, cancel.
+    what the photograph does there, and errors that continue across the face, cancel.
     """
     along = [axis for axis in range(3) if axis != face.axis]
     cells = np.floor(strip.points[:, along] / side).astype(np.int64)

@@ -69,7 +69,7 @@ class Room:
 class Grown(NamedTuple):
     """What has happened to the rows of a model."""
 
-    statistics: Statistics  # those that go on: the same where no row has changed
+    statistics: Statistics  # those that continue: the same where no row has changed
     invalid: int  # Gaussians that were not finite and are removed
 
 

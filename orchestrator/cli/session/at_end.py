@@ -16,7 +16,7 @@ from panolog.orchestrator.runs.records import Outcome
 from panolog.orchestrator.runs.storage.state import read_state
 from panolog.scene.errors import InputError, in_one_line
 
-_LONGEST_S = 600.0  # for the command; then it goes on by itself
+_LONGEST_S = 600.0  # for the command; then it continues by itself
 _REFUSED, _INTERRUPTED = 2, 130  # exit codes of panolog
 Say = Callable[[str], None]
 
@@ -70,7 +70,7 @@ def _end(wanted: str, folder: RunFolder, code: int, why: str, say: Say) -> None:
     except OSError as error:
         say(f"--at-end cannot be carried out: {error.strerror}")
     except TimeoutExpired:
-        say(f"--at-end has not ended after {_LONGEST_S:.0f} s; it goes on by itself")
+        say(f"--at-end has not ended after {_LONGEST_S:.0f} s; it continues by itself")
     else:
         if failed:
             say(f"--at-end has failed (code {failed}): what it was to end may still be there, and paid")

@@ -131,8 +131,8 @@ def resume(
 ) -> RunState:
     """Resumes a run, to the end; does nothing if it is done, or at a limit that stays as it is.
 
-    Args: as `start`; after, why the supervisor resumes it, which becomes a notice; accept_changes, go on with
-    other settings in run.json than those that the run was begun with.
+    Args: as `start`; after, why the supervisor resumes it, which becomes a notice; accept_changes, continue
+    with other settings in run.json than those that the run was begun with.
     Raises InputError if `root` is no run, its scene or its settings have changed, its device is missing or
     another driver is at work on it; RunError if the run failed.
     """

@@ -74,7 +74,7 @@ class Machines:
 
     @property
     def idle(self) -> float | None:
-        """Seconds after which a machine goes on which nothing runs; None if all stay."""
+        """Seconds after which a machine without a task goes; None if all stay."""
         return IDLE_S if self._pool.growth().groups else None
 
     @property

@@ -56,7 +56,7 @@ def _pictures(folder: RunFolder, panoramas: list[Panorama]) -> Iterator[str]:
     for panorama in panoramas:
         try:
             photograph = decode_panorama(panorama.image)
-        except SceneError:  # it may have been damaged since: the run goes on without it, and so does this
+        except SceneError:  # it may have been damaged since: the run continues without it, and so does this
             continue
         path = folder.mover_picture(panorama.name)
         folder.make(path.parent)

@@ -1,6 +1,6 @@
 """The settled part of a run's curves, as run.db has them in the end: each iteration once.
 
-After a failure a task goes on from its latest checkpoint, and iterations that follow it come again. A row
+After a failure a task continues from its latest checkpoint, and iterations that follow it come again. A row
 counts only if no row of an earlier iteration is newer; up to a checkpoint no newer rows will come.
 """
 

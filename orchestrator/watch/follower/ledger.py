@@ -1,4 +1,4 @@
-"""RUN/follower/NAME.json: what of a run a target or a sink has, so that the next follower goes on there.
+"""RUN/follower/NAME.json: what of a run a target or a sink has, so that the next follower continues there.
 
 A ledger of another run, as of one whose folder was used before, counts as none.
 """

@@ -1,4 +1,4 @@
-"""Exposures before training: from points that panoramas share, from EXIF, and from how a walk goes on."""
+"""Exposures before training: from points that panoramas share, from EXIF, and from how a walk continues."""
 
 from collections.abc import Sequence
 from dataclasses import replace

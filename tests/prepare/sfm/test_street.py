@@ -44,7 +44,7 @@ class Made:
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """Walls of random patches, and the operator; each job goes on where the last one was stopped."""
+    """Walls of random patches, and the operator; each job continues where the last one was stopped."""
     source, jobs = tmp_path_factory.mktemp("street"), tmp_path_factory.mktemp("jobs")
     shots = walk([0.9] * COUNT)
     (source / "images").mkdir()

@@ -76,7 +76,7 @@ PATTERNS = (
     Pattern("the rows of another part", r"row = part;", "row = 0;"),
     Pattern("another product", r"j \+= i;", ""),
     Pattern("no only thread for a sum", r"if \(threadIdx\.x >= kMotionSums\) return;", "", LOST),
-    Pattern("a sum that goes on", r"(?<=  )total = 0;", ""),
+    Pattern("a sum that continues", r"(?<=  )total = 0;", ""),
     Pattern("motion that keeps what was there", r"seen\.motion\[kMotion \* i \+ k\] = 0;", ";", f"{UNSET}"),
     # lists of tiles
     Pattern("one past its pairs", r"(tiles|rows)\[(at \+ k|to)\] =", r"\1[\2 + 1] =", LOST),

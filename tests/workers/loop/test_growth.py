@@ -75,7 +75,7 @@ def test_clones_have_no_moments_and_others_keep_theirs() -> None:
         assert torch.equal(moments(leaves, optimizer, name)[:60], kept[name][:60])
         assert not moments(leaves, optimizer, name)[60:-SKY].any()
         assert torch.equal(moments(leaves, optimizer, name)[-SKY:], kept[name][-SKY:])
-    step(leaves, optimizer)  # and the optimizer goes on
+    step(leaves, optimizer)  # and the optimizer continues
     assert (optimizer.state[leaves["means"]]["step"]) == 3
 
 

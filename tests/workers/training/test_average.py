@@ -73,7 +73,7 @@ def test_a_resume_does_not_change_what_it_started_from(scene: Scene) -> None:
 
 
 def test_only_models_with_the_same_rows_count(scene: Scene) -> None:
-    """Densification goes on until 20 of 24 iterations, resets until 18."""
+    """Densification continues until 20 of 24 iterations, resets until 18."""
     densify = {"until": 26_000, "max_gaussians": 0}
     long, short = (
         trained(coarse_of(scene, config(part, densify=densify))) for part in (0.99, 4 / ITERATIONS)

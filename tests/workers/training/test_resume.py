@@ -1,4 +1,4 @@
-"""A training that goes on from a checkpoint ends with the bytes of an undisturbed one, for any threads."""
+"""A training that continues from a checkpoint ends with the bytes of an undisturbed one, for any threads."""
 
 import pickle
 from collections.abc import Iterator

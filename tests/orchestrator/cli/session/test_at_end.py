@@ -122,7 +122,7 @@ def test_a_run_that_is_not_all_in_its_store_keeps_its_machine(tmp_path: Path, en
 
 
 def test_a_command_that_fails_or_hangs_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, file = begun(tmp_path / "run", *DONE), tmp_path / "goes on"
+    folder, file = begun(tmp_path / "run", *DONE), tmp_path / "continues"
     result = call("resume", folder.root, "--at-end", "exit 3")
     assert (result.exit_code, "has failed (code 3)" in result.stderr) == (0, True)
     started: list[subprocess.Popen[bytes]] = []
@@ -135,7 +135,7 @@ def test_a_command_that_fails_or_hangs_is_said(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(at_end, "_LONGEST_S", 0.05)
     waits = f"while [ ! -e '{file}' ]; do sleep 0.02; done; exit 7"
     result = call("resume", folder.root, "--at-end", waits)
-    assert "it goes on by itself" in result.stderr
+    assert "it continues by itself" in result.stderr
     file.touch()
     assert started[0].wait(timeout=300) == 7
 

@@ -157,7 +157,7 @@ def test_a_host_loses_its_network_and_gets_it_back(cluster: Cluster, tmp_path: P
 
 
 def check_the_cut(history: list[Stored]) -> None:
-    """One block was lost with its host and went on from its checkpoint; all work was done by the workers."""
+    """One block was lost with its host and continued from its checkpoint; the workers did all work."""
     (failed,) = [stored.record for stored in history if isinstance(stored.record, TaskFailed)]
     assert failed.kind == Failure.LOST
     starts = [stored.record for stored in history if isinstance(stored.record, TaskStarted)]
