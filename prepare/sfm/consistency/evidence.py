@@ -56,6 +56,11 @@ class Evidence:
     rays: tuple[Array, ...]  # of each panorama (N, 3) directions of its features in camera axes
     pairs: tuple[Pair, ...]
 
+    def directions(self, pair: Pair) -> tuple[Array, Array]:
+        """(M, 3) directions of the matches of a pair, in camera axes of the first panorama and the second."""
+        one, other = (self.rays[row][pair.matches[:, side]] for side, row in enumerate(pair.between))
+        return one, other
+
     def among(self, rows: Collection[int]) -> "Evidence":
         """The pairs of these panoramas alone."""
         inside = set(rows)
@@ -106,7 +111,8 @@ def with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:
             coverage=min(
                 _share(known[row], np.bincount(cells[row][pair.telling[:, side]], minlength=_CELLS))
                 for side, row in enumerate(pair.between)
-            ),
+            )
+            * (len(pair.telling) >= FEWEST),
             share=len(pair.telling) / max(1, min(int(known[row].sum()) for row in pair.between)),
         )
         for pair in pairs

@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from panolog.prepare.sfm.consistency.distant import STILL, angles, common_rotation, direction_of_rest
 from panolog.prepare.sfm.consistency.evidence import FEWEST, LIKE_OTHERS, Evidence, Pair, with_coverage
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.projection import project_to_fractions
@@ -17,8 +18,6 @@ _TURN = np.deg2rad(3.0)  # between a rotation and those of the two parts of a wa
 _RIVAL = 0.3, 0.6  # of the matches and the coverage of a geometry: another with both may be the true one
 _CLEAR = 0.5  # between cosines of two geometries' continuity: less decides nothing
 _ASIDE = np.deg2rad(20.0)  # of a motion from the plane of the motions of the two parts
-_REFITS = 3  # of a rotation
-_STILL = 2.0  # errors of a feature: what a rotation explains to that says nothing of where the camera moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +63,23 @@ class Geometries:
         """The motion from the first panorama of a pair to the second; None if its matches give none."""
         known, motion = self._motions.get(pair.between, (None, None))
         if known is None or known.matches is not pair.matches:
-            motion = self._estimate(pair.between, pair.matches.astype(np.uint32))[1]
+            motion = self._estimate(pair)[1]
             self._motions[pair.between] = pair, motion
         return motion
 
     def marked(self, evidence: Evidence) -> Evidence:
-        """The pairs with which of their matches have moved, and the coverage of these."""
-        pairs = [self.mark(pair, self.motion(pair)) for pair in evidence.pairs]
+        """The pairs with which of their matches have moved, and the coverage of these.
+
+        Where most have not, such as clouds, any motion fits most of them, and what fits the true one was left
+        out: the geometry is then found again, in all matches.
+        """
+        pairs = []
+        for pair in evidence.pairs:
+            marked = self.mark(pair, self.motion(pair))
+            if 2 * len(marked.telling) < len(marked.matches):
+                whole = self._fitted(Pair(pair.between, self._matches(pair)))
+                marked = max(marked, whole, key=lambda it: len(it.telling))
+            pairs.append(marked)
         return Evidence(evidence.rays, tuple(with_coverage(evidence.rays, pairs)))
 
     def mark(self, pair: Pair, motion: Motion | None) -> Pair:
@@ -80,28 +89,49 @@ class Geometries:
     def second(self, pair: Pair, least: float) -> Pair | None:
         """The pair with those of its other matches that fit one geometry; None with fewer than `least`."""
         known = {tuple(match) for match in pair.matches.tolist()}
-        one, other = (self._ids[row] for row in pair.between)
-        with pycolmap.Database.open(self._database) as database:
-            every = np.asarray(database.read_matches(one, other), np.int64).reshape(-1, 2).tolist()
-        rest = np.array([match for match in every if tuple(match) not in known], np.uint32)
+        rest = np.array([it for it in self._matches(pair).tolist() if tuple(it) not in known], np.int64)
         if len(rest) < max(FEWEST, least):
             return None
-        matches, motion = self._estimate(pair.between, rest)
-        found = self.mark(Pair(pair.between, matches), motion)
-        return found if len(matches) >= max(FEWEST, least) else None
+        found = self._fitted(Pair(pair.between, rest))
+        return found if len(found.matches) >= max(FEWEST, least) else None
 
-    def _estimate(
-        self, between: tuple[int, int], matches: NDArray[np.uint32]
-    ) -> tuple[NDArray[np.int64], Motion | None]:
-        """The matches (M, 2) that fit one geometry, and its motion."""
-        one, other = (self._pixels[row] for row in between)
+    def _matches(self, pair: Pair) -> NDArray[np.int64]:
+        """(M, 2) all matches of a pair, whatever fits."""
+        one, other = (self._ids[row] for row in pair.between)
+        with pycolmap.Database.open(self._database) as database:
+            return np.asarray(database.read_matches(one, other), np.int64).reshape(-1, 2)
+
+    def _fitted(self, pair: Pair) -> Pair:
+        """A pair with those of its matches that fit one geometry, marked by its motion."""
+        matches, motion = self._estimate(pair)
+        return self.mark(replace(pair, matches=matches), motion)
+
+    def _estimate(self, pair: Pair) -> tuple[NDArray[np.int64], Motion | None]:
+        """The matches (M, 2) of a pair that fit one geometry, and its motion."""
+        one, other = (self._pixels[row] for row in pair.between)
         found = pycolmap.estimate_calibrated_two_view_geometry(
-            self._camera, one, self._camera, other, matches, self._options
+            self._camera, one, self._camera, other, pair.matches.astype(np.uint32), self._options
         )
         pose, motion = found.cam2_from_cam1, None
-        if pose is not None and (length := float(np.linalg.norm(pose.translation))) > 0:
-            motion = Motion(np.asarray(pose.rotation.matrix()), np.asarray(pose.translation) / length)
-        return np.asarray(found.inlier_matches, np.int64).reshape(-1, 2), motion
+        inliers = np.asarray(found.inlier_matches, np.int64).reshape(-1, 2)
+        if pose is None:
+            return inliers, None
+        rotation = np.asarray(pose.rotation.matrix())
+        if (length := float(np.linalg.norm(pose.translation))) > 0:
+            motion = Motion(rotation, np.asarray(pose.translation) / length)
+        moved = self.mark(Pair(pair.between, inliers), motion).telling
+        if 2 * len(moved) >= len(inliers):
+            return inliers, motion
+        start, end = self._evidence.directions(pair)
+        rotation = common_rotation(start, end, rotation, self._error)
+        fit = angles(start @ rotation.T, end) <= STILL * self._error
+        near = np.flatnonzero(~fit)
+        if len(near) < FEWEST:
+            return inliers, motion
+        direction, fit[near] = direction_of_rest(start[near] @ rotation.T, end[near], self._error)
+        if fit.sum() < len(inliers):
+            return inliers, motion
+        return pair.matches[fit], Motion(rotation, direction)
 
 
 def mark(evidence: Evidence, pair: Pair, motion: Motion | None, error: float) -> Pair:
@@ -111,24 +141,11 @@ def mark(evidence: Evidence, pair: Pair, motion: Motion | None, error: float) ->
     """
     if motion is None:
         return replace(pair, moved=np.zeros(len(pair.matches), np.bool_), parallax=0.0)
-    one, other = (evidence.rays[row][pair.matches[:, side]] for side, row in enumerate(pair.between))
-    apart = _apart(one, other, motion.rotation, _STILL * error)
-    moved = apart > _STILL * error
+    one, other = evidence.directions(pair)
+    apart = angles(one @ common_rotation(one, other, motion.rotation, error).T, other)
+    moved = apart > STILL * error
     parallax = float(np.rad2deg(np.median(apart[moved]))) if moved.any() else 0.0
     return replace(pair, moved=moved, parallax=parallax)
-
-
-def _apart(one: Array, other: Array, rotation: Array, error: float) -> Array:
-    """(N,) radians from directions to others, (N, 3) both, but for the rotation that most have in common.
-
-    It is fitted to those within an error, from one that is near: that of a motion has made room for its
-    direction.
-    """
-    for _ in range(_REFITS):
-        fit = ((one @ rotation.T) * other).sum(axis=1) >= np.cos(error)
-        left, _, right = np.linalg.svd(other[fit].T @ one[fit])
-        rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return np.asarray(np.arccos(np.clip(((one @ rotation.T) * other).sum(axis=1), -1, 1)))
 
 
 class Judge(Protocol):

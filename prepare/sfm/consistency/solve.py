@@ -35,6 +35,7 @@ _PURE = 0.8  # share of the matches of a pair that fit, for those to count that 
 _ROUNDS = 4  # of mapping with the pairs that fit
 _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
 _GUESSES = 4  # of what connects panoramas with a scene that they are added to
+_RIM = 0.1  # share of the panoramas that may be left out without an order: all others agree
 
 Kept = dict[Edge, NDArray[np.int64]]  # matches (M, 2) of the pairs that are mapped
 
@@ -92,8 +93,8 @@ class Solver:
         """Reconstructions of different panoramas, each without a contradiction, the largest first.
 
         What contradicts itself is cut where it is weakest, and each side is reconstructed again.
-        Args: least, panoramas of a part; doubtful, also without an order: nothing says then which of the
-            pairs within a side that agree are wrong together.
+        Args: least, panoramas of a part; doubtful, also without an order where the cut does not only leave
+            out a few: nothing says then which of the pairs within a side that agree are wrong together.
         """
         todo, found = [set(range(len(self._ids)))], list[Solution]()
         while todo:
@@ -125,15 +126,22 @@ class Solver:
         return found if found is not None and found.found.poses.keys() > self._given else None
 
     def _part(self, rows: Collection[int], cut: bool) -> Solution | None:
-        """The reconstruction of the most of these panoramas that agree; None if some do not, but to `cut`."""
+        """The reconstruction of the most of these panoramas that agree.
+
+        None if these leave out more than a few, but to `cut`; panoramas that nothing carries stay.
+        """
+        first = 0  # panoramas that had a pose before anything was cut
         while (found := self.solve(rows)) is not None and not found.trusted:
-            if not cut:
-                self.cuts += found.contradictions
-                return None
             before = sorted(found.found.poses)
+            first = first or len(before)
             agreed = consistent_part(before, found.contradictions, found.skeleton, found.evidence)
             sides = [(side >= self._given, len(side), side) for side in self._sides(agreed)]
             *_, rows = max(sides, key=lambda it: it[:2], default=(False, 0, set[int]()))
+            carried = (*found.skeleton.edges, *(it.between for it in found.contradictions))
+            rows |= set(before).difference(*carried)
+            if not cut and len(rows) < (1 - _RIM) * first:
+                self.cuts += found.contradictions
+                return None
             if len(rows) == len(before):
                 return None
             self.cuts += [it for it in found.contradictions if not set(it.between) <= set(rows)]

@@ -75,7 +75,7 @@ def test_coverage_counts_directions_and_not_features() -> None:
     around = np.linspace(-np.pi, np.pi, 60, endpoint=False) + 0.01
     rays = np.column_stack([np.sin(around), np.zeros(60), np.cos(around)])
     every = np.repeat(np.arange(60)[:, None], 2, axis=1)
-    for matches, share in ((every, 1.0), (every[:30], 0.5), (every[::2], 1.0), (every[:0], 0.0)):
+    for matches, share in ((every, 1.0), (every[:30], 0.5), (every[::2], 1.0), (every[::5], 0.0)):
         pairs = [Pair((0, 1), every), Pair((0, 2), matches), Pair((2, 3), every)]
         assert with_coverage([rays] * 4, pairs)[1].coverage == share
 
