@@ -27,7 +27,7 @@ def _matches() -> tuple[Array, Array]:
 
     def around(count: int) -> Array:
         rays = random.normal(size=(count, 3))
-        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     one = around(_CLOUDS + _NEAR + _WRONG)
     far = np.full((len(one), 1), 1e6)
