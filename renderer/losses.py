@@ -121,10 +121,12 @@ def inverse_depth_loss(rendered: Tensor, target: Tensor, valid: Tensor) -> Tenso
     return value
 
 
+@torch.no_grad()
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     """SSIM of every pixel, mean over the channels, with the window of `photometric_loss`.
 
-    On the CPU a kernel computes it, on a GPU `ssim_map_by_strips` does.
+    It has no gradient, which `photometric_loss` has. On the CPU a kernel computes it, on a GPU
+    `ssim_map_by_strips` does.
 
     Args:
         a, b: (H, W, 3) float32 in [0, 1].

@@ -84,7 +84,7 @@ def rasterize(
     """
     if len({(camera.width, camera.height) for camera in cameras}) != 1:
         raise ValueError(f"{len(cameras)} cameras: there must be some, of one size")
-    parts, degree, channels = _parts(colors, sh)
+    parts, degree, channels = _parts(colors, sh, len(means))
     own = (means, quats, scales, opacities)
     models = [Gaussians(*own, part.sh[:, :1], part.sh[:, 1:], exact=exact) for part in parts]
     screen = means.new_zeros(len(cameras), len(means), 2).requires_grad_(_learn(models))
@@ -127,29 +127,31 @@ class _Part(NamedTuple):
         return image * self.span + alpha[..., None] * self.least
 
 
-def _parts(colors: Tensor | None, sh: Tensor | None) -> tuple[list[_Part], int, int]:
+def _parts(colors: Tensor | None, sh: Tensor | None, count: int) -> tuple[list[_Part], int, int]:
     """What is drawn, three channels each; the degree of its spherical harmonics; the number of channels."""
     if colors is not None and sh is None:
-        return _features(colors)
+        return _features(colors, count)
     if sh is not None and colors is None:
-        return _harmonics(sh)
+        return _harmonics(sh, count)
     raise ValueError("give either colors or sh")
 
 
-def _harmonics(sh: Tensor) -> tuple[list[_Part], int, int]:
-    if sh.dim() != 3 or sh.shape[1] not in _DEGREES or sh.shape[2] != 3:
-        raise ValueError(f"sh is {tuple(sh.shape)}, must be (N, 1, 4, 9 or 16, 3)")
+def _harmonics(sh: Tensor, count: int) -> tuple[list[_Part], int, int]:
+    fits = sh.dim() == 3 and sh.shape[0] == count and sh.shape[1] in _DEGREES and sh.shape[2] == 3
+    if not fits or sh.dtype != torch.float32:
+        raise ValueError(f"sh is {sh.dtype} {tuple(sh.shape)}, must be float32 ({count}, 1, 4, 9 or 16, 3)")
     padding = sh.new_zeros(len(sh), SH_REST + 1 - sh.shape[1], 3)
     return [_Part(torch.cat([sh, padding], 1))], _DEGREES[sh.shape[1]], 3
 
 
-def _features(colors: Tensor) -> tuple[list[_Part], int, int]:
+def _features(colors: Tensor, count: int) -> tuple[list[_Part], int, int]:
     """The kernels clamp a Gaussian's colour at 0, so each channel is moved and scaled to lie above it: an
     image has alpha times what was subtracted.
     """
-    if colors.dim() != 2 or not colors.shape[1]:
-        raise ValueError(f"colors is {tuple(colors.shape)}, must be (N, X)")
-    count, channels = colors.shape
+    fits = colors.dim() == 2 and colors.shape[0] == count and colors.shape[1] > 0
+    if not fits or colors.dtype != torch.float32:
+        raise ValueError(f"colors is {colors.dtype} {tuple(colors.shape)}, must be float32 ({count}, X)")
+    channels = colors.shape[1]
     colors = torch.nn.functional.pad(colors, (0, -channels % 3))
     parts = []
     for three in torch.split(colors, 3, dim=1):

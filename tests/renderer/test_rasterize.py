@@ -153,8 +153,9 @@ def test_wrong_arguments_are_errors(few: Gaussians) -> None:
         drawn(few, colors=colors)
     with pytest.raises(ValueError, match="must have 3 channels"):
         drawn(few, place, colors=colors, background=torch.ones(4))
-    with pytest.raises(ValueError, match="must be \\(N, 1, 4, 9 or 16, 3\\)"):
+    with pytest.raises(ValueError, match=f"must be float32 \\({len(few)}, 1, 4, 9 or 16, 3\\)"):
         drawn(few, place, sh=harmonics(few)[:, :5])
-    with pytest.raises(ValueError, match="must be \\(N, X\\)"):
-        drawn(few, place, colors=colors[0])
+    for wrong in (colors[0], colors[:-1], colors.double(), colors > 0):
+        with pytest.raises(ValueError, match=f"^colors is .* must be float32 \\({len(few)}, X\\)"):
+            drawn(few, place, colors=wrong)
     assert not drawn(few, place, colors=colors).color.requires_grad
