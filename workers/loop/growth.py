@@ -39,6 +39,10 @@ class _Strategy:
         places = np.asarray(centers, np.float64)
         settings = {"densify": {**densify, "method": self.method}, "reset": reset or {}}
         config = TrainConfig.model_validate(settings)
+        if config.densify.split_gradient > 0:
+            raise ValueError(
+                "split_gradient is of absolute gradients, which a raster does not have: set it to 0"
+            )
         extent = extent_of(places, baseline(places))
         self._schedule = Schedule(config, iterations, extent, refine=False)
         self._centers, self._sky, self._seed = places, sky, seed
@@ -66,10 +70,13 @@ class _Strategy:
             iteration: from 1 to `iterations`.
 
         Raises:
-            ValueError: a parameter is missing, or nothing went backward through the raster.
+            ValueError: a parameter is missing, nothing went backward through the raster, or rows change while
+                the optimizer has more by row than Adam's two moments, as with `amsgrad`.
         """
         if raster.screen.grad is None:
             raise ValueError("the raster has no gradient: call backward, then this")
+        if missing := [name for name in PARAMETERS if name not in parameters]:
+            raise ValueError(f"parameters has no {', '.join(missing)}: it needs {', '.join(PARAMETERS)}")
         schedule = self._schedule
         if self._growth is None:
             count, pixels = len(parameters["means"]) - self._sky, raster.alpha[0].numel()
@@ -130,6 +137,11 @@ class Relocate(_Strategy):
 def _state_of(parameters: Mapping[str, Tensor], optimizer: torch.optim.Optimizer, sky: int) -> ModelState:
     """The parameters and their moments, sharing memory; zeros before the first step."""
     leaves = {name: parameters[name] for name in PARAMETERS}
+    for name, leaf in leaves.items():
+        for kind, value in optimizer.state[leaf].items():
+            if kind not in _MOMENTS and isinstance(value, Tensor) and value.shape == leaf.shape:
+                known = " and ".join(_MOMENTS)
+                raise ValueError(f"the optimizer has {kind} of {name}: rows take only {known} with them")
     first, second = (
         {name: optimizer.state[leaf].get(moment, torch.zeros_like(leaf)) for name, leaf in leaves.items()}
         for moment in _MOMENTS
@@ -146,7 +158,7 @@ def _write(state: ModelState, parameters: dict[str, Tensor], optimizer: torch.op
         for moment, values in zip(_MOMENTS, (state.exp_avg, state.exp_avg_sq), strict=True):
             if moment in own:
                 own[moment] = values[name]
-        parameters[name] = tensor.detach().requires_grad_()
+        parameters[name] = tensor.detach().requires_grad_(before.requires_grad)
         optimizer.state[parameters[name]] = own
         for group in optimizer.param_groups:
             group["params"] = [parameters[name] if it is before else it for it in group["params"]]

@@ -108,6 +108,26 @@ def test_it_says_what_is_missing() -> None:
     leaves, optimizer = start()
     with pytest.raises(ValueError, match="no_such_setting"):
         Clone3DGS(CENTERS, 20, no_such_setting=1)
+    with pytest.raises(ValueError, match="split_gradient is of absolute gradients"):
+        Clone3DGS(CENTERS, 20, split_gradient=4e-4)
     raster = rasterized(leaves, camera(64))
     with pytest.raises(ValueError, match="call backward"):
         Clone3DGS(CENTERS, 20, sky=SKY).step(leaves, optimizer, raster, 1)
+    raster, some = step(leaves, optimizer), {name: leaf for name, leaf in leaves.items() if name != "shN"}
+    with pytest.raises(ValueError, match="has no shN"):
+        Clone3DGS(CENTERS, 20, sky=SKY).step(some, optimizer, raster, 1)
+
+
+def test_what_an_optimizer_has_by_row_must_be_known() -> None:
+    leaves, _ = start()
+    optimizer = torch.optim.Adam(list(leaves.values()), amsgrad=True)
+    with pytest.raises(ValueError, match="max_exp_avg_sq of means"):
+        Clone3DGS(CENTERS, 20, sky=SKY, **OFTEN).step(leaves, optimizer, step(leaves, optimizer), 2)
+
+
+def test_what_does_not_train_stays_so() -> None:
+    leaves, optimizer = start()
+    raster = step(leaves, optimizer)
+    leaves["quats"].requires_grad_(False)
+    Clone3DGS(CENTERS, 20, sky=SKY, gradient=1e-6, **OFTEN).step(leaves, optimizer, raster, 2)
+    assert [name for name, leaf in leaves.items() if not leaf.requires_grad] == ["quats"]
