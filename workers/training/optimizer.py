@@ -7,7 +7,9 @@ import torch
 from torch import Tensor
 
 from panolog.renderer.adam import Moving
+from panolog.scene.errors import RunError
 from panolog.scene.gaussians import EXACT, PARAMETERS, SH_REST, Gaussians
+from panolog.workers.training.config import TrainConfig
 
 MOMENT = "exp_avg."  # in `ModelState.tensors`, before the name of a parameter
 AVERAGE = "average."  # before the names of what `Average.tensors` has
@@ -120,6 +122,17 @@ def gaussians_of(tensors: Mapping[str, Tensor]) -> Gaussians:
     if missing := SH_REST - model["shN"].shape[1]:
         model["shN"] = torch.nn.functional.pad(model["shN"], (0, 0, 0, missing))
     return Gaussians(**model, sky=int(tensors["sky"]), exact=EXACT in tensors)
+
+
+def check_kind(tensors: Mapping[str, Tensor], config: TrainConfig) -> None:
+    """Raises RunError if a checkpoint is of a training with another projection or unit of rates."""
+    saved = EXACT in tensors, f"{UNITS}means" in tensors
+    if saved != (config.projection == "exact", config.optimizer.unit == "distance"):
+        projection, unit = "exact" if saved[0] else "affine", "distance" if saved[1] else "extent"
+        raise RunError(
+            f"the checkpoint is of a training with projection={projection} and optimizer.unit={unit}:"
+            " continue it with the settings that it had"
+        )
 
 
 def trained_rows(gaussians: Gaussians, degree: int, *, refine: bool, sky_scales: bool) -> dict[str, int]:

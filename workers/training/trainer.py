@@ -46,7 +46,7 @@ from panolog.workers.training.initialise import (
     scene_length,
 )
 from panolog.workers.training.loss import Loss, loss_rows
-from panolog.workers.training.optimizer import AVERAGE, Average, ModelState, trained_rows
+from panolog.workers.training.optimizer import AVERAGE, Average, ModelState, check_kind, trained_rows
 from panolog.workers.training.pipeline import Direct, Pipeline, Plan
 from panolog.workers.training.relocate import Growth, Place
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
@@ -206,12 +206,13 @@ class Trainer:
         _LOG.info("%s: %s", self.spec.task, exterior.finish(self._cameras()))
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Continue from a checkpoint. Raises RunError if it is of another task or a longer run."""
+        """Continue from a checkpoint. Raises RunError if it is of another training."""
         if checkpoint.task != self.spec.task or checkpoint.iteration > self.spec.iterations:
             what = f"{self.spec.task} with {self.spec.iterations} iterations"
             raise RunError(
                 f"a checkpoint of {checkpoint.task} at {checkpoint.iteration} does not continue {what}"
             )
+        check_kind(checkpoint.tensors, self.spec.config)
         held = {name: tensor for name, tensor in checkpoint.tensors.items() if not name.startswith(AVERAGE)}
         tensors = {name: tensor.to(self.spec.device, copy=True) for name, tensor in held.items()}
         self.state = ModelState.from_tensors(tensors)

@@ -196,6 +196,11 @@ def test_what_is_no_task_is_refused(coarse: TrainSpec, events: list[Event]) -> N
     """A checkpoint of another one, half of a block, and nothing to see."""
     with pytest.raises(RunError, match="does not continue coarse"):
         next(train(replace(coarse, checkpoint=Value(Checkpoint(TaskId.block(0), 5, {})))))
+    saved = next(event for event in events if isinstance(event, Checkpoint))
+    for other in ({"projection": "exact"}, {"optimizer": {"unit": "distance"}}):
+        spec = replace(coarse, checkpoint=Value(saved), config=settings(**other))
+        with pytest.raises(RunError, match=r"projection=affine and optimizer\.unit=extent"):
+            next(train(spec))
     block = block_of(coarse, trained(events))
     with pytest.raises(ValueError, match="needs both"):
         replace(coarse, cell=block.cell)
