@@ -40,7 +40,7 @@ from panolog.workers.training.schedule import Schedule
 Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
-MOST = 50  # parts of one Gaussian at one time: the tests of eq. 9 go so far
+MOST = 50  # parts of one Gaussian at one time: the tests of `shares` go so far
 _SLOPE, _FAINT = 100.0, 0.005  # k and t of the noise in the MCMC paper: only what is nearly transparent moves
 _LEAST_OPACITY = 1e-6
 _MOST_WEIGHT = 1e30  # so that the sum of all is finite
