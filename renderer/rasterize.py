@@ -59,7 +59,7 @@ def rasterize(
         scales: (N, 3) logarithms of the standard deviations in world units.
         opacities: (N,) logits.
         cameras: C of one size. Where a pose requires grad it gets one, also on a GPU with poses on the CPU.
-        colors: (N, X) of any range and number of channels: RGB, or features.
+        colors: (N, X), RGB or features of any range and number; errors are about 1e-7 of a channel's range.
         sh: in place of `colors`, (N, K, 3) spherical harmonics of RGB, with K = 1, 4, 9 or 16.
         background: (X,) or (C, X), what is seen where nothing hides it; black if None.
         near: radial distance in world units below which a Gaussian is not drawn.
