@@ -90,6 +90,7 @@ class _Strategy:
         if schedule.changes(iteration):
             state = _state_of(parameters, optimizer, self._sky)
             self._statistics, _ = self._growth.after(state, self._statistics, iteration)
+            self._sky = state.gaussians.sky  # without what was not finite
             _write(state, parameters, optimizer)
 
 

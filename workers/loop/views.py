@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from panolog.renderer.camera import Camera
+from panolog.renderer.process import choose_device
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache, View, load_view
 from panolog.scene.model import Scene
@@ -81,6 +82,7 @@ def load_views(
 
     Raises:
         ConfigError: the width is not possible.
+        DeviceError: there is no such device.
         SceneError: a panorama cannot be decoded.
 
     >>> import panolog
@@ -92,7 +94,7 @@ def load_views(
     """
     chosen = tuple(scene.train if rows is None else rows)
     targets = DepthTargets(scene, DepthConfig(), seed)
-    with PanoramaCache(scene, chosen, width, _MEMORY, device=device) as cache:
+    with PanoramaCache(scene, chosen, width, _MEMORY, device=choose_device(device)) as cache:
         for iteration in range(iterations):
             ahead = range(iteration, min(iteration + cache.ahead(_AHEAD), iterations))
             order = [epoch(seed, "coarse", chosen, at // len(chosen))[at % len(chosen)] for at in ahead]

@@ -131,3 +131,14 @@ def test_what_does_not_train_stays_so() -> None:
     leaves["quats"].requires_grad_(False)
     Clone3DGS(CENTERS, 20, sky=SKY, gradient=1e-6, **OFTEN).step(leaves, optimizer, raster, 2)
     assert [name for name, leaf in leaves.items() if not leaf.requires_grad] == ["quats"]
+
+
+def test_what_of_the_sky_is_not_finite_is_removed() -> None:
+    leaves, optimizer = start()
+    growth = Clone3DGS(CENTERS, 20, sky=SKY, gradient=1e9, prune_opacity=0.0, prune_scale=0.0, **OFTEN)
+    for iteration in range(1, 5):
+        raster = step(leaves, optimizer)
+        with torch.no_grad():
+            leaves["means"][-iteration] = torch.nan if iteration == 2 else 1.0
+        growth.step(leaves, optimizer, raster, iteration)
+    assert len(leaves["means"]) == 69 and growth._sky == SKY - 1

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from panolog.renderer.camera import Camera
-from panolog.scene.errors import ConfigError
+from panolog.scene.errors import ConfigError, DeviceError
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
@@ -44,9 +44,11 @@ def test_a_view_has_its_camera_and_its_picture(scene: Scene) -> None:
     assert view.depth is None
 
 
-def test_a_width_that_the_panoramas_do_not_have_is_an_error(scene: Scene) -> None:
+def test_a_width_or_device_that_there_is_not_is_an_error(scene: Scene) -> None:
     with pytest.raises(ConfigError, match="width 65"):
         next(load_views(scene, 65, 1))
+    with pytest.raises(DeviceError, match="tpu"):
+        next(load_views(scene, 64, 1, device="tpu"))
 
 
 def test_the_first_model_has_points_then_a_sky(scene: Scene) -> None:
