@@ -168,5 +168,5 @@ def _features(colors: Tensor, count: int) -> tuple[list[_Part], int, int]:
 def _view(parts: list[_Part], drawn: list[Render], channels: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(H, W, X) colours, (H, W) alpha and inverse depth, and (N,) what is visible, of what was drawn."""
     first = drawn[0]
-    color = [part.of(each.color, first.alpha) for part, each in zip(parts, drawn, strict=True)]
+    color = [part.of(each.color, each.alpha) for part, each in zip(parts, drawn, strict=True)]
     return torch.cat(color, -1)[..., :channels], first.alpha, first.inverse_depth, first.visible

@@ -80,6 +80,15 @@ def test_features_of_any_range_and_number_are_sums_with_their_gradients(few: Gau
     torch.testing.assert_close(features.grad, by_sum, rtol=1e-3, atol=1e-4)
 
 
+def test_channels_without_a_gaussian_that_is_not_finite_there_are_as_without_it(few: Gaussians) -> None:
+    colors = torch.rand(len(few), 5, generator=torch.Generator().manual_seed(2))
+    others = few.select(torch.arange(len(few)) > 0)
+    expected = drawn(others, camera(64), colors=colors[1:]).color[..., 3]
+    colors[0, 4] = torch.nan
+    found = drawn(few, camera(64), colors=colors).color[..., 3]
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
+
+
 def test_geometry_gets_the_gradients_of_all_channels(few: Gaussians) -> None:
     place = camera(64)
     colors = torch.rand(len(few), 6, generator=torch.Generator().manual_seed(2)) + 0.1
