@@ -14,8 +14,6 @@ same world is given or is next to it (ODGS' preparation of the data has one: see
 dataLoader/dataset_omniblender.py and get_ray_directions_360 in ray_utils.py.
 """
 
-from dataclasses import replace
-
 from panolog.prepare.importers.interface import FLIP_YZ, ImportedScene, ImportSource, posed_image, read_head
 from panolog.prepare.importers.json_xml import load_json
 from panolog.prepare.importers.spheresfm import find_model, from_model
@@ -35,9 +33,7 @@ def read_ricoh360(source: ImportSource) -> ImportedScene:
     folder = next((source.path / name for name in _MODELS if find_model(source.path / name)), None)
     if folder is None:
         raise SceneError(f"{source.path}: there is no COLMAP model in {_MODELS[0]}")
-    train, test = source.split()
-    imported = from_model(folder, source.image_folders("imgs", "images"), source)
-    return replace(imported, train=train, test=test)
+    return from_model(folder, source.image_folders("imgs", "images"), source)
 
 
 def detect_omniblender(source: ImportSource) -> bool:
@@ -51,4 +47,4 @@ def read_omniblender(source: ImportSource) -> ImportedScene:
     folders = source.image_folders("images")
     frames = load_json(source.json_file(_TRANSFORMS), source.memory)["frames"]
     images = [posed_image(it["transform_matrix"], it["file_path"], folders, FLIP_YZ) for it in frames]
-    return ImportedScene(images, *source.cloud("pcd.ply", "points.ply"), *source.split())
+    return ImportedScene(images, *source.cloud("pcd.ply", "points.ply"))

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import permutations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ from panolog.prepare.importers.spheresfm import find_model
 from panolog.prepare.sfm.triangulate import triangulate
 from panolog.scene.colmap_files import read_cameras
 from panolog.scene.errors import ConfigError, SceneError
-from panolog.scene.files import natural_key, stem_of
+from panolog.scene.files import natural_key, some_of, stem_of
 from panolog.scene.image_files import check_images
 from panolog.scene.model import NO_OFFSET, Vector
 from panolog.scene.read import MASKS, MIN_CAMERAS, check_names, find_offset
@@ -53,6 +54,7 @@ FORMATS: dict[str, ImportFormat] = {
     "metashape": ImportFormat(metashape.detect, metashape.read),
     "poses": ImportFormat(pose_table.detect, pose_table.read),
 }
+_SPLIT = "train.txt", "test.txt"
 
 
 def register_format(name: str, format: ImportFormat) -> None:
@@ -102,17 +104,13 @@ def import_scene(
         scene = _triangulated(source, scene, size, progress)
     scene, offset = _centred(scene)
     masks, left_out = find_masks(source, images, scene.masks)
-    split = _split(scene)
+    split, lost = _split(scene, source)
     new = NewScene(
         scene.images, size, scene.points, scene.colors, split=split, layers={MASKS: masks}, offset=offset
     )
     write_scene(output, new, link=link, progress=partial(progress, "import"))
     observations = sum(len(image.sightings[0]) for image in scene.images)
-    notes = [*scene.notes, *left_out]
-    if split is None and (scene.train or scene.test):
-        notes.append(
-            "the source's split is left out: it has to name panoramas to train on and others to test"
-        )
+    notes = [*scene.notes, *left_out, *lost]
     if scene.colors is None and not observations:
         notes.append("the points have no colours and begin grey")
     return ImportReport(name, len(images), len(scene.points), observations, tuple(notes))
@@ -168,10 +166,21 @@ def _about(place: Origin | None, offset: Vector) -> Offset:
     return Offset(offset=offset, frame=None if place is None else "ENU", origin=place)
 
 
-def _split(scene: ImportedScene) -> dict[str, list[str]] | None:
-    """train.txt and test.txt with the panoramas that exist, if both have some."""
+def _split(scene: ImportedScene, source: ImportSource) -> tuple[dict[str, list[str]] | None, list[str]]:
+    """The source's train.txt and test.txt, one or both, with the panoramas that exist; None if there is none.
+
+    And one line for each thing that is left out of them.
+    """
     known = {stem_of(image.name) for image in scene.images}
-    train, test = (sorted(set(part) & known) for part in (scene.train, scene.test))
-    if train and test and not set(train) & set(test):
-        return {"train.txt": train, "test.txt": test}
-    return None
+    parts = (scene.train, scene.test) if scene.train or scene.test else source.split()
+    split = {name: set(part) for name, part in zip(_SPLIT, parts, strict=True) if part}
+    if not split:
+        return None, []
+    lost = sorted(set().union(*split.values()) - known)
+    notes = [f"{some_of(lost, 'name')} of the source's split: left out, as of no panorama"] if lost else []
+    split = {name: part & known for name, part in split.items()}
+    train, test = (split.get(name, known - split.get(other, set())) for name, other in permutations(_SPLIT))
+    if train and test and not train & test:
+        return {name: sorted(part) for name, part in split.items()}, notes
+    left_out = "the source's split is left out: it has to name panoramas to train on and others to test"
+    return None, [*notes, left_out]

@@ -33,7 +33,7 @@ class ImportedScene:
     images: Sequence[PosedImage]
     points: NDArray[np.float64]  # (P, 3) world units
     colors: NDArray[np.uint8] | None  # (P, 3) RGB; None where the format has none: sampled from the panoramas
-    train: Sequence[str] = ()  # stems, where the format has a split
+    train: Sequence[str] = ()  # stems, where the format has a split of its own
     test: Sequence[str] = ()
     notes: Sequence[str] = ()  # messages for the user, one line each: what was left out
     place: Origin | None = None  # the world is metres east, north and up of it

@@ -11,7 +11,6 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,9 +61,7 @@ def _prepared(source: ImportSource, folders: Sequence[Path]) -> ImportedScene:
         load_json(root / f"data_{part}.json", source.memory) for part in ("views", "extrinsics")
     )
     cloud = source.cloud("pcd.ply", _named_cloud(source))
-    imported = openmvg.assemble(views["views"], extrinsics["extrinsics"], folders, cloud)
-    train, test = source.split()
-    return replace(imported, train=train, test=test)
+    return openmvg.assemble(views["views"], extrinsics["extrinsics"], folders, cloud)
 
 
 def _named_cloud(source: ImportSource) -> str:

@@ -146,6 +146,32 @@ def test_nerfstudio_without_what_others_write(tmp_path: Path) -> None:
         import_scene(source, tmp_path / "other")
 
 
+@pytest.mark.parametrize("case", ["spheresfm", "opensfm", "metashape", "openmvg", "nerfstudio", "poses"])
+@pytest.mark.parametrize(
+    ("files", "test", "note"),
+    [
+        ({"train": "0 1 2", "test": "4"}, (4,), ""),
+        ({"test": "4 5"}, (4, 5), ""),
+        ({"train": "0 1 2 3"}, (4, 5), ""),
+        ({"test": "4 7 8"}, (4,), "2 names (pano_07, pano_08) of the source's split: left out"),
+        ({"test": "7"}, (0,), "the source's split is left out"),
+        ({"train": "0 1 2", "test": "2 3"}, (0,), "the source's split is left out"),
+    ],
+)
+def test_the_split_next_to_any_source(
+    case: str, files: dict[str, str], test: tuple[int, ...], note: str, tmp_path: Path
+) -> None:
+    """It was dropped without a word by most formats, and so were names that no panorama has."""
+    _, source = WRITERS[case][1](tmp_path / "source")
+    for name, numbers in files.items():
+        lines = [f"pano_0{number}.png\n" for number in numbers.split()]
+        (source.folder / f"{name}.txt").write_text("".join(lines))
+    report = import_scene(source, tmp_path / "scene")
+    assert note in "; ".join(report.notes)
+    assert bool(note) == ("split" in "; ".join(report.notes))
+    assert read_scene(tmp_path / "scene").test == test
+
+
 def change_metashape(folder: Path, change: Callable[[str], str]) -> ImportSource:
     _, source = metashape(folder)
     path = folder / "cameras.xml"
