@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import ImageError, SceneError
-from panolog.scene.pictures.headers import ImageInfo, read_header
+from panolog.scene.pictures.headers import ImageInfo, read_header, without_orientation
 from panolog.scene.pictures.kinds import describe_picture, kind_of
 from panolog.scene.pictures.profiles import jpeg_segments, to_srgb
 from panolog.scene.stores.outline import whole
@@ -103,6 +103,8 @@ def _decoded(path: Path, data: bytes, flags: int) -> NDArray[Any]:
     """`decode` of what was read from `path`."""
     if data.startswith(_JPEG):
         _jpeg(path, BytesIO(data))  # OpenCV fills the missing part of a truncated one with grey
+    if data.startswith(_TIFF):
+        data = without_orientation(data)
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _chunks_fit(data) else None
     if pixels is None:
         kind = kind_of(data)

@@ -1,10 +1,12 @@
-"""Headers of TIFF and WebP: sizes of pictures that would take a second to decode."""
+"""Headers of TIFF and WebP: sizes of pictures that would take a second to decode, and how they are turned."""
 
 import os
 import struct
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
+from PIL import ExifTags
 from PIL import TiffImagePlugin as Tiff
 
 _DAMAGE = (SyntaxError, ValueError, LookupError, TypeError, ArithmeticError, OSError, struct.error)
@@ -37,6 +39,21 @@ def read_header(file: BinaryIO) -> ImageInfo | None:
         return _webp(head, size) if head[8:12] == b"WEBP" else None
     except _DAMAGE:
         return None
+
+
+def without_orientation(data: bytes) -> bytes:
+    """A TIFF that no viewer turns: OpenCV follows its orientation even when it is told not to."""
+    order, big = "<" if data.startswith(Tiff.II) else ">", 43 in data[2:4]  # 43: BigTIFF, for 4 GiB and more
+    with suppress(struct.error):
+        (directory,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
+        (count,) = struct.unpack_from(order + ("Q" if big else "H"), data, directory)
+        first, size = (directory + 8, 20) if big else (directory + 2, 12)
+        for at in range(first, min(first + count * size, len(data)), size):
+            if struct.unpack_from(order + "H", data, at) == (ExifTags.Base.Orientation,):
+                upright = bytearray(data)
+                struct.pack_into(order + "H", upright, at + (12 if big else 8), 1)
+                return bytes(upright)
+    return data
 
 
 def _tiff(file: BinaryIO, head: bytes, size: int) -> ImageInfo | None:

@@ -1,3 +1,4 @@
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.scene.errors import ImageError, InputError
+from panolog.scene.image_files import decode_with_alpha
 from panolog.scene.images import PanoramaCache, load_view
 from panolog.scene.read import read_scene
 from tests.scenes import HEIGHT, WIDTH, write_scene
@@ -160,6 +162,25 @@ def test_an_exif_orientation_does_not_turn_a_panorama(tmp_path: Path) -> None:
     assert pixels_of(scene.panoramas[0].image).shape == (WIDTH, HEIGHT, 3)  # OpenCV would turn it
     with PanoramaCache(scene, [0], WIDTH, 0) as cache:
         assert torch.equal(cache.get(0).image, before)
+
+
+@pytest.mark.parametrize(("order", "big"), [("<", False), ("<", True), (">", False)])
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_nor_does_that_of_a_tiff(order: str, big: bool, orientation: int, tmp_path: Path) -> None:
+    """OpenCV turns these whatever it is asked for, so a scene of TIFFs was trained upside down."""
+    grey = np.random.default_rng(0).integers(256, size=(HEIGHT, WIDTH), dtype=np.uint8)
+    number, counts = ("Q", "HQ") if big else ("I", "HI")
+    first = 16 if big else 8  # byte of the pixels; the directory is behind them
+    tags = {256: WIDTH, 257: HEIGHT, 258: 8, 259: 1, 262: 1, 273: first, 274: orientation, 277: 1}
+    tags |= {278: HEIGHT, 279: grey.size}
+    head = {"<": b"II", ">": b"MM"}[order]
+    head += struct.pack(order + ("3HQ" if big else "HI"), *((43, 8, 0) if big else (42,)), first + grey.size)
+    directory = struct.pack(order + ("Q" if big else "H"), len(tags))
+    for tag, value in tags.items():
+        directory += struct.pack(order + "H" + counts + "H", tag, 3, 1, value) + bytes(6 if big else 2)
+    path = tmp_path / "a.tif"
+    path.write_bytes(head + grey.tobytes() + directory + struct.pack(order + number, 0))
+    assert np.array_equal(decode_with_alpha(path)[0], np.dstack([grey] * 3))
 
 
 def test_a_damaged_image_is_named_when_it_is_asked_for(root: Path) -> None:
