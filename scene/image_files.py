@@ -264,7 +264,7 @@ def read_infos(paths: Sequence[Path]) -> list[ImageInfo]:
         more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
         raise SceneError(
             f"{missing[0]}: the model names this image, but it is missing{more}; `panolog scene import` also "
-            "finds images in other folders, of other formats, and with names in another case"
+            "finds images in other folders, of other formats, and with endings in another case"
         )
     infos = [read_info(path) for path in paths]
     width, height = infos[0].width, infos[0].height

@@ -21,7 +21,8 @@ from panolog.scene.write import UNSEEN, Origin, PosedImage
 Array = NDArray[np.float64]
 FLIP_YZ = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera (x right, y up, z backward) to ours, and back
 _TOLERANCE = 1e-3  # how far from orthonormal a rotation that was written as text may be
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
+_ENDS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+_SUFFIXES = (*_ENDS, *(end.upper() for end in _ENDS))
 _HEAD = 65_536  # bytes that `detect` may read of a file
 _LARGEST_LIST = 2**26  # bytes of a file of image names
 

@@ -17,7 +17,7 @@ are arbitrary. Source: openMVG's cameras/Camera_Spherical.hpp and sfm/sfm_data_i
 from array import array
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +95,7 @@ def assemble(
             raise data.error(f"{width} x {height} pixels are not 2:1, so it is not a panorama")
         rows, pixels = tracks.get(key, UNSEEN)
         fractions = (pixels + 0.5) / (width, height)
-        shown, file = find_panorama(name.where, folders, name.text())
+        shown, file = find_panorama(name.where, folders, _path(data))
         images.append(PosedImage(shown, file, pose[0], -pose[0] @ pose[1], (rows, fractions)))
         widths.append(width)
     mirror = np.eye(3)
@@ -111,6 +111,13 @@ def assemble(
 def _by_key(node: JsonNode) -> list[tuple[int, JsonNode]]:
     """(key, value) of the pairs that cereal writes for a map."""
     return [(pair["key"].integer(2**32), pair["value"]) for pair in node]
+
+
+def _path(data: JsonNode) -> str:
+    """The file of a view below the root: openMVG writes its folder and its name apart."""
+    given, name = data.get("local_path"), data["filename"].text()
+    folder = PurePosixPath("" if given is None else given.text())
+    return name if folder.is_absolute() or ".." in folder.parts else str(folder / name)
 
 
 def _pose(value: JsonNode) -> tuple[Array, Array]:

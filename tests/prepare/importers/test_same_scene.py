@@ -86,10 +86,26 @@ def test_far_from_the_origin(tmp_path: Path) -> None:
     assert np.abs(scene.points + offset - known.points - utm).max() < 1e-6
 
 
+def test_openmvg_in_folders(tmp_path: Path) -> None:
+    """Cameras number files alike in each folder, which openMVG writes next to the name."""
+    _, source = WRITERS["openmvg"][1](tmp_path / "source")
+    with changed_json(source.path / "sfm_data.json") as content:
+        for number, view in enumerate(content["views"]):
+            data = view["value"]["ptr_wrapper"]["data"]
+            path = source.path / f"images/day{number % 2}/{number // 2}.png"
+            path.parent.mkdir(exist_ok=True)
+            (source.path / "images" / data["filename"]).rename(path)
+            data |= {"local_path": f"{path.parent.name}/", "filename": path.name}
+    import_scene(source, tmp_path / "scene")
+    names = [panorama.name for panorama in read_scene(tmp_path / "scene").panoramas]
+    assert names == [f"day{day}/{number}.png" for day in range(2) for number in range(3)]
+
+
 def test_labels_with_dots_and_without_extension(tmp_path: Path) -> None:
-    for name in ("IMG.001.jpg", "a.jpg", "b.png"):
+    for name in ("IMG.001.jpg", "a.jpg", "b.png", "c.TIF"):
         (tmp_path / name).touch()
-    for label, name in (("IMG.001", "IMG.001.jpg"), ("sub/b.jpeg", "b.png"), ("C:\\shots\\b", "b.png")):
+    spelled = {"IMG.001": "IMG.001.jpg", "sub/b.jpeg": "b.png", "C:\\shots\\b": "b.png", "c.tif": "c.TIF"}
+    for label, name in spelled.items():
         assert find_panorama("here", [tmp_path], label) == (name, tmp_path / name)
     with pytest.raises(SceneError, match=r"a\.1 is not in"):  # a number after a dot is no extension
         find_panorama("here", [tmp_path], "a.1")
