@@ -9,6 +9,7 @@ from panolog.scene.pictures.kinds import STITCH
 
 _RAW = "a camera's raw data; develop it to TIFF or JPEG, such as with darktable"
 _HEIC = "HEIC; convert it with `heif-convert NAME.heic NAME.jpg`, or export it as JPEG"
+_NAMED = "a JPEG; rename it to NAME.jpg"
 _PACKED = "an archive; unpack it, and give the folder"
 _LIGHT = "a picture of high dynamic range; save it tone-mapped, as TIFF or PNG of 8 or 16 bits"
 _LENSES = f"a video of two lenses; {STITCH}"
@@ -22,6 +23,8 @@ _KINDS = {
     ".osv": _LENSES,
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".gpr"), _RAW),
     **dict.fromkeys((".heic", ".heif", ".hif"), _HEIC),
+    **dict.fromkeys((".jfif", ".jpe", ".jfi", ".mpo"), _NAMED),
+    **dict.fromkeys((".jp2", ".j2k"), "JPEG 2000; save it as PNG or TIFF"),
     ".avif": "AVIF; convert it with `avifdec NAME.avif NAME.png`",
     ".jxl": "JPEG XL; convert it with `djxl NAME.jxl NAME.png`",
     **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".gz", ".tgz"), _PACKED),

@@ -22,6 +22,7 @@ _LEFT_OUT = {
     "skymasks": "`panolog scene depth` makes sky masks",
     "segmentations": "make masks of them, black = ignore",
     "semantics": "make masks of them, black = ignore",
+    "offset.json": "copy it to SCENE, if the world was not moved, to keep its place on the earth",
 }
 _ENDS = (".png", ".PNG", ".jpg", ".tif", ".tiff", ".webp", ".bmp")
 
@@ -59,7 +60,7 @@ def find_masks(
     ]
     for place in places:
         notes += [
-            f"{place / it}: left out; {what}" for it, what in _LEFT_OUT.items() if (place / it).is_dir()
+            f"{place / it}: left out; {what}" for it, what in _LEFT_OUT.items() if (place / it).exists()
         ]
     return found, notes
 

@@ -27,6 +27,7 @@ from panolog.prepare.video.frames import extract_frames
 from panolog.prepare.world.cropped import complete_panoramas
 from panolog.prepare.world.exif import read_exif
 from panolog.scene.errors import SceneError
+from panolog.scene.files import some_of
 from panolog.scene.read import DEPTHS, MASKS, MIN_CAMERAS, SKY_MASKS, check_names, find_layer
 from panolog.scene.write import Progress, StageProgress, part_of
 
@@ -151,11 +152,14 @@ def _stitched(
     And a line for each kind of files in it that are left out.
     """
     given = pictures_below(folder)
-    pictures = raw_pictures(given) if folder.is_dir() else []
+    files = folder.glob("[!.]*") if given != folder else ()
+    beside = sorted(it.name for it in files if it.suffix.lower() in SUFFIXES)
+    lines = [f"{some_of(beside)}: left out, as pictures are taken from {given}"] if beside else []
+    pictures = raw_pictures(given)
     if not pictures:
-        return folder, look_into(given).left_out
+        return folder, [*lines, *look_into(given).left_out]
     stitch_pictures(pictures, given, place / "stitched", up=up, progress=progress, note=note)
-    return place / "stitched", look_into(given, {INSP}).left_out
+    return place / "stitched", [*lines, *look_into(given, {INSP}).left_out]
 
 
 def _photographs(source: Source, folder: Path, least: int) -> list[_Row]:

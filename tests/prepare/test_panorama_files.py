@@ -39,6 +39,7 @@ KINDS = {
     "insv": "a video of two lenses; stitch it",
     "DNG": "a camera's raw data; develop it to TIFF or JPEG",
     "heic": "HEIC; convert it with `heif-convert",
+    "jfif": "a JPEG; rename it to NAME.jpg",
     "avif": "AVIF; convert it with `avifdec",
     "jxl": "JPEG XL; convert it with `djxl",
     "zip": "an archive; unpack it",

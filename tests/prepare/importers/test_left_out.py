@@ -89,6 +89,7 @@ def test_masks_that_belong_to_no_panorama_are_named(tmp_path: Path) -> None:
     for name in ("pano_00.png", "left.png", "right.png", "a.png", "b.png"):
         write_mask(source.path / "masks" / name)
     (source.path / "depths").mkdir()
+    (source.path / "offset.json").touch()
     write_mask(source.path / "images" / "mask.png")
     notes = import_scene(source, tmp_path / "scene").notes
     assert "1 of 6 panoramas have a mask in the source" in notes[0]
@@ -96,7 +97,8 @@ def test_masks_that_belong_to_no_panorama_are_named(tmp_path: Path) -> None:
     assert lost in notes[1]
     assert "images/mask.png: left out; if black in it is to be ignored in all panoramas" in notes[2]
     assert "depths: left out; `panolog scene depth` makes depth maps" in notes[3]
-    assert len(notes) == 4
+    assert "offset.json: left out; copy it to SCENE" in notes[4]
+    assert len(notes) == 5
 
 
 def test_a_damaged_mask_is_refused_by_its_name(tmp_path: Path) -> None:

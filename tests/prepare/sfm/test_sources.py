@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
-from panolog.prepare.sources.gather import panoramas_in_folder, without_copies
+from panolog.prepare.sources.find import find_sources
+from panolog.prepare.sources.gather import gather, panoramas_in_folder, without_copies
 from panolog.scene.errors import InputError
 from panolog.scene.write import no_progress
 
@@ -82,6 +83,17 @@ def test_where_pictures_and_masks_are(pictures: str, given: str, tmp_path: Path)
     assert [panorama.name for panorama in panoramas] == ["0.png", "1.png"]
     assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
     assert layers["depths"] == [None, None]
+
+
+def test_pictures_beside_their_folder_are_named(tmp_path: Path) -> None:
+    """The half of a place that was not in its folder images was missing without a word."""
+    _pictures(tmp_path / "place")
+    _pictures(tmp_path / "place" / "images")
+    sources = find_sources([tmp_path / "place"])
+    found = gather(sources, tmp_path / "work", SfmSettings(), no_progress)
+    assert [panorama.path.parent.name for panorama in found.panoramas] == ["images", "images"]
+    (line,) = found.left_out
+    assert line.startswith("2 files (0.png, 1.png): left out, as pictures are taken from ")
 
 
 def test_a_mask_next_to_its_panorama_is_no_panorama(tmp_path: Path) -> None:
