@@ -181,6 +181,8 @@ def _split(scene: ImportedScene, source: ImportSource) -> tuple[dict[str, list[s
     split = {name: part & known for name, part in split.items()}
     train, test = (split.get(name, known - split.get(other, set())) for name, other in permutations(_SPLIT))
     if train and test and not train & test:
+        if unused := sorted(known - train - test):
+            notes.append(f"{some_of(unused, 'panorama')}: not used, as in no part of the source's split")
         return {name: sorted(part) for name, part in split.items()}, notes
     left_out = "the source's split is left out: it has to name panoramas to train on and others to test"
     return None, [*notes, left_out]

@@ -130,4 +130,6 @@ def _stems(content: JsonNode, key: str, folder: Path, names: Sequence[str], comm
     if entry is None:
         return []
     members = [_name(member, folder) for member in entry]
-    return [stem_of(str(PurePosixPath(name).relative_to(common))) for name in members if name in names]
+    return [
+        stem_of(str(PurePosixPath(name).relative_to(common) if name in names else name)) for name in members
+    ]

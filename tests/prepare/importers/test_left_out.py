@@ -152,7 +152,8 @@ def test_nerfstudio_without_what_others_write(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("files", "test", "note"),
     [
-        ({"train": "0 1 2", "test": "4"}, (4,), ""),
+        ({"train": "0 1 2 3", "test": "4 5"}, (4, 5), ""),
+        ({"train": "0 1 2", "test": "4"}, (4,), "2 panoramas (pano_03, pano_05): not used"),
         ({"test": "4 5"}, (4, 5), ""),
         ({"train": "0 1 2 3"}, (4, 5), ""),
         ({"test": "4 7 8"}, (4,), "2 names (pano_07, pano_08) of the source's split: left out"),
@@ -172,6 +173,16 @@ def test_the_split_next_to_any_source(
     assert note in "; ".join(report.notes)
     assert bool(note) == ("split" in "; ".join(report.notes))
     assert read_scene(tmp_path / "scene").test == test
+
+
+def test_names_in_the_split_of_a_file(tmp_path: Path) -> None:
+    _, source = nerfstudio(tmp_path / "source")
+    with changed_json(source.path / "transforms.json") as content:
+        paths = [frame["file_path"] for frame in content["frames"]]
+        content |= {"train_filenames": [*paths[:4], "images/lost.png"], "test_filenames": paths[4:]}
+    notes = import_scene(source, tmp_path / "scene").notes
+    assert "1 name (images/lost) of the source's split: left out, as of no panorama" in notes
+    assert read_scene(tmp_path / "scene").test == (4, 5)
 
 
 def change_metashape(folder: Path, change: Callable[[str], str]) -> ImportSource:
