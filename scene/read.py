@@ -38,7 +38,8 @@ DEPTHS, SKY_MASKS, MASKS = "depths", "skymasks", "masks"
 DEPTH_PARAMS = "depth_params.json"  # next to the model
 # Where the model is in a scene: as COLMAP has it, and those that others make of equirectangular pictures.
 MODELS = ("sparse/0", "sparse", "sparse_equirectangular/0", "colmap/sparse/0")
-MIN_CAMERAS = 2  # one panorama has no parallax
+MIN_TRAINED = 2  # one panorama has no parallax
+MIN_CAMERAS = MIN_TRAINED + 1  # one is held out
 MIN_POINTS = 4  # a point's initial scale comes from its three nearest neighbours
 FAR = 10  # times the cameras' reach; float32 is then coarser than 1e-6 of it, 1 mm in a kilometre
 HOLD_OUT = 8  # every 8th in natural order is test: the 7:1 of the paper
@@ -286,7 +287,7 @@ def _read_split_file(path: Path, rows: dict[str, int]) -> set[int] | None:
 
 
 def _check_geometry(where: Path, model: ColmapModel) -> None:
-    """Refuses fewer than two cameras, too few points, or points that are not finite."""
+    """Refuses too few cameras, too few points, or points that are not finite."""
     if len(model.images) < MIN_CAMERAS:
         raise SceneError(f"{where}: {len(model.images)} posed panoramas; at least {MIN_CAMERAS} are needed")
     if len(model.points) < MIN_POINTS:
@@ -300,9 +301,9 @@ def _check_geometry(where: Path, model: ColmapModel) -> None:
 
 def _check_training(where: Path, centers: NDArray[np.float64]) -> None:
     """Refuses a training split of fewer than two cameras, or all at one place; `centers` (K, 3)."""
-    if len(centers) < MIN_CAMERAS:
+    if len(centers) < MIN_TRAINED:
         raise SceneError(
-            f"{where}: the train split has {len(centers)} panoramas; at least {MIN_CAMERAS} are needed, "
+            f"{where}: the train split has {len(centers)} panoramas; at least {MIN_TRAINED} are needed, "
             "add some or change train.txt or test.txt"
         )
     if np.ptp(centers, axis=0).max() <= 1e-9 * np.abs(centers).max():

@@ -248,7 +248,8 @@ def without_copies(
     kept = kept[len(known) :]
     if len(kept) < least:
         raise SceneError(
-            f"{panoramas[0].root}: all panoramas are copies of {every[0].name}; give different ones"
+            f"{panoramas[0].root}: {len(kept)} panoramas differ, the others are copies; at least {least} are "
+            "needed"
         )
     chosen = {layer: [files[row] for row in kept] for layer, files in layers.items()}
     return tuple(panoramas[row] for row in kept), chosen, lines

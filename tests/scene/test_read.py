@@ -258,9 +258,10 @@ def test_a_file_that_may_not_be_read(root: Path, name: str, monkeypatch: pytest.
     "names, points, complaint",
     [
         (["one.jpg"], 50, "1 posed panoramas"),
-        (["a.jpg", "b.jpg"], 0, "0 points"),
-        (["a.jpg", "a.png"], 50, "2 panoramas are called a"),
-        (["a.jpg", "../b.jpg"], 50, "leaves the image folder"),
+        (["a.jpg", "b.jpg"], 50, "2 posed panoramas; at least 3 are needed"),
+        (["a.jpg", "b.jpg", "c.jpg"], 0, "0 points"),
+        (["a.jpg", "a.png", "b.png"], 50, "2 panoramas are called a"),
+        (["a.jpg", "c.jpg", "../b.jpg"], 50, "leaves the image folder"),
     ],
 )
 def test_scenes_that_cannot_be_trained(tmp_path: Path, names: list[str], points: int, complaint: str) -> None:

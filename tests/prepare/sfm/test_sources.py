@@ -15,7 +15,7 @@ from panolog.scene.write import no_progress
 
 def _pictures(folder: Path, *shapes: tuple[int, int]) -> None:
     folder.mkdir(parents=True)
-    for number, shape in enumerate(shapes or [(64, 128)] * 2):
+    for number, shape in enumerate(shapes or [(64, 128)] * 3):
         cv2.imwrite(str(folder / f"{number}.png"), np.full(shape, 90 + number, np.uint8))
 
 
@@ -23,7 +23,8 @@ def _pictures(folder: Path, *shapes: tuple[int, int]) -> None:
     "what, message",
     [
         ("nothing", "there is no such folder or video"),
-        ("one", "1 panoramas"),
+        ("one", "1 panoramas .*; at least 3 are needed"),
+        ("two", "2 panoramas .*; at least 3 are needed"),  # which no scene can have: one is held out
         ("sizes", r"1\.png: is 16 pixels wide, and 0\.png 128, more than 4 times as many; leave it out"),
         ("another format", r"1\.png: COLMAP cannot read this image; save it as"),
         ("taken", "already exists"),
@@ -33,7 +34,7 @@ def _pictures(folder: Path, *shapes: tuple[int, int]) -> None:
 def test_refusals(what: str, message: str, tmp_path: Path) -> None:
     folder = tmp_path / "images"
     output = (folder if what == "inside" else tmp_path) / "scene"
-    shapes = {"one": [(64, 128)], "sizes": [(64, 128), (8, 16)]}
+    shapes = {"one": [(64, 128)], "two": [(64, 128)] * 2, "sizes": [(64, 128), (8, 16), (8, 16)]}
     if what != "nothing":
         _pictures(folder, *shapes.get(what, []))
     if what == "another format":
@@ -59,9 +60,9 @@ def test_copies_are_left_out_by_content_and_named(tmp_path: Path) -> None:
 
 
 def test_copies_of_one_picture_are_refused(tmp_path: Path) -> None:
-    _pictures(tmp_path / "images", (64, 128))
-    (tmp_path / "images" / "1.png").write_bytes((tmp_path / "images" / "0.png").read_bytes())
-    with pytest.raises(InputError, match=r"all panoramas are copies of 0\.png"):
+    _pictures(tmp_path / "images", *[(64, 128)] * 2)
+    (tmp_path / "images" / "2.png").write_bytes((tmp_path / "images" / "0.png").read_bytes())
+    with pytest.raises(InputError, match=r"2 panoramas differ, the others are copies; at least 3 are"):
         make_scene(tmp_path / "images", tmp_path / "scene", SfmSettings(), no_progress)
 
 
@@ -80,9 +81,9 @@ def test_where_pictures_and_masks_are(pictures: str, given: str, tmp_path: Path)
     _pictures(tmp_path / pictures)
     _pictures(tmp_path / "place" / "masks")
     panoramas, layers = panoramas_in_folder(tmp_path / given)
-    assert [panorama.name for panorama in panoramas] == ["0.png", "1.png"]
-    assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
-    assert layers["depths"] == [None, None]
+    assert [panorama.name for panorama in panoramas] == ["0.png", "1.png", "2.png"]
+    assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(3)]
+    assert layers["depths"] == [None] * 3
 
 
 def test_pictures_beside_their_folder_are_named(tmp_path: Path) -> None:
@@ -91,9 +92,9 @@ def test_pictures_beside_their_folder_are_named(tmp_path: Path) -> None:
     _pictures(tmp_path / "place" / "images")
     sources = find_sources([tmp_path / "place"])
     found = gather(sources, tmp_path / "work", SfmSettings(), no_progress)
-    assert [panorama.path.parent.name for panorama in found.panoramas] == ["images", "images"]
+    assert [panorama.path.parent.name for panorama in found.panoramas] == ["images"] * 3
     (line,) = found.left_out
-    assert line.startswith("2 files (0.png, 1.png): left out, as pictures are taken from ")
+    assert line.startswith("3 files (0.png, 1.png, 2.png): left out, as pictures are taken from ")
 
 
 def test_a_mask_next_to_its_panorama_is_no_panorama(tmp_path: Path) -> None:
@@ -102,8 +103,8 @@ def test_a_mask_next_to_its_panorama_is_no_panorama(tmp_path: Path) -> None:
     mask = np.full((64, 128), 255, np.uint8)
     cv2.imwrite(str(tmp_path / "images" / "1_mask.png"), mask)
     panoramas, layers = panoramas_in_folder(tmp_path / "images")
-    assert [panorama.name for panorama in panoramas] == ["0.png", "1.png"]
-    assert layers["masks"] == [None, tmp_path / "images" / "1_mask.png"]
+    assert [panorama.name for panorama in panoramas] == ["0.png", "1.png", "2.png"]
+    assert layers["masks"] == [None, tmp_path / "images" / "1_mask.png", None]
 
 
 def test_what_is_left_out_is_in_the_refusal(tmp_path: Path) -> None:
@@ -115,7 +116,7 @@ def test_what_is_left_out_is_in_the_refusal(tmp_path: Path) -> None:
         r"1 file \(0\.insp\): left out, each a photograph of two fisheye",
         r"1 file \(2\.HEIC\): left out, each HEIC; convert it with `heif",
     )
-    words = "1 panoramas .*; at least 2 are needed; " + ".*; ".join(lines)
+    words = "2 panoramas .*; at least 3 are needed; " + ".*; ".join(lines)
     with pytest.raises(InputError, match=words):
         panoramas_in_folder(folder)
 
@@ -132,8 +133,8 @@ def test_fisheye_circles_are_refused_by_name(shape: tuple[int, int], words: str,
     """Poses were found for two circles as if they were a panorama; one among six was 79 degrees off."""
     scale, folder = 8, tmp_path / "images"
     _pictures(folder)
-    for path in folder.iterdir():
-        cv2.imwrite(str(path), np.random.default_rng(0).integers(60, 255, (64 * scale, 128 * scale, 3)))
+    for seed, path in enumerate(folder.iterdir()):
+        cv2.imwrite(str(path), np.random.default_rng(seed).integers(60, 255, (64 * scale, 128 * scale, 3)))
     height, width = (scale * size for size in shape)
     side = min(height, width)
     y, x = (np.mgrid[:height, :width] + 0.5) % side / side * 2 - 1

@@ -123,7 +123,7 @@ def test_a_damaged_crop_is_one_clear_line(tmp_path: Path) -> None:
 
 
 def test_sfm_reads_the_metadata_first(tmp_path: Path) -> None:
-    for index in range(2):
+    for index in range(3):
         write_still(tmp_path / "place" / f"{index}.jpg", noise(FULL, index), orientation=3)
     with pytest.raises(InputError, match=r"0\.jpg: its EXIF orientation 3"):
         make_scene(tmp_path / "place", tmp_path / "scene", SfmSettings(), lambda *_: None)

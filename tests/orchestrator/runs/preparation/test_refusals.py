@@ -122,23 +122,22 @@ def test_another_source_or_a_scene_does_not_take_the_folder(
 def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     root = tmp_path / "run"
     image(tmp_path / "one" / "a.jpg", 64, 32)
-    image(tmp_path / "flat" / "a.jpg", 64, 40)
-    image(tmp_path / "flat" / "b.jpg", 64, 40)
-    image(tmp_path / "sizes" / "a.jpg", 64, 32)
-    image(tmp_path / "sizes" / "b.jpg", 512, 256)
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        image(tmp_path / "flat" / name, 64, 40)
+        image(tmp_path / "sizes" / name, *((512, 256) if name == "b.jpg" else (64, 32)))
     (tmp_path / "none").mkdir()
     (tmp_path / "text.mp4").write_text("no video")
     writer = cv2.VideoWriter(str(tmp_path / "flat.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (320, 240))
     writer.write(np.zeros((240, 320, 3), np.uint8))
     writer.release()
-    for name in ("a.png", "b.png"):
+    for name in ("a.png", "b.png", "c.png"):
         circles = np.full((128, 256), 90, np.uint8)
         circles[np.hypot(*(np.mgrid[:128, :256] % 128 - 63.5)) > 64] = 0
         (tmp_path / "fisheye").mkdir(exist_ok=True)
         cv2.imwrite(str(tmp_path / "fisheye" / name), circles)
     wrong = {
         "fisheye": "a.png: its two fisheye circles cannot be stitched: .*; or stitch it in",
-        "one": "1 panoramas .*; at least 2 are needed",
+        "one": "1 panoramas .*; at least 3 are needed",
         "flat": "64 x 40 pixels are not 2:1",
         "sizes": "a.jpg: is 64 pixels wide, and b.jpg 512, more than 4 times as many",
         "none": "the folder is empty",
@@ -150,9 +149,10 @@ def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
         assert re.search(message, one_line(call("run", tmp_path / name, "-o", root))), name
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "note.txt").write_text("mine")
-    image(tmp_path / "two" / "a.jpg", 64, 32)
-    image(tmp_path / "two" / "b.jpg", 64, 32)
-    run = ("run", tmp_path / "two", "-o")
+    image(tmp_path / "three" / "a.jpg", 64, 32)
+    image(tmp_path / "three" / "b.jpg", 64, 32)
+    image(tmp_path / "three" / "c.jpg", 64, 32)
+    run = ("run", tmp_path / "three", "-o")
     assert "is not empty and not a run" in one_line(call(*run, tmp_path / "full"))
     for network in ("--mask-model", "--depth-model"):
         assert "there is no such model" in one_line(call(*run, root, network, tmp_path / "no.onnx"))

@@ -149,7 +149,7 @@ def test_a_network_masks_folders_and_videos_and_what_it_has_done_is_kept(
 def test_the_same_sources_in_any_order_take_up_a_run_and_others_do_not(
     gathering: list[Sequence[Path]], tmp_path: Path
 ) -> None:
-    one, other, third = (walked(tmp_path / name, bearer=False, count=2) for name in "abc")
+    one, other, third = (walked(tmp_path / name, bearer=False, count=3) for name in "abc")
     for given in ([one, other], [other, one]):
         with pytest.raises(MaskedError):
             start(given, tmp_path / "run")
@@ -183,13 +183,13 @@ def test_doctor_looks_at_all_sources(tmp_path: Path) -> None:
 
 def test_panoramas_that_become_whole_first_are_looked_at_as_they_will_be(tmp_path: Path) -> None:
     """Cropped ones were refused by `run`, though `scene sfm` completes them."""
-    for number in range(2):
+    for number in range(3):
         part = np.full((40, 96, 3), 90 + number, np.uint8)
         write_still(tmp_path / "cropped" / f"{number}.png", part, panorama=crop((128, 64), 16, 8, (96, 40)))
         image(tmp_path / "odd" / f"{number}.png", 256, 127)
     for given, width in (("cropped", 128), ("odd", 256)):
         settings = settings_of(tmp_path / given, Options())
-        assert settings is not None and (settings.width, settings.panoramas) == (width, 2)
+        assert settings is not None and (settings.width, settings.panoramas) == (width, 3)
     settings = settings_of([tmp_path / "cropped", tmp_path / "odd"], Options())
     assert settings is not None and settings.width == 256
 
