@@ -153,8 +153,8 @@ def _stitched(
     """
     given = pictures_below(folder)
     files = folder.glob("[!.]*") if given != folder else ()
-    beside = sorted(it.name for it in files if it.suffix.lower() in SUFFIXES)
-    lines = [f"{some_of(beside)}: left out, as pictures are taken from {given}"] if beside else []
+    others = sorted(it.name for it in files if it.suffix.lower() in SUFFIXES)
+    lines = [f"{some_of(others)}: left out, as pictures are taken from {given}"] if others else []
     pictures = raw_pictures(given)
     if not pictures:
         return folder, [*lines, *look_into(given).left_out]

@@ -42,7 +42,7 @@ def read_header(file: BinaryIO) -> ImageInfo | None:
 
 
 def without_orientation(data: bytes) -> bytes:
-    """A TIFF that no viewer turns: OpenCV follows its orientation even when it is told not to."""
+    """A TIFF that no viewer turns: OpenCV follows its orientation whatever its flags say."""
     order, big = "<" if data.startswith(Tiff.II) else ">", 43 in data[2:4]  # 43: BigTIFF, for 4 GiB and more
     with suppress(struct.error):
         (directory,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)

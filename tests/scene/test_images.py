@@ -167,7 +167,7 @@ def test_an_exif_orientation_does_not_turn_a_panorama(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("order", "big"), [("<", False), ("<", True), (">", False)])
 @pytest.mark.parametrize("orientation", [1, 3, 6])
 def test_nor_does_that_of_a_tiff(order: str, big: bool, orientation: int, tmp_path: Path) -> None:
-    """OpenCV turns these whatever it is asked for, so a scene of TIFFs was trained upside down."""
+    """OpenCV turns these whatever its flags say, so a scene of TIFFs was trained upside down."""
     grey = np.random.default_rng(0).integers(256, size=(HEIGHT, WIDTH), dtype=np.uint8)
     number, counts = ("Q", "HQ") if big else ("I", "HI")
     first = 16 if big else 8  # byte of the pixels; the directory is behind them

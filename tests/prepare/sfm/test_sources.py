@@ -86,7 +86,7 @@ def test_where_pictures_and_masks_are(pictures: str, given: str, tmp_path: Path)
     assert layers["depths"] == [None] * 3
 
 
-def test_pictures_beside_their_folder_are_named(tmp_path: Path) -> None:
+def test_pictures_next_to_their_folder_are_named(tmp_path: Path) -> None:
     """The half of a place that was not in its folder images was missing without a word."""
     _pictures(tmp_path / "place")
     _pictures(tmp_path / "place" / "images")
