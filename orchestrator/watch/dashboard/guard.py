@@ -17,7 +17,6 @@ import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import HTTPConnection
@@ -174,7 +173,7 @@ def _same(given: str | None, token: str) -> bool:
 def _is_ours(headers: Headers) -> bool:
     """Whether a request comes from one of our pages, or from no page at all."""
     origin = headers.get("origin")
-    if origin is not None and urlsplit(origin).netloc.lower() != headers.get("host", "").lower():
+    if origin is not None and origin.lower().partition("://")[2] != headers.get("host", "").lower():
         return False
     if headers.get("sec-fetch-site", "same-origin") != "same-origin":
         return False
