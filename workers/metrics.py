@@ -152,7 +152,7 @@ def measure(
     is the same on every device; SSIM may differ by 1e-5, by 1e-4 for images without texture.
 
     Args: render and truth (ground truth), (H, W, 3) uint8 RGB; mask (H, W) bool, True = counts; crop_bottom,
-    fraction of the height.
+    fraction of the height, of which at least a row stays.
     Raises ValueError if shapes disagree or `crop_bottom` is not in [0, 1).
     """
     pair = _pair(render, truth, mask, crop_bottom)
@@ -241,7 +241,7 @@ def _pair(render: Image, truth: Image, mask: Image | None, crop_bottom: float) -
         )
     if not 0 <= crop_bottom < 1:
         raise ValueError(f"the cropped fraction is {crop_bottom}, must be at least 0 and below 1")
-    height = truth.shape[0] - round(crop_bottom * truth.shape[0])
+    height = max(1, truth.shape[0] - round(crop_bottom * truth.shape[0]))
     area, black = sphere_weights(truth.shape[0]), valid[:height, :, None]
     return Pair(render[:height] * black, truth[:height] * black, valid[:height], area[:height])
 

@@ -76,6 +76,7 @@ def test_the_cropped_bottom_takes_no_part() -> None:
     other = render.copy()
     other[-3:] = 0  # a tenth of 32 rows
     assert measure(render, truth, crop_bottom=0.1) == measure(other, truth, crop_bottom=0.1)
+    assert measure(render, truth, crop_bottom=0.999) == measure(other, truth, crop_bottom=0.999)  # a row
     assert measure(render, truth) != measure(other, truth)
 
 
