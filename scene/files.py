@@ -3,6 +3,7 @@
 `Locate` maps a path to where this machine has the file: on a cluster the path may be another machine's.
 """
 
+import errno
 import os
 import re
 import secrets
@@ -80,10 +81,22 @@ def atomic(path: Path) -> Iterator[Path]:
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{SUFFIX}")
     try:
-        yield temporary
-        publish(temporary, path)
+        with _naming(path):
+            yield temporary
+            publish(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Inside, the error of a disk that takes no more bytes names `path`: the system gives it no file."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            error.filename = str(path)
+        raise
 
 
 @contextmanager
@@ -98,7 +111,8 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     new, old = (folder.with_name(f".{folder.name}.{secrets.token_hex(4)}{SUFFIX}") for _ in range(2))
     new.mkdir()
     try:
-        yield new
+        with _naming(folder):
+            yield new
         if folder.exists():
             folder.rename(old)
         try:

@@ -1,9 +1,11 @@
 import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 
-from panolog.scene.files import SUFFIX, atomic, natural_key, remove_partial, write_bytes
+from panolog.scene.files import SUFFIX, atomic, atomic_folder, natural_key, remove_partial, write_bytes
 
 
 def test_a_file_appears_whole(tmp_path: Path) -> None:
@@ -23,6 +25,15 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
         raise ZeroDivisionError
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("appearing", [atomic, atomic_folder])
+def test_a_full_disk_names_what_was_written(
+    appearing: Callable[[Path], AbstractContextManager[Path]], tmp_path: Path
+) -> None:
+    with pytest.raises(OSError, match="No space left") as full, appearing(tmp_path / "a"):
+        Path("/dev/full").write_bytes(b"new")
+    assert full.value.filename == str(tmp_path / "a")
 
 
 def test_a_pipe_gets_the_bytes_and_stays_a_pipe(tmp_path: Path) -> None:
