@@ -45,7 +45,7 @@ _LINES, _LONGEST = 200, 200  # of a header, and bytes of each
 
 
 def write_compressed_ply(path: StrPath, source: SplatSource) -> None:
-    """Writes Gaussians as a compressed PLY, atomically, in Morton order.
+    """Writes Gaussians as a compressed PLY, atomically, in the order of `_order`.
 
     Reads the source three times and keeps 61 bytes of each Gaussian with spherical harmonics of degree 3.
 
@@ -53,7 +53,7 @@ def write_compressed_ply(path: StrPath, source: SplatSource) -> None:
     """
     if not source.count:
         raise FormatError("there is no Gaussian to write; select more of the model")
-    order = morton_order(means_of(source))
+    order = _order(means_of(source))
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     del order
@@ -92,6 +92,16 @@ def read_compressed_ply(path: StrPath) -> Splats:
             f"{path}: bounds of chunks are no numbers, or sizes beyond e^{_SIZE:g}; write it again"
         )
     return _unpacked(tables["vertex"], chunks.astype(np.float64), tables.get("sh"))
+
+
+def _order(means: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(N,) rows of means (N, 3) in Morton order, within shells of which each reaches four times as far.
+
+    A chunk with both scene and sky in it has the grid of the sky, units apart, for the scene too.
+    """
+    far = np.abs(means - np.median(means, axis=0)).max(axis=1)
+    shells, order = (np.frexp(far)[1] + 1) // 2, morton_order(means)
+    return order[np.argsort(shells[order], kind="stable")]
 
 
 def _columns(piece: Splats) -> Doubles:

@@ -1,13 +1,15 @@
 """Compressed PLY: values within the quantisation, words as the format says, and files that are none."""
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from panolog.export.compressed_ply import read_compressed_ply, write_compressed_ply
-from panolog.export.splats import InMemory
+from panolog.export.splats import InMemory, Splats
 from panolog.scene.errors import PlyError
 from tests.export.gaussians import C0, matched, scattered, turn_between
 
@@ -49,6 +51,16 @@ def test_values_return_within_the_quantisation(tmp_path: Path, degree: int) -> N
     assert np.abs(sigmoids[0] - sigmoids[1]).max() <= 0.5 / 255 + 1e-5
     assert turn_between(found.quats, was.quats).max() < 0.3
     assert np.abs(found.shN - was.shN).max(initial=0) <= 1 / 64 + 1e-6
+
+
+def test_a_far_sky_does_not_move_the_scene(tmp_path: Path) -> None:
+    """Chunks with both, in which positions are units apart, were one of six."""
+    scene, sky = scattered(3000, 0, extent=5), scattered(1000, 0, seed=1)
+    around = 500 * sky.means / np.linalg.norm(sky.means, axis=1, keepdims=True)
+    both = Splats.joined([scene, replace(sky, means=around)])
+    write_compressed_ply(path := tmp_path / "a.ply", InMemory(both))
+    error, _ = cKDTree(read_compressed_ply(path).means).query(scene.means)
+    assert (error > 0.01).sum() < 256  # of one chunk between them
 
 
 def test_words_are_unpacked_as_the_format_says(tmp_path: Path) -> None:
