@@ -65,7 +65,16 @@ def read_sog(path: StrPath) -> Splats:
     Raises FormatError: it is missing, damaged, of an unknown version, or holds more than `MOST` Gaussians;
     OSError: it cannot be read.
     """
-    path = Path(path)
+    return _decoded(*_opened(Path(path)))
+
+
+def count_of(path: StrPath) -> int:
+    """How many Gaussians a SOG says that it has. Args and raises as `read_sog`."""
+    return _opened(Path(path))[0].count
+
+
+def _opened(path: Path) -> tuple[_Meta, Folder | Archive]:
+    """What meta.json says, and where the images are."""
     if not path.is_file() and not path.is_dir():
         raise FormatError(f"{path}: there is no SOG; give a .sog file, or a folder with meta.json")
     if path.name == INDEX or ((path / INDEX).is_file() and not (path / META).is_file()):
@@ -80,7 +89,7 @@ def read_sog(path: StrPath) -> Splats:
         raise FormatError(
             f"{path}: {meta.count:,} Gaussians cannot be in {files.size:,} bytes; export it again"
         )
-    return _decoded(meta, files)
+    return meta, files
 
 
 def _decoded(meta: _Meta, files: Folder | Archive) -> Splats:

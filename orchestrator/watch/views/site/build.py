@@ -25,6 +25,7 @@ from panolog.export.site.page import (
 from panolog.export.site.write import MOST_IN_ONE, SKY, write_page, write_site
 from panolog.export.sky import WIDTH, render_sky, write_sky_image
 from panolog.export.sog.folder import INDEX
+from panolog.export.sog.read import count_of
 from panolog.export.sog.streamed import write_streamed
 from panolog.export.sog.write import write_sog
 from panolog.export.splats import InMemory, Selection, Splats
@@ -92,7 +93,7 @@ def site_of_file(path: Path, wanted: Wanted) -> Shown:
 
     Raises InputError if it cannot be read or has no Gaussians.
     """
-    if path.suffix.lower() == _SOG:
+    if path.suffix.lower() == _SOG and (count := count_of(path)) <= (wanted.most or count):
         return Shown(Page(path.stem), lambda folder: _copied(path, folder), None)
     place = wanted.place or Georeference()
     model = open_model(path, place.upside_down, wanted.selection)

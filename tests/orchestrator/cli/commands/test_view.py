@@ -123,6 +123,8 @@ def test_the_command_writes_one_file_or_a_folder(folder: RunFolder, browsed: lis
     assert len(list((folder.root / "site" / "photos").iterdir())) == 6
     done = view(folder.root / "site" / "model.sog", "-o", folder.root / "again")
     assert (done.exit_code, done.stderr) == (0, "")
+    done = view(folder.root / "site" / "model.sog", "-o", page, "--max-gaussians", 5)
+    assert done.stderr.endswith("5 of 20 Gaussians\n")
 
 
 def test_the_command_serves_and_opens_the_page(
@@ -165,9 +167,11 @@ def test_sigterm_ends_the_command_and_leaves_nothing(folder: RunFolder, tmp_path
 
 
 def test_wrong_arguments_of_the_command(folder: RunFolder, browsed: list[str], tmp_path: Path) -> None:
+    (damaged := tmp_path / "damaged.sog").write_bytes(b"no model")
     for wrong in (
         ["/none"],
         [tmp_path],
+        [damaged, "-o", tmp_path / "page"],
         [folder.root, "--task", TaskId.block(9)],
         [folder.model(COARSE), "--task", COARSE],
         [folder.model(COARSE), "--camera", "pano_0.jpg"],
