@@ -64,9 +64,10 @@ def _sog(model: ChosenModel, path: Path) -> list[Path]:
 def _spz(model: ChosenModel, path: Path) -> list[Path]:
     """The sky, whose size SPZ may not hold, is a file of its own: pulled in, so that it looks the same."""
     write_spz(path, _source(model, "scene"), model.spz)
-    if not model.sky or not len(read_sky(model.ply)):
-        return [path]
     sky = sky_of(path)
+    if not model.sky or not len(read_sky(model.ply)):
+        sky.unlink(missing_ok=True)  # of an earlier export, which readers of the scene would take for its own
+        return [path]
     write_spz(sky, _source(model, "sky").within(REACH, LARGEST), model.spz)
     return [path, sky]
 

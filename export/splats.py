@@ -218,10 +218,10 @@ class ModelSource:
         def farthest(parts: Iterable[Floats]) -> float:
             return max((float(np.linalg.norm(part - center, axis=1).max()) for part in parts), default=0.0)
 
-        reach = farthest(piece.means for piece in self.part("scene")._selected())
-        factor = _SKY * reach / farthest(sky)
+        reach = _SKY * farthest(piece.means for piece in self.part("scene")._selected())
+        far = farthest(sky)  # 0 of a single one
         x, y, z = center.tolist()
-        return replace(self, sky=Ball((x, y, z), factor)) if 0 < factor < 1 else self
+        return replace(self, sky=Ball((x, y, z), reach / far)) if 0 < reach < far else self
 
     def within(self, reach: float, size: float) -> "ModelSource":
         """The same, made smaller around the origin of its frame until it fits: from there it looks the same.

@@ -272,6 +272,23 @@ def test_a_sky_that_spz_cannot_hold_is_pulled_in(run: RunFolder, tmp_path: Path)
     assert len(read_model(tmp_path / "far.spz")) == len(whole) - whole.sky
 
 
+def test_a_sky_of_an_earlier_spz_goes_with_it(run: RunFolder, tmp_path: Path) -> None:
+    """Read with the scene that was exported without one, it came back."""
+    for options, files in ((), {"a.spz", "a-sky.spz"}), (("--without-sky",), {"a.spz"}):
+        export(run.root, "-o", tmp_path / "a.spz", *options)
+        assert {path.name for path in tmp_path.iterdir()} == files
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_sky_of_one_gaussian(run: RunFolder, tmp_path: Path, count: int) -> None:
+    """Its reach is 0, also where there is no scene."""
+    whole = read_ply(run.point_cloud)
+    last = whole.select(torch.arange(len(whole)) >= len(whole) - 1 - count)
+    write_ply(tmp_path / "a.ply", last.with_tensors(last.tensors(), sky=1))
+    export(tmp_path / "a.ply", "-o", tmp_path / "out", "--sog", "--ply", "--compressed-ply")
+    assert len(read_model(tmp_path / "out" / "a.sog")) == 1 + count
+
+
 def test_rows_that_are_no_gaussians_are_counted(run: RunFolder, tmp_path: Path) -> None:
     whole = read_ply(run.point_cloud)
     tensors = {name: tensor.clone() for name, tensor in whole.tensors().items()}
