@@ -18,9 +18,14 @@ _SPZ = (b"\x1f\x8b", b"NGSP")  # gzip, and version 4
 
 
 def is_ply(path: Path) -> bool:
-    """Whether a file is a PLY as trainers write it. Raises FormatError if it cannot be read."""
+    """Whether a path is a PLY as trainers write it. Raises FormatError if it cannot be read."""
     head = _head(path)
     return head.startswith(b"ply") and b"element chunk" not in head
+
+
+def is_spz(path: Path) -> bool:
+    """Whether a path is an SPZ, whatever its name. Raises FormatError if it cannot be read."""
+    return _head(path).startswith(_SPZ)
 
 
 def read_model(path: Path) -> Splats:
@@ -54,7 +59,7 @@ def convert_to_ply(path: Path, output: StrPath, frame: Frame, *, exact: bool = F
         return
     model = read_model(path).turned(frame.inverse).gaussians(exact=exact)
     sky = sky_of(path)
-    if path.suffix == sky.suffix and sky.is_file():
+    if is_spz(path) and sky.is_file():
         apart = read_model(sky).turned(frame.inverse).gaussians(exact=exact)
         model = concatenate(model, apart.with_tensors(apart.tensors(), sky=len(apart)))
     write_ply(output, model)
@@ -66,6 +71,9 @@ def sky_of(path: Path) -> Path:
 
 
 def _head(path: Path) -> bytes:
+    """The first bytes; none of a folder, which may be a SOG."""
+    if path.is_dir():
+        return b""
     try:
         with path.open("rb") as file:
             return file.read(_HEAD)

@@ -8,7 +8,7 @@ from typing import Literal
 
 from panolog.export.frame import Frame
 from panolog.export.georeference import georeference_of
-from panolog.export.reading import convert_to_ply, is_ply
+from panolog.export.reading import convert_to_ply, is_ply, is_spz
 from panolog.orchestrator.cli.console import say
 from panolog.scene.model import Scene
 from panolog.scene.ply import describe_faults, ply_exported
@@ -21,7 +21,7 @@ def frame_in(path: Path, scene: Scene, axes: Axes) -> Frame:
     if axes == "model":
         return Frame()
     place = georeference_of(scene)
-    return place.frame if path.suffix == ".spz" else place.upside_down
+    return place.frame if is_spz(path) else place.upside_down
 
 
 def size_of(path: Path) -> int:

@@ -92,6 +92,9 @@ def parse_view(
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", size or "")
     if size is not None and match is None:
         raise InputError(f"--size {size}: write it like 1280x720")
+    for name, angle in (("yaw", yaw), ("pitch", pitch)):
+        if not math.isfinite(angle or 0):
+            raise InputError(f"--{name} {angle}: write a number of degrees")
     pixels = (int(match[1]), int(match[2])) if match else None
     view = ViewSpec(None, fov, pixels, yaw or 0.0, pitch or 0.0, fps)
     try:
@@ -130,7 +133,7 @@ def render_views(
     exact = job is not None and ply_exact(job.folder.point_cloud)
     with as_ply(file, lambda: frame_in(file, job.scene, axes) if job else Frame(), exact=exact) as ply:
         shown = read_ply(ply).to(device)
-    views = _poses(job, poses, frames, ply_offset(job.folder.point_cloud if job else ply))
+        views = _poses(job, poses, frames, ply_offset(job.folder.point_cloud if job else ply))
     width = view.width or (job.width if job else _WIDTH)
     lens = view.lens(width)
     size = (lens.width, lens.height) if lens else (width, width // 2)

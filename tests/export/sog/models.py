@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.export.sog.write import write_sog
-from panolog.export.splats import REST, InMemory, Splats
+from panolog.export.splats import REST, InMemory, Splats, SplatSource
 
 Quats = NDArray[np.float32]
 
@@ -39,7 +39,7 @@ def turned_alike(quats: Quats, as_these: Quats) -> Quats:
     return np.asarray(quats * np.sign((quats * as_these).sum(axis=1, keepdims=True)), np.float32)
 
 
-def write_unpacked(folder: Path, source: InMemory) -> None:
+def write_unpacked(folder: Path, source: SplatSource) -> None:
     """A SOG as the folder that is in its file."""
     write_sog(packed := folder.with_suffix(".sog"), source)
     with zipfile.ZipFile(packed) as archive:

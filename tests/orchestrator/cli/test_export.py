@@ -99,13 +99,14 @@ def test_the_same_folder_again(run: RunFolder, tmp_path: Path) -> None:
     assert "exists already" in one_line(again)
 
 
-@pytest.mark.parametrize("kind", MODELS)
+@pytest.mark.parametrize("kind", [*MODELS, "SPZ"])
 def test_what_is_exported_comes_back(
     run: RunFolder, seen: NDArray[np.float64], tmp_path: Path, kind: str
 ) -> None:
     """In the place of the run's scene; read as it stands, it is elsewhere."""
-    file = tmp_path / f"model.{kind.replace('-', '.')}"
+    file = tmp_path / f"model.{kind.lower().replace('-', '.')}"
     export(run.root, "-o", file)
+    file = file.rename(tmp_path / f"model.{kind}")  # the content decides
     for name, options in (("back", []), ("off", ["--frame", "model"])):
         words = ("--model", file, "-o", tmp_path / name, "--path", 2, *options)
         assert panolog("render", run.root, *words).exit_code == 0

@@ -7,11 +7,13 @@ import cv2
 import pytest
 from typer.testing import Result
 
+from panolog.export.splats import ModelSource
 from panolog.orchestrator.cli.commands.render import lens_like
 from panolog.renderer.camera import Lens
 from panolog.scene.ply import write_ply
 from panolog.scene.read import read_scene
 from panolog.workers.training.initialise import scene_gaussians
+from tests.export.sog.models import write_unpacked
 from tests.orchestrator.cli.program import call, one_line
 
 FRAMES = 4
@@ -85,6 +87,8 @@ def test_a_video_that_is_cut_off_leaves_nothing(
         (("--fov", "90", "--size", "40000x20"), "at most 32766"),
         (("--fov", "200"), "--fov 200: the field of view is 200 degrees, must be above 0 and below 180"),
         (("--fov", "90", "--width", "64"), "give --size"),
+        (("--fov", "90", "--yaw", "nan"), "--yaw nan: write a number of degrees"),
+        (("--fov", "90", "--pitch", "-inf"), "--pitch -inf: write a number of degrees"),
         (("--fps", "30"), "give --mp4 too"),
         (("--size", "8x8"), "give --fov too"),
     ],
@@ -111,3 +115,14 @@ def test_pictures_along_a_path_are_written_one_by_one(ply: Path, poses: Path, tm
     done = render(ply, "-o", tmp_path / "out", "--poses", poses, "--width", 32)
     assert (done.exit_code, done.stderr) == (0, f"{FRAMES} pictures in {tmp_path / 'out'}\n")
     assert len(list((tmp_path / "out").iterdir())) == FRAMES
+
+
+@pytest.mark.parametrize("name", ["up.ply", "up.spz", "folder"])
+def test_an_exported_model_without_its_run(ply: Path, poses: Path, tmp_path: Path, name: str) -> None:
+    """It is read through a temporary PLY, which was gone before its offset was read."""
+    if name == "folder":
+        write_unpacked(tmp_path / name, ModelSource(ply))
+    else:
+        assert call("export", ply, "-o", tmp_path / name).exit_code == 0
+    done = render(tmp_path / name, "-o", tmp_path / "out", "--poses", poses, "--width", 32)
+    assert (done.exit_code, len(list((tmp_path / "out").iterdir()))) == (0, FRAMES), done.output

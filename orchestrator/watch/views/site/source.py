@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from panolog.export.frame import HALF_TURN, Frame
-from panolog.export.reading import is_ply, read_model
+from panolog.export.reading import is_ply, is_spz, read_model
 from panolog.export.splats import REST, InMemory, ModelSource, Selection, Splats, SplatSource
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
@@ -57,7 +57,7 @@ def _of_export(path: Path, chosen: Selection) -> Model:
     """A file in a format of others; its frame is theirs: SPZ is y up, and what pages show y down."""
     splats = read_model(path)
     kept = splats.select(replace(chosen, part="all").keeps(splats, np.ones(len(splats), np.bool_)))
-    if path.suffix.lower() == ".spz":
+    if is_spz(path):
         kept = kept.turned(HALF_TURN)
     return Model(InMemory(kept.reduced(chosen.degree)), None, len(splats))
 

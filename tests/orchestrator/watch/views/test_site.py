@@ -12,15 +12,20 @@ import torch
 from playwright.sync_api import Browser, expect
 from scipy.spatial.transform import Rotation
 
+from panolog.export.frame import Frame
+from panolog.export.splats import InMemory, Selection
+from panolog.export.spz import read_spz, write_spz
 from panolog.orchestrator.runs.folder import RunFolder, model_of, write_json
 from panolog.orchestrator.watch.views.site import build
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_file, site_of_run, write_folder
 from panolog.orchestrator.watch.views.site.photographs import panorama_rotations, photograph
+from panolog.orchestrator.watch.views.site.source import open_model
 from panolog.orchestrator.watch.views.site.viewpoints import read_viewpoints
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import write_ply, write_ply_parts
 from panolog.scene.read import read_scene
 from panolog.workers.tasks import COARSE, TaskId
+from tests.export.gaussians import scattered
 from tests.orchestrator.history import begun
 from tests.orchestrator.watch.dashboard.browser import opened, program
 from tests.orchestrator.watch.views.models import save_checkpoint, save_model, save_plan, some
@@ -219,6 +224,14 @@ def test_a_model_of_sky_alone_is_shown(tmp_path: Path) -> None:
     write_ply(tmp_path / "sky.ply", some(9, sky=9))
     page = site_of_file(tmp_path / "sky.ply", Wanted()).page
     assert (page.total, page.sky) == (9, None)
+
+
+def test_an_spz_is_upright_whatever_its_name(tmp_path: Path) -> None:
+    """It is y up, and what pages show y down."""
+    for name in ("model.spz", "model"):
+        write_spz(tmp_path / name, InMemory(scattered(30)))
+        (piece,) = open_model(tmp_path / name, Frame(), Selection()).scene.pieces()
+        assert np.allclose(piece.means, read_spz(tmp_path / name).means * (-1, -1, 1))
 
 
 WIDTH, HEIGHT = 800, 500  # pixels of a window
