@@ -75,4 +75,7 @@ def _write_exr(path: Path, image: Image) -> None:
     linear = np.where(dark <= 0.04045, dark / 12.92, ((dark + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic(path) as temporary:
-        OpenEXR.File(header, {"RGB": linear.astype(np.float16)}).write(str(temporary))
+        try:
+            OpenEXR.File(header, {"RGB": linear.astype(np.float16)}).write(str(temporary))
+        except RuntimeError as error:  # so it says that the disk is full
+            raise OSError(f"{path}: {error}") from error

@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 StrPath: TypeAlias = str | os.PathLike[str]  # what users may give where a path is needed
 SUFFIX = ".part"
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NUMBER = re.compile("0*([0-9]+)")
 Locate = Callable[[Path], Path]  # a path as the run has it -> where the file is on this machine
 
@@ -81,22 +82,11 @@ def atomic(path: Path) -> Iterator[Path]:
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{SUFFIX}")
     try:
-        with _naming(path):
+        with _named(path, temporary):
             yield temporary
             publish(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Inside, the error of a disk that takes no more bytes names `path`: the system gives it no file."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            error.filename = str(path)
-        raise
 
 
 @contextmanager
@@ -109,9 +99,10 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     Raises OSError: the folder above is missing or cannot be written, or the disk is full.
     """
     new, old = (folder.with_name(f".{folder.name}.{secrets.token_hex(4)}{SUFFIX}") for _ in range(2))
-    new.mkdir()
+    with _named(folder, new):
+        new.mkdir()
     try:
-        with _naming(folder):
+        with _named(folder, new):
             yield new
         if folder.exists():
             folder.rename(old)
@@ -126,6 +117,17 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(new, ignore_errors=True)
         if folder.exists():
             shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def _named(path: Path, temporary: Path) -> Iterator[None]:
+    """Names what is written in the error of a full disk, which names nothing, and of its temporary file."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL or str(error.filename) == str(temporary):
+            error.filename = str(path)
+        raise
 
 
 def publish(source: Path, path: Path) -> None:

@@ -89,6 +89,8 @@ def test_files(tmp_path: Path) -> None:
     pixels = exr.File(str(tmp_path / "sky.exr")).channels()["RGB"].pixels
     np.testing.assert_allclose(pixels[0, 0], 0, atol=1e-3)
     assert pixels[-1, -1].max() > 1.2  # linear light, not cut at 1
+    with pytest.raises(OSError, match=r"sky\.exr: .*No such file"):
+        write_sky_image(tmp_path / "none" / "sky.exr", image)
     with pytest.raises(InputError, match=r"sky\.png: the picture of a sky is \.jpg or \.exr"):
         write_sky_image(tmp_path / "sky.png", image)
     assert {path.name for path in tmp_path.iterdir()} == {"sky.jpg", "sky.exr"}

@@ -1,3 +1,4 @@
+import errno
 import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -27,13 +28,16 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("appearing", [atomic, atomic_folder])
-def test_a_full_disk_names_what_was_written(
-    appearing: Callable[[Path], AbstractContextManager[Path]], tmp_path: Path
+@pytest.mark.parametrize("writer", [atomic, atomic_folder])
+def test_an_error_names_what_is_written(
+    tmp_path: Path, writer: Callable[[Path], AbstractContextManager[Path]]
 ) -> None:
-    with pytest.raises(OSError, match="No space left") as full, appearing(tmp_path / "a"):
-        Path("/dev/full").write_bytes(b"new")
-    assert full.value.filename == str(tmp_path / "a")
+    with pytest.raises(OSError, match="full") as caught, writer(tmp_path / "a"):
+        raise OSError(errno.ENOSPC, "full")
+    assert caught.value.filename == str(tmp_path / "a")
+    with pytest.raises(OSError, match="No such file") as caught, writer(tmp_path / "none" / "a") as temporary:
+        temporary.write_bytes(b"")
+    assert caught.value.filename == str(tmp_path / "none" / "a")
 
 
 def test_a_pipe_gets_the_bytes_and_stays_a_pipe(tmp_path: Path) -> None:

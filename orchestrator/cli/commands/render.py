@@ -167,13 +167,19 @@ def _video(path: Path, size: tuple[int, int], fps: int) -> Iterator[Callable[[Im
             if not writer.isOpened():
                 raise RunError(f"{path}: OpenCV cannot encode a video of {size[0]}x{size[1]} pixels here")
 
+            written = 0
+
             def write(image: Image) -> None:
+                nonlocal written
                 # of OpenCV 5; 4 returns None
                 if writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR)) is False:
                     raise RunError(f"{path}: a frame cannot be written; is the disk full?")
+                written += 1
 
             yield write
-            writer.release()
+            writer.release()  # says nothing if the disk is full
+            if cv2.VideoCapture(str(growing)).get(cv2.CAP_PROP_FRAME_COUNT) != written:
+                raise RunError(f"{path}: its end cannot be written; is the disk full?")
             growing.replace(temporary)
         finally:
             growing.unlink(missing_ok=True)

@@ -1,7 +1,9 @@
 """`panolog render`: the size of perspective views, and videos."""
 
 import json
+import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -75,6 +77,28 @@ def test_a_video_that_is_cut_off_leaves_nothing(
     out = tmp_path / "out"
     assert render(ply, "-o", out, "--poses", poses, "--fov", 90, "--size", "64x36", "--mp4").exit_code == 130
     assert list(out.iterdir()) == []
+
+
+def test_a_video_whose_end_is_missing_is_none(
+    ply: Path, poses: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a full disk OpenCV wrote what fitted, and said nothing."""
+
+    class Full:
+        fourcc, real = cv2.VideoWriter.fourcc, cv2.VideoWriter
+
+        def __init__(self, name: str, *arguments: Any) -> None:
+            self.name, self.writer = name, self.real(name, *arguments)
+            self.isOpened, self.write = self.writer.isOpened, self.writer.write
+
+        def release(self) -> None:
+            self.writer.release()
+            os.truncate(self.name, 600)
+
+    monkeypatch.setattr(cv2, "VideoWriter", Full)
+    done = render(ply, "-o", tmp_path / "out", "--poses", poses, "--width", 64, "--mp4")
+    assert done.exit_code == 1 and "is the disk full?" in done.stderr
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 @pytest.mark.parametrize(
