@@ -92,6 +92,8 @@ def export_model(
         write_json(output / _GEOREFERENCE, model.place.as_json(model.made_of))
         written.append(output / _GEOREFERENCE)
     faults = describe_faults(model.ply) if model.run is None else []
+    if model.run is not None and model.ply != model.run.point_cloud:
+        faults = [f"{model.run.root}: is not merged yet; this is its model of Stage I"]
     for line in (*faults, *_doubts(model.place, formats)):
         say(line)
     progress("writing", len(jobs), len(jobs))

@@ -18,6 +18,7 @@ from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import read_ply, write_ply
 from panolog.scene.read import read_scene
 from panolog.scene.write import Offset, Origin, write_offset
+from panolog.workers.tasks import COARSE
 from panolog.workers.training.initialise import scene_gaussians
 from tests.orchestrator.cli.program import call as panolog
 from tests.orchestrator.cli.program import one_line, shown
@@ -214,6 +215,14 @@ def test_a_run_whose_scene_is_gone(run: RunFolder, tmp_path: Path) -> None:
     (tmp_path / "all" / "georef.json").rename(copy.georeference)
     export(copy.root, "-o", file)
     assert file.read_bytes() == (tmp_path / "all" / "place.sog").read_bytes()
+
+
+def test_a_run_that_is_not_merged(run: RunFolder, tmp_path: Path) -> None:
+    shutil.copytree(run.root, tmp_path / "place")
+    copy = RunFolder(tmp_path / "place")
+    copy.of(COARSE).mkdir()
+    copy.point_cloud.rename(copy.model(COARSE))
+    assert "this is its model of Stage I" in export(copy.root, "-o", tmp_path / "a.sog").stderr
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04"])
