@@ -117,7 +117,7 @@ class Georeference:
             "exports": {
                 "axes": "x right, y up, z backward",
                 "in_metres": [".glb", "tileset.json"],
-                "half_turn_around_z": [".sog", ".compressed.ply", "lod-meta.json"],
+                "half_turn_around_z": [".sog", ".ply", ".compressed.ply", "lod-meta.json"],  # .ply: of --ply
                 "rotation": frame.rotation.tolist(),
                 "origin": frame.origin.tolist(),
                 "wgs84": place,

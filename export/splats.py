@@ -54,11 +54,12 @@ class Splats:
 
     @staticmethod
     def of(gaussians: Gaussians) -> "Splats":
-        """The same: unit quaternions (the identity for what has no length), and finite logarithms."""
+        """The same: unit quaternions (the identity for zeros, NaN if not finite), and finite logarithms."""
         found = {name: tensor.detach().cpu().numpy() for name, tensor in gaussians.tensors().items()}
-        lengths = np.linalg.norm(found["quats"], axis=1, keepdims=True)
-        sound = np.isfinite(lengths) & (lengths > 0)
-        quats = np.where(sound, found["quats"] / np.where(sound, lengths, 1), np.array([1.0, 0, 0, 0]))
+        wide = found["quats"].astype(np.float64)  # whose squares neither overflow nor vanish
+        lengths = np.linalg.norm(wide, axis=1, keepdims=True)
+        lengths[~np.isfinite(lengths)] = np.nan
+        quats = np.where(lengths == 0, np.array([1.0, 0, 0, 0]), wide / np.where(lengths == 0, 1, lengths))
         return Splats(
             means=found["means"],
             quats=quats.astype(np.float32),

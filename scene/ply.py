@@ -32,6 +32,7 @@ COLUMNS = (
     *(f"scale_{i}" for i in range(3)),
     *(f"rot_{i}" for i in range(4)),
 )
+_BOUNDED = ("opacity", "scale_0", "scale_1", "scale_2")  # exports write an infinite one as a finite one
 _REST_OF_DEGREE = (0, 3, 8, 15)  # coefficients of one channel beyond degree 0
 _ROW = np.dtype([(name, "<f4") for name in COLUMNS])
 
@@ -192,15 +193,23 @@ def ply_exported(path: Path) -> bool:
 def describe_faults(path: Path) -> list[str]:
     """What is wrong with the Gaussians of a PLY, one line for each kind. Raises PlyError as `ply_header`."""
     table, _, _ = _open(path)
-    numbers = [name for name in COLUMNS if name in (table.dtype.names or ())]
-    infinite = empty = 0
+    numbers = [name for name in COLUMNS if name in (table.dtype.names or ()) and name[0] != "n"]
+    lost = infinite = empty = 0
     for start in range(0, table.count, CHUNK):
         rows = table.rows(start, min(start + CHUNK, table.count))
-        infinite += int((~np.all([np.isfinite(rows[name]) for name in numbers], axis=0)).sum())
+        inside = [rows[name].clip(-1, 1) if name in _BOUNDED else rows[name] for name in numbers]
+        kept = np.all(np.isfinite(inside), axis=0)
+        lost += int((~kept).sum())
+        infinite += int((kept & np.any([np.isinf(rows[name]) for name in _BOUNDED], axis=0)).sum())
         empty += int(np.all([rows[f"rot_{axis}"] == 0 for axis in range(4)], axis=0).sum())
     lines, of = [], f"of {table.count:,} Gaussians have"
+    if lost:
+        lines.append(f"{path}: {lost:,} {of} numbers that are not finite; exports leave them out")
     if infinite:
-        lines.append(f"{path}: {infinite:,} {of} numbers that are not finite; exports leave them out")
+        lines.append(
+            f"{path}: {infinite:,} {of} an infinite opacity or size; exports bound it, and renders leave "
+            "them out"
+        )
     if empty:
         lines.append(
             f"{path}: {empty:,} {of} a rotation of zeros, as rows have that a program did not write; export "

@@ -86,6 +86,8 @@ def test_all_formats_at_once(run: RunFolder, tmp_path: Path) -> None:
     assert all(size > 0 for size in files.values())
     place = json.loads((out / "georef.json").read_bytes())
     assert place["exports"]["wgs84"]["latitude"] == pytest.approx(48.137, abs=1e-3)
+    turned = place["exports"]["half_turn_around_z"]
+    assert {".sog", ".ply", ".compressed.ply"} < set(turned) and ".spz" not in turned
     assert place["provenance"]["scene"] == read_scene(run.root.parent / "scene").fingerprint
     root = json.loads((out / "3dtiles" / "tileset.json").read_bytes())["root"]
     assert np.linalg.norm(root["transform"][12:15]) == pytest.approx(6.37e6, rel=0.01)
@@ -302,12 +304,17 @@ def test_a_sky_of_one_gaussian(run: RunFolder, tmp_path: Path, count: int) -> No
 def test_rows_that_are_no_gaussians_are_counted(run: RunFolder, tmp_path: Path) -> None:
     whole = read_ply(run.point_cloud)
     tensors = {name: tensor.clone() for name, tensor in whole.tensors().items()}
-    tensors["means"][:5] = torch.nan
+    tensors["means"][:3] = torch.nan
+    tensors["quats"][3, 2], tensors["quats"][4, 0] = torch.nan, torch.inf
+    tensors["opacities"][20:22] = torch.inf
+    tensors["scales"][22, 0] = -torch.inf
     for tensor in tensors.values():
         tensor[10:17] = 0
     write_ply(tmp_path / "bad.ply", whole.with_tensors(tensors))
     done = export(tmp_path / "bad.ply", "-o", tmp_path / "bad.sog")
     left_out = f"5 of {len(whole)} Gaussians have numbers that are not finite; exports leave them out"
     assert left_out in done.stderr
+    assert len(read_model(tmp_path / "bad.sog")) == len(whole) - 5
+    assert f"3 of {len(whole)} Gaussians have an infinite opacity or size" in done.stderr
     assert f"7 of {len(whole)} Gaussians have a rotation of zeros" in done.stderr
     assert "not finite" not in export(run.point_cloud, "-o", tmp_path / "good.sog").stderr
