@@ -74,6 +74,11 @@ class RunFolder:
     images = _At("eval/images")  # held-out renders above their photographs
     seams = _At("eval/seams.json")  # what was measured at the faces between blocks
 
+    @property
+    def place(self) -> Path:
+        """The folder's absolute path, without `..`, so that it has a name."""
+        return Path(os.path.normpath(self.root.absolute()))
+
     def make(self, place: Path) -> None:
         """Makes a folder below that of the run, with those between. Raises OSError.
 

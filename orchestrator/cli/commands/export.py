@@ -110,7 +110,7 @@ def _model(source: Path, spec: ExportSpec) -> _Model:
         place, made_of, name = (
             _place_of(folder),
             provenance(info.scene.fingerprint, info.config, info.versions),
-            folder.root.absolute().name,
+            folder.place.name,
         )
     else:
         ply, place, made_of, name = source, Georeference(), {}, source.stem

@@ -225,6 +225,8 @@ def test_a_run_that_is_not_merged(run: RunFolder, tmp_path: Path) -> None:
     copy.of(COARSE).mkdir()
     copy.point_cloud.rename(copy.model(COARSE))
     assert "this is its model of Stage I" in export(copy.root, "-o", tmp_path / "a.sog").stderr
+    export(copy.of(COARSE) / "..", "-o", tmp_path / "out", "--sog")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"place.sog", "georef.json"}
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04"])

@@ -59,7 +59,7 @@ def write_report(folder: RunFolder, output: Path | None = None, *, running: bool
     prepared = view_preparation(folder, history.state, running=running)
     view = view_run(history, info, running=running, root=folder.root, preparation=prepared)
     answers = dict(_answers(folder, view, read_findings(folder)))
-    message = _message(folder, view, next_to=path.absolute().parent == folder.root.absolute())
+    message = _message(folder, view, next_to=RunFolder(path.parent).place == folder.place)
     write_snapshot(path, RUN, answers, {"run": message}, _own_paths(folder, info, prepared))
     return path
 
@@ -83,7 +83,7 @@ def report_or_notice(folder: RunFolder) -> list[Record]:
 def _own_paths(folder: RunFolder, info: dict[str, Any], prepared: PreparationView | None) -> list[str]:
     """Paths of this machine that a reader elsewhere needs to know no more of than their names."""
     found = [
-        str(folder.root.absolute()),
+        str(folder.place),
         str(info["scene"]["path"]),
         *([prepared.source, *prepared.others] if prepared else []),
     ]
@@ -95,7 +95,7 @@ def _message(folder: RunFolder, view: RunView, *, next_to: bool) -> dict[str, An
 
     Args: next_to, whether the report is in the run's folder, so that links lead to what is there.
     """
-    root, summary = folder.root.absolute(), view.summary
+    root, summary = folder.place, view.summary
     notices = tuple(notice for notice in summary.notices if _INSTALL not in notice.message)
     return dict(view) | {
         "summary": summary.model_copy(update={"notices": notices}),

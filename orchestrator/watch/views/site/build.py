@@ -79,7 +79,7 @@ def site_of_run(folder: RunFolder, wanted: Wanted, locate: Locate = here) -> Sho
     viewpoints = read_viewpoints(folder, wanted.task, wanted.camera, locate)
     place = wanted.place or place_of(folder, viewpoints, locate)
     model = open_model(path, place.upside_down, wanted.selection)
-    page = _page(f"{wanted.task or 'model'} of {folder.root.absolute().name}", model, place, wanted)
+    page = _page(f"{wanted.task or 'model'} of {folder.place.name}", model, place, wanted)
     scene = None
     if viewpoints is not None:
         cameras, scene = _cameras(viewpoints, place.frame, local_folder(read_head(folder)[0]))
