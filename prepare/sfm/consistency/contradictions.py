@@ -71,18 +71,22 @@ def find_contradictions(
     sides = components(skeleton.certain, len(evidence.rays))
     known = [Pair(edge, np.empty((0, 2), np.int64), 1.0) for edge in sorted(skeleton.star)]
     way = widest_tree([*agreeing, *known], len(evidence.rays))
+    shares = {pair.between: pair.share for pair in agreeing}
     likely = []
     for pair, fit, median in against:
         guessed = sides[pair.between[0]] != sides[pair.between[1]]
         if skeleton.ordered:
             counts = pair.coverage >= _AS_NEIGHBOURS * covered and (guessed or median < _DRIFTED)
+            usual_share = share
         else:
-            least = min((way[edge] for edge in tree_path(way, pair.between)), default=0.0)
+            path = tree_path(way, pair.between)
+            least = min((way[edge] for edge in path), default=0.0)
             counts = pair.coverage >= _MARGIN * least
+            usual_share = min([share, *(shares[edge] for edge in path if edge in shares)])
         nearer = max(1.0, parallax / pair.parallax) if pair.parallax else 1.0  # shares more, if it is true
         if pair.between in skeleton.tree:
             contradictions.append(fit)
-        elif counts and pair.share >= _SHARED * share * np.sqrt(nearer):
+        elif counts and pair.share >= _SHARED * usual_share * np.sqrt(nearer):
             likely.append((pair, fit))
     if likely and skeleton.ordered:
         doubted = _outvoted(skeleton, agreeing, [pair for pair, _ in likely])
@@ -148,6 +152,7 @@ def consistent_part(
     coverage = {pair.between: pair.coverage for pair in evidence.pairs}
     part, star, known = set(rows), skeleton.star, sorted(skeleton.given)[:1]
     tree = {edge for edge in skeleton.tree if set(edge) <= part}
+    carried = {row for edge in tree for row in edge}
     if is_repetitive(skeleton, rows):
         tree -= skeleton.rivalled
         part = _largest(part, tree | star, known or sorted(part), len(evidence.rays))
@@ -156,7 +161,8 @@ def consistent_part(
             continue
         path = [edge for edge in tree_path(tree | star, it.between) if edge in tree]
         if not path:
-            part -= {max(set(it.between) - skeleton.given)}
+            free = set(it.between) - skeleton.given
+            part -= {max(free - carried or free)}
             continue
         guesses = skeleton.guessed.intersection(path) if known else frozenset()
         tree -= guesses or {min(path, key=lambda edge: (coverage[edge], edge))}

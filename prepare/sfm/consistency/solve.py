@@ -78,7 +78,7 @@ class Solver:
         self._ids, evidence = work.ids(), read_evidence(work, size)
         self._geometries = Geometries(work, size, max_error, evidence)
         evidence = look_again(self._geometries.marked(evidence), self._geometries)
-        self._known, self._given, self._refuted = known, set[int](), set[Edge]()
+        self._known, self._given, self._refuted, self._places = known, set[int](), set[Edge](), places
         if known is not None:
             self._given = set(posed(known, self._ids).poses)
             judged = [pair for pair in evidence.pairs if not self._given.issuperset(pair.between)]
@@ -108,22 +108,23 @@ class Solver:
     def joined(self) -> Solution | None:
         """What is known with those of the other panoramas that agree with it; None if there are none.
 
-        What leads from these to it is guessed by looks. A guess that contradictions refute makes room for the
-        next one; after several, what contradicts is cut off.
+        What leads from these to it is guessed by looks. What contradicts after several guesses is cut off.
         """
-        rows = range(len(self._ids))
+        found = self._part(range(len(self._ids)), cut=True)
+        return found if found is not None and found.found.poses.keys() > self._given else None
+
+    def _guessed(self, rows: Collection[int]) -> Solution | None:
+        """The reconstruction of these panoramas: a guess that it refutes makes room for the next one."""
         found = self.solve(rows)
         for _ in range(_GUESSES):
             if found is None or not (against := refuted_guesses(found.contradictions, found.skeleton)):
                 break
             self._refuted |= against
             before = self._skeleton
-            self._skeleton = find_skeleton(self._evidence, None, self._given, self._refuted)
+            self._skeleton = find_skeleton(self._evidence, self._places, self._given, self._refuted)
             self._evidence = self._thicker(self._evidence, self._skeleton.tree - before.tree)
             found = self.solve(rows)
-        if found is not None and not found.trusted:
-            found = self._part(rows, cut=True)
-        return found if found is not None and found.found.poses.keys() > self._given else None
+        return found
 
     def _part(self, rows: Collection[int], cut: bool) -> Solution | None:
         """The reconstruction of the most of these panoramas that agree.
@@ -131,7 +132,7 @@ class Solver:
         None if these leave out more than a few, but to `cut`; panoramas that nothing carries stay.
         """
         first = 0  # panoramas that had a pose before anything was cut
-        while (found := self.solve(rows)) is not None and not found.trusted:
+        while (found := self._guessed(rows)) is not None and not found.trusted:
             before = sorted(found.found.poses)
             first = first or len(before)
             agreed = consistent_part(before, found.contradictions, found.skeleton, found.evidence)
@@ -183,7 +184,8 @@ class Solver:
             found = posed(model, self._ids)
             against = find_contradictions(evidence, skeleton, found, _CLOSE, self._geometries.motion)
             new = Solution(model, against, evidence, skeleton, found, kept)
-            if best is None or (new.trusted, len(found.poses)) >= (best.trusted, len(best.found.poses)):
+            better = best is None or (new.trusted, len(found.poses)) >= (best.trusted, len(best.found.poses))
+            if turn <= 1 or better:  # the tree alone is not judged by all that its poses decide
                 best = new
             again = _agreeing(new, drift=_DRIFT if turn == 0 else 0.0)
             if again.keys() == kept.keys():

@@ -11,10 +11,17 @@ from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton
 COUNT, AROUND = 6, 360
 
 
-def _contradictions(agreeing: list[Edge], against: list[Edge], ordered: bool, covers: float) -> set[Edge]:
+def _contradictions(
+    agreeing: list[Edge],
+    against: list[Edge],
+    ordered: bool,
+    covers: float,
+    shared: tuple[float, float] = (0.3, 0.3),
+) -> set[Edge]:
     """Of a walk within a ring of houses, each of which looks as that ten degrees further on.
 
-    Args: pairs that agree besides the neighbours, and pairs with copies; covers, the coverage of the latter.
+    Args: pairs that agree besides the neighbours, and pairs with copies; covers, the coverage of the latter;
+        shared, of the features by these, and by the neighbours 2 and 3.
     """
     random = np.random.default_rng(0)
     turn = np.deg2rad(np.arange(AROUND))
@@ -24,8 +31,9 @@ def _contradictions(agreeing: list[Edge], against: list[Edge], ordered: bool, co
     same = np.repeat(np.arange(AROUND)[:, None], 2, axis=1)
     copies = np.column_stack([same[:, 0], (same[:, 0] + 10) % AROUND])
     walk = [(row, row + 1) for row in range(COUNT - 1)]
-    pairs = [Pair(edge, same, 0.9, share=0.3) for edge in (*walk, *agreeing)]
-    pairs += [Pair(edge, copies, covers, share=0.3) for edge in against]
+    shares = {(2, 3): shared[1]}
+    pairs = [Pair(edge, same, 0.9, share=shares.get(edge, 0.3)) for edge in (*walk, *agreeing)]
+    pairs += [Pair(edge, copies, covers, share=shared[0]) for edge in against]
     unit = tuple(ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
     poses = {row: (np.eye(3), shift) for row, shift in enumerate(shifts)}
     found = Posed(poses, dict.fromkeys(range(COUNT), points))
@@ -43,3 +51,10 @@ def test_copies_count_where_they_outvote_what_agrees(agreeing: list[Edge]) -> No
 @pytest.mark.parametrize(("covers", "counts"), [(0.9, True), (0.7, False)])
 def test_without_an_order_copies_count_if_they_cover_as_much(covers: float, counts: bool) -> None:
     assert _contradictions([(0, 2)], [(1, 4)], False, covers) == ({(1, 4)} if counts else set())
+
+
+@pytest.mark.parametrize(("weak", "counts"), [(0.2, True), (0.3, False)])
+def test_without_an_order_copies_count_if_they_share_as_much_as_what_connects(
+    weak: float, counts: bool
+) -> None:
+    assert _contradictions([], [(1, 4)], False, 0.9, (0.16, weak)) == ({(1, 4)} if counts else set())

@@ -116,6 +116,8 @@ def test_the_part_that_agrees_is_cut_where_the_tree_is_weakest() -> None:
     for edge, part in (((2, 9), range(7)), ((3, 4), range(4, 10)), (None, range(10))):
         doubt = [] if edge is None else [Contradiction(edge, 80, 3)]
         assert consistent_part(range(10), doubt, skeleton, evidence) == list(part)
+    later = Skeleton(False, frozenset((row, row + 1) for row in range(1, 9)))  # nothing carries the first
+    assert consistent_part(range(10), [Contradiction((0, 5), 80, 3)], later, evidence) == [*range(1, 10)]
 
 
 def test_panoramas_whose_poses_are_known_need_no_pairs_and_one_edge_joins_others_with_them() -> None:

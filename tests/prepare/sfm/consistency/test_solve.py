@@ -39,6 +39,16 @@ def test_neighbours_in_order_outweigh_sides_that_look_the_same_and_give_equal_po
         assert np.array_equal(shift, again.found.poses[row][1])
 
 
+def test_a_guess_where_the_walk_jumps_is_refuted_and_another_pair_joins_the_parts(tmp_path: Path) -> None:
+    """The walk jumps to where the opposite side looks the same, and returns from there."""
+    place = square(
+        tmp_path, count=COUNT, order=np.array([0, 1, 2, 3, 4, 5, 13, 12, 11, 10, 9, 8, 7, 6, 14, 15])
+    )
+    found = _solve(place)
+    assert found.skeleton.ordered and found.trusted
+    assert _error(place, found) < 0.1
+
+
 def test_without_order_what_lies_around_tells_sides_apart(tmp_path: Path) -> None:
     place = square(tmp_path, count=COUNT, order=np.random.default_rng(4).permutation(COUNT))
     found = _solve(place)
