@@ -55,7 +55,7 @@ def test_poses_that_do_not_fit(tmp_path: Path) -> None:
 
 
 def test_panoramas_without_features(tmp_path: Path) -> None:
-    source = _street(tmp_path / "source", walk([0.9] * 2), OPENGL)
+    source = _street(tmp_path / "source", walk([0.9] * 3), OPENGL)
     for path in (tmp_path / "source" / "images").iterdir():
         cv2.imwrite(str(path), np.full((64, 128), 90, np.uint8))
     with pytest.raises(InputError, match="has no points, and"):
