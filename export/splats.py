@@ -54,7 +54,7 @@ class Splats:
 
     @staticmethod
     def of(gaussians: Gaussians) -> "Splats":
-        """The same: unit quaternions (the identity for zeros, NaN if not finite), and finite logarithms."""
+        """Splats with unit quaternions (the identity for zeros, NaN if not finite), and finite logarithms."""
         found = {name: tensor.detach().cpu().numpy() for name, tensor in gaussians.tensors().items()}
         wide = found["quats"].astype(np.float64)  # whose squares neither overflow nor vanish
         lengths = np.linalg.norm(wide, axis=1, keepdims=True)

@@ -106,7 +106,7 @@ class Streets:
         return streets
 
     def __call__(self, x: Floats, y: Floats) -> tuple[tuple[Floats, Floats], tuple[Bools, Bools]]:
-        """As `paint.Network`; a street continues for a block beyond its last crossing's half."""
+        """Metres from the nearest street each way, and whether it is there: also a block beyond its end."""
         inner = np.pad(self.cells, 2)
         along_x, along_y = inner.copy(), inner.copy()
         along_x[1:-1] |= inner[:-2] | inner[2:]

@@ -129,7 +129,8 @@ class Solver:
     def _part(self, rows: Collection[int], cut: bool) -> Solution | None:
         """The reconstruction of the most of these panoramas that agree.
 
-        None if these leave out more than a few, but to `cut`; panoramas that nothing carries stay.
+        Panoramas that no pair of the skeleton carries stay, unless they contradict. Without `cut`, None where
+        more than `_RIM` of the panoramas would be left out.
         """
         first = 0  # panoramas that had a pose before anything was cut
         while (found := self._guessed(rows)) is not None and not found.trusted:

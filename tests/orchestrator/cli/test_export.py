@@ -295,7 +295,7 @@ def test_a_sky_of_an_earlier_spz_goes_with_it(run: RunFolder, tmp_path: Path) ->
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_sky_of_one_gaussian(run: RunFolder, tmp_path: Path, count: int) -> None:
-    """Its reach is 0, also where there is no scene."""
+    """A sky of one Gaussian has a reach of 0, also where there is no scene."""
     whole = read_ply(run.point_cloud)
     last = whole.select(torch.arange(len(whole)) >= len(whole) - 1 - count)
     write_ply(tmp_path / "a.ply", last.with_tensors(last.tensors(), sky=1))

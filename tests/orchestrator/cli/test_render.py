@@ -143,7 +143,7 @@ def test_pictures_along_a_path_are_written_one_by_one(ply: Path, poses: Path, tm
 
 @pytest.mark.parametrize("name", ["up.ply", "up.spz", "folder"])
 def test_an_exported_model_without_its_run(ply: Path, poses: Path, tmp_path: Path, name: str) -> None:
-    """It is read through a temporary PLY, which was gone before its offset was read."""
+    """Exports are read through a temporary PLY, which was gone before the offset in that PLY was read."""
     if name == "folder":
         write_unpacked(tmp_path / name, ModelSource(ply))
     else:

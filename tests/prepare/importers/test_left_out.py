@@ -164,7 +164,7 @@ def test_nerfstudio_without_what_others_write(tmp_path: Path) -> None:
 def test_the_split_next_to_any_source(
     case: str, files: dict[str, str], test: tuple[int, ...], note: str, tmp_path: Path
 ) -> None:
-    """It was dropped without a word by most formats, and so were names that no panorama has."""
+    """Most formats dropped a split without a note, and names that no panorama has with it."""
     _, source = WRITERS[case][1](tmp_path / "source")
     for name, numbers in files.items():
         lines = [f"pano_0{number}.png\n" for number in numbers.split()]

@@ -227,7 +227,7 @@ def test_a_model_of_sky_alone_is_shown(tmp_path: Path) -> None:
 
 
 def test_an_spz_is_upright_whatever_its_name(tmp_path: Path) -> None:
-    """It is y up, and what pages show y down."""
+    """In an SPZ y is up, and in what pages show y is down."""
     for name in ("model.spz", "model"):
         write_spz(tmp_path / name, InMemory(scattered(30)))
         (piece,) = open_model(tmp_path / name, Frame(), Selection()).scene.pieces()
