@@ -40,6 +40,7 @@ class Reconstruction:
     links: list[Link]  # between parts of it, the weakest first; their rows are those of `from_colmap`
     contradictions: list[Contradiction]  # in it, and between it and what was left out for them
     missing: dict[int, tuple[int, int]]  # rows without a pose: the row with most matches, and how many
+    unconfirmed: frozenset[int]  # those of them that a single pair held
     others: list[tuple[int, ...]]  # rows of the other parts, each right, but not connected to this one
     features: int
     pairs: int
@@ -94,6 +95,7 @@ def reconstruct(
             links=links_of(model, size[0]),
             contradictions=[it for it in against if set(it.between) & set(model.rows)],
             missing={row: shared[row] for row in range(len(panoramas)) if row not in model.rows},
+            unconfirmed=frozenset(solver.unconfirmed.difference(model.rows)),
             others=[other.rows for other in models if other is not model],
             features=features,
             pairs=len(pairs),

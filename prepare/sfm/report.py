@@ -62,7 +62,12 @@ class SfmReport:
                 for row, own in zip(model.rows, errors, strict=True)
             ],
             "missing": [
-                {"name": self._name(row), "most_shared_with": self._name(other), "matches": count}
+                {
+                    "name": self._name(row),
+                    "most_shared_with": self._name(other),
+                    "matches": count,
+                    "unconfirmed": row in self.found.unconfirmed,
+                }
                 for row, (other, count) in self.found.missing.items()
             ],
             "parts": [[self._name(row) for row in rows] for rows in self.found.others],
@@ -107,9 +112,10 @@ class SfmReport:
         for image in content["missing"]:
             if image["name"] in elsewhere:
                 continue
+            why = ", and no second pair confirms what one says" if image["unconfirmed"] else ""
             yield (
                 f"no pose: {image['name']} (shares at most {image['matches']} features, "
-                f"with {image['most_shared_with']})"
+                f"with {image['most_shared_with']}{why})"
             )
         for link in content["weak_links"]:
             jump = "by any factor" if link["scale_error"] is None else f"by {link['scale_error']:.1%}"

@@ -5,6 +5,7 @@ judged by it: their points must be where they are seen, but for its drift. With 
 of panoramas that it has not reached, the mapper starts again, until its result contradicts none of them.
 """
 
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -88,6 +89,7 @@ class Solver:
         self._guide = Guide(work, evidence.rays, max_error * 2 * np.pi / size[0])
         self._evidence = self._thicker(evidence, self._skeleton.tree)
         self.cuts: list[Contradiction] = []  # for which `parts` has left panoramas out
+        self.unconfirmed = set[int]()  # that were left out because a single pair held them
 
     def parts(self, least: int, doubtful: bool = False) -> list[Solution]:
         """Reconstructions of different panoramas, each without a contradiction, the largest first.
@@ -147,7 +149,10 @@ class Solver:
             if len(rows) == len(before):
                 return None
             self.cuts += [it for it in found.contradictions if not set(it.between) <= set(rows)]
-        return found
+        if found is not None and (loose := _unconfirmed(found)):
+            self.unconfirmed |= loose
+            found = self._guessed(found.found.poses.keys() - loose)
+        return found if found is not None and found.trusted else None
 
     def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
         """The pairs of these edges with what matches along their motion."""
@@ -221,6 +226,21 @@ def _agreeing(solution: Solution, drift: float) -> Kept:
         elif matches is not None and len(matches):
             kept[pair.between] = matches
     return kept
+
+
+def _unconfirmed(solution: Solution) -> set[int]:
+    """The panoramas with a pose that a single pair holds, unless the order of capture confirms it.
+
+    A pair that looks alike gives a pose, too: only a second one shows that it is right.
+    """
+    skeleton, found = solution.skeleton, solution.found
+    firm = skeleton.certain if skeleton.ordered or skeleton.given else frozenset[Edge]()
+    held = Counter[int]()
+    for pair in solution.evidence.pairs:
+        off = deviations(found, solution.evidence, pair)
+        if pair.between in skeleton.tree or agrees(solution.evidence, pair, off, _CLOSE):
+            held.update(pair.between)
+    return {row for row in found.poses if held[row] < 2}.difference(*firm)
 
 
 def _fitting(found: Posed, evidence: Evidence, pair: Pair, bound: float) -> NDArray[np.int64] | None:

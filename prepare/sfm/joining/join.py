@@ -109,11 +109,12 @@ def _join(
         pairs = _pairs(work, known, settings.pairing, progress)
         match_pairs(work, pairs, max_error(size[0]), progress)
         model = _points(work, known, size)
-        against, cuts = list[Contradiction](), list[Contradiction]()
+        against, cuts, unconfirmed = list[Contradiction](), list[Contradiction](), set[int]()
         while model.num_reg_images() < len(panoramas):
             solver = Solver(work, size, "incremental", max_error(size[0]), progress, known=model)
             found = solver.joined()
             cuts += solver.cuts
+            unconfirmed |= solver.unconfirmed
             if found is None:
                 break
             model, against = found.model, [*against, *found.contradictions]
@@ -133,6 +134,7 @@ def _join(
         links=links_of(whole, size[0]),
         contradictions=against,
         missing=missing,
+        unconfirmed=frozenset(unconfirmed & missing.keys()),
         others=[],
         features=features,
         pairs=len(pairs),

@@ -40,6 +40,7 @@ def faulty() -> SfmReport:
         ],
         contradictions=[Contradiction((1, 4), 300, 2)],
         missing={3: (2, 17)},
+        unconfirmed=frozenset(),
         others=[],
         features=1000,
         pairs=10,

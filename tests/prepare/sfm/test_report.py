@@ -26,13 +26,23 @@ def test_lines_say_what_is_wrong_and_where() -> None:
 def test_json_and_plot_show_the_same(tmp_path: Path) -> None:
     write_report(tmp_path, faulty())
     read = json.loads((tmp_path / "sfm.json").read_text())
-    assert read["missing"] == [{"name": "d.jpg", "most_shared_with": "c.jpg", "matches": 17}]
+    missing = {"name": "d.jpg", "most_shared_with": "c.jpg", "matches": 17, "unconfirmed": False}
+    assert read["missing"] == [missing]
     assert [link["scale_error"] for link in read["weak_links"]] == [None, 0.02]
     assert read["contradictions"] == [{"between": ["b.jpg", "e.jpg"], "matches": 300, "points": 2}]
     panorama = cv2.imread(str(tmp_path / "sfm.png"))
     assert panorama is not None
     red = (panorama[..., 2] > 150) & (panorama[..., 1] < 100) & (panorama[..., 0] < 60)
     assert red.sum() > 200  # the links, the pair and the panorama without a pose
+
+
+def test_a_panorama_that_one_pair_alone_held_says_so() -> None:
+    report = faulty()
+    report = replace(report, found=replace(report.found, unconfirmed=frozenset({3})))
+    line = list(report.lines())[1]
+    assert line == (
+        "no pose: d.jpg (shares at most 17 features, with c.jpg, and no second pair confirms what one says)"
+    )
 
 
 def test_another_part_is_named_once() -> None:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from panolog.prepare.sfm.consistency.solve import Solution, Solver
@@ -54,6 +55,23 @@ def test_without_order_what_lies_around_tells_sides_apart(tmp_path: Path) -> Non
     found = _solve(place)
     assert not found.skeleton.ordered
     assert _error(place, found) < 0.1  # on a square of 16
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+def test_a_pose_that_a_single_pair_holds_needs_the_order(tmp_path: Path, ordered: bool) -> None:
+    """The two ends of the walk, which each share something with one panorama alone."""
+    order = np.arange(COUNT) if ordered else np.random.default_rng(4).permutation(COUNT)
+    place = square(tmp_path, count=COUNT, order=order)
+    first, last = (int(np.flatnonzero(order == end)[0]) for end in (0, COUNT - 1))
+    ids = place.work.ids()
+    with pycolmap.Database.open(place.work.database) as database:
+        database.delete_two_view_geometry(ids[first], ids[last])
+    with silence_colmap():
+        solver = Solver(place.work, SIZE, "incremental", 2.0, no_progress)
+        (found,) = solver.parts(3)
+    assert found.skeleton.ordered == ordered
+    assert solver.unconfirmed == (set() if ordered else {first, last})
+    assert found.found.poses.keys() == {*range(COUNT)} - solver.unconfirmed
 
 
 def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
