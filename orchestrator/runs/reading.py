@@ -96,7 +96,7 @@ def require_own_journal(path: Path) -> None:
 
 
 def _connected(path: Path, mode: str, timeout_s: float) -> sqlite3.Connection:
-    uri = f"{path.absolute().as_uri()}?mode={mode}"
+    uri = f"{path.resolve().as_uri()}?mode={mode}"  # SQLite refuses `..` at the root
     return sqlite3.connect(uri, uri=True, timeout=timeout_s)
 
 

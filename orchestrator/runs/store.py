@@ -109,7 +109,7 @@ class Database:
         self._streams: dict[TaskId, _Stream] = {}
         require_own_journal(path)
         try:
-            self._connection = sqlite3.connect(path, timeout=TIMEOUT_S, isolation_level=None)
+            self._connection = sqlite3.connect(path.resolve(), timeout=TIMEOUT_S, isolation_level=None)
             self._connection.executescript(_SCHEMA)
         except sqlite3.Error as error:
             raise RunFolderError(f"{path} cannot be opened as the database of a run: {error}") from error

@@ -73,7 +73,7 @@ class Queue:
         except OSError as error:
             raise QueueError(f"{folder}: cannot be created: {error.strerror}") from error
         try:
-            self._connection = sqlite3.connect(path, timeout=_TIMEOUT_S, isolation_level=None)
+            self._connection = sqlite3.connect(path.resolve(), timeout=_TIMEOUT_S, isolation_level=None)
         except sqlite3.Error as error:
             raise _unusable(path, error) from error
         try:

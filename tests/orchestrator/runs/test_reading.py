@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from panolog.orchestrator.runs import lock, reading
+from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.runs.records import Noticed
 from panolog.orchestrator.runs.store import Database, read_records
 from panolog.scene.errors import InputError
@@ -89,6 +90,17 @@ def test_the_folder_of_another_user_stays_as_it_is(dead: Path, monkeypatch: pyte
     assert reading.version(dead) == reading.version(dead)  # and no copy is made for it
     assert messages(dead) == MESSAGES
     assert (dead.read_bytes(), journal(dead).read_bytes()) == before
+
+
+def test_a_path_may_lead_over_the_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SQLite refuses `/../tmp`, which a relative path becomes in the folder /."""
+    monkeypatch.chdir("/")
+    folder = Path("..", *tmp_path.parts[1:])
+    with closing(Database(folder / "run.db")) as database:
+        database.append([Noticed(COARSE, MESSAGES[0])])
+    assert messages(folder / "run.db") == MESSAGES[:1]
+    with closing(Queue(folder)) as queue:
+        assert queue.entries() == []
 
 
 @pytest.mark.parametrize("read", [read_records, Database, reading.version])
