@@ -87,7 +87,17 @@ def model_folder(root: Path) -> Path:
     for folder in (root / name for name in MODELS):
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return folder
+    refuse_run(root)
     raise SceneError(f"{root}: there is no COLMAP model in sparse/0; `panolog run` makes one of panoramas")
+
+
+def refuse_run(folder: Path) -> None:
+    """Raises SceneError for the folder of a run, in which a scene or panoramas are looked for."""
+    if (folder / "run.db").is_file():
+        raise SceneError(
+            f"{folder}: is the folder of a run; give the scene that it was made of, named in its run.json, "
+            "or continue it by `panolog resume`"
+        )
 
 
 def image_folder(root: Path) -> Path:
@@ -95,6 +105,7 @@ def image_folder(root: Path) -> Path:
     for name in ("images", "imgs"):
         if (root / name).is_dir():
             return root / name
+    refuse_run(root)
     raise SceneError(f"{root}: there is no folder images or imgs; put the panoramas there")
 
 

@@ -23,6 +23,7 @@ from panolog.prepare.video.streams import begun, open_container
 from panolog.prepare.world.exif import read_exif
 from panolog.scene.errors import SceneError
 from panolog.scene.files import natural_key, some_of
+from panolog.scene.read import refuse_run
 
 _CHAPTER = re.compile(r"G(?:OPR|[HXSP](\d\d))(\d{4})", re.IGNORECASE)
 _PREVIEW = "LRV_"  # in front of the name of a small copy of a video, by Insta360
@@ -51,12 +52,13 @@ def find_sources(given: Sequence[Path], taken: Collection[str] = ()) -> Sources:
     Each has a label of its own: the name of its file or folder, after those above where names are equal.
     Args: taken, labels of the scene that they are added to, if there is one.
 
-    Raises SceneError: a file or folder is missing, or given twice.
+    Raises SceneError: a file or folder is missing, given twice, or that of a run.
     """
     found, left_out = list[Source](), list[str]()
     for path in given:
         if not path.exists():
             raise SceneError(f"{path}: there is no such folder or video")
+        refuse_run(path)
         content = look_into(path, VIDEOS) if path.is_dir() else None
         if content is None or (content.videos and not _pictures(path)):
             found += [Source(it, "", is_video=True) for it in ([path] if content is None else content.videos)]

@@ -207,9 +207,16 @@ def resized(size: tuple[int, int]) -> Callable[[Path], None]:
     return lambda root: write_image(root / "images" / "pano_3.jpg", np.random.default_rng(0), size)
 
 
+def as_run(root: Path, without: str) -> None:
+    shutil.rmtree(root / without)
+    (root / "run.db").touch()
+
+
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "no scene": (shutil.rmtree, "no such folder"),
     "no model": (lambda r: shutil.rmtree(r / "sparse"), "no COLMAP model"),
+    "a run": (lambda r: as_run(r, "sparse"), "is the folder of a run; give the scene"),
+    "a run with refined poses": (lambda r: as_run(r, "images"), "is the folder of a run; give the scene"),
     "no image folder": (lambda r: (r / "images").rename(r / "pictures"), "no folder images"),
     "missing image": (lambda r: (r / "images" / "pano_3.jpg").unlink(), r"pano_3\.jpg.*missing"),
     "truncated JPEG": (lambda r: truncate(r / "images" / "pano_3.jpg"), r"pano_3\.jpg.*truncated"),

@@ -135,6 +135,14 @@ def test_a_missing_source_is_named(tmp_path: Path) -> None:
         find_sources([file(tmp_path / "a.mp4"), tmp_path / "no.mp4"])
 
 
+def test_a_run_is_no_folder_of_panoramas(tmp_path: Path) -> None:
+    """Its previews would be taken for panoramas."""
+    run = file(tmp_path / "run" / "run.db").parent
+    file(run / "coarse" / "previews" / "000001.jpg")
+    with pytest.raises(InputError, match=r"run: is the folder of a run; give the scene"):
+        find_sources([run])
+
+
 def test_labels_of_the_scene_that_sources_are_added_to_are_taken(tmp_path: Path) -> None:
     walk, other = file(tmp_path / "monday" / "walk.mp4", 2), file(tmp_path / "garden.mp4", 1)
     found = find_sources([walk, other], {"walk", "scene"})
