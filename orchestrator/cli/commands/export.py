@@ -72,8 +72,8 @@ def export_model(
     With one format whose ending `output` has, that is the file; else it is a folder, with georef.json.
 
     Args: source, the folder of a run or a PLY; say, is called with what the user should know of the model.
-    Raises InputError if the source is no model, the place or a format does not fit, or `output` exists as
-    something else; OSError if it cannot be written.
+    Raises InputError if the source is no model, the place or a format does not fit, or `output` is of a run
+    or exists as something else; OSError if it cannot be written.
     """
     torch.set_num_threads(1)  # small pieces: threads would only wait for each other
     model = _model(source, spec)
@@ -81,6 +81,7 @@ def export_model(
     jobs: list[tuple[str, Path]] = [
         (kind, _place(output, model.name, kind, len(formats))) for kind in formats
     ]
+    _spare_runs(output, [path for _, path in jobs])
     for _, path in jobs:
         path.parent.mkdir(parents=True, exist_ok=True)
     chosen = ChosenModel(model.ply, model.place, spec.selection, spec.sky, spec.levels, spec.spz)
@@ -98,6 +99,16 @@ def export_model(
         say(line)
     progress("writing", len(jobs), len(jobs))
     return written
+
+
+def _spare_runs(output: Path, paths: list[Path]) -> None:
+    """Raises InputError if a run has made what would be written: its model, pages or georef.json."""
+    if RunFolder(output).info.is_file():
+        raise InputError(f"{output}: is the folder of a run; give a folder of its own")
+    for path in paths:
+        run = RunFolder(path.parent)
+        if run.info.is_file() and path in (run.point_cloud, run.sky, run.web):
+            raise InputError(f"{path}: belongs to the run; give it another name")
 
 
 def _model(source: Path, spec: ExportSpec) -> _Model:

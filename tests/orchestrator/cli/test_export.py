@@ -159,9 +159,25 @@ def test_choices_of_a_plain_ply(run: RunFolder, tmp_path: Path) -> None:
     assert (len(found), found.sky) == (len(whole), whole.sky)
     assert not found.shN[:, 3:].any()
     torch.testing.assert_close(found.scales, whole.scales)
-    before = run.point_cloud.read_bytes()
-    assert "is the model itself" in one_line(panolog("export", run.root, "-o", run.point_cloud))
-    assert run.point_cloud.read_bytes() == before
+    before = file.read_bytes()
+    assert "is the model itself" in one_line(panolog("export", file, "-o", file))
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("output", "kind"),
+    [("", "ply"), ("point_cloud.ply", "ply"), ("sky.ply", "ply"), ("web", "web"), ("place.sog", None)],
+)
+def test_what_a_run_has_made_stays(run: RunFolder, tmp_path: Path, output: str, kind: str | None) -> None:
+    copy = RunFolder(shutil.copytree(run.root, tmp_path / "copy"))
+    copy.georeference.write_text("{}")
+    before = {path: path.read_bytes() for path in copy.root.iterdir() if path.is_file()}
+    done = panolog("export", copy.root, "-o", copy.root / output, *([f"--{kind}"] if kind else []))
+    assert done.exit_code == (2 if kind else 0)
+    assert not kind or "the run" in one_line(done) or "is the folder of a run" in one_line(done)
+    made = [copy.root / output] * (kind is None)
+    assert {path for path in copy.root.iterdir() if path.is_file()} == {*before, *made}
+    assert all(path.read_bytes() == content for path, content in before.items())
 
 
 def test_up(run: RunFolder, tmp_path: Path) -> None:
