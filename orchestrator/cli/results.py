@@ -175,10 +175,12 @@ def view(
         raise InputError(f"{output.parent}: there is no such folder for the page")
     with ExitStack() as open_until_the_end:
         with progress_bar("reading the model") as show:
+            from panolog.orchestrator.cli.commands.models import say_missing_sky
             from panolog.orchestrator.cli.commands.view import SiteServer, serve, site_of, write_view
             from panolog.orchestrator.watch.views.site.build import Wanted
             from panolog.workers.tasks import TaskId
 
+            say_missing_sky(source)
             wanted = Wanted(TaskId.parse(task) if task else None, camera, max_gaussians or most)
             if output is not None:
                 page = write_view(source, wanted, output, show).page

@@ -8,7 +8,7 @@ from typing import Literal
 
 from panolog.export.frame import Frame
 from panolog.export.georeference import georeference_of
-from panolog.export.reading import convert_to_ply, is_ply, is_spz
+from panolog.export.reading import convert_to_ply, is_ply, is_spz, sky_of
 from panolog.orchestrator.cli.console import say
 from panolog.scene.model import Scene
 from panolog.scene.ply import describe_faults, ply_exported
@@ -30,6 +30,12 @@ def size_of(path: Path) -> int:
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
+def say_missing_sky(path: Path) -> None:
+    """Says of an SPZ without a sky where that would be: it may have been left behind."""
+    if is_spz(path) and not path.stem.endswith("-sky") and not sky_of(path).is_file():
+        say(f"{path}: has no sky; if it was exported with one, that is {sky_of(path).name}, to be next to it")
+
+
 @contextmanager
 def as_ply(path: Path, frame: Callable[[], Frame], *, exact: bool) -> Iterator[Path]:
     """Yields a model as a PLY: its own path, or that of a temporary file.
@@ -42,6 +48,7 @@ def as_ply(path: Path, frame: Callable[[], Frame], *, exact: bool) -> Iterator[P
             say(line)
         yield path
         return
+    say_missing_sky(path)
     with TemporaryDirectory(prefix="panolog-model-") as folder:
         ply = Path(folder) / f"{path.stem}.ply"
         convert_to_ply(path, ply, frame(), exact=exact)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from panolog.export.frame import HALF_TURN, Frame
-from panolog.export.reading import is_ply, is_spz, read_model
+from panolog.export.reading import is_ply, is_spz, read_model, sky_of
 from panolog.export.splats import REST, InMemory, ModelSource, Selection, Splats, SplatSource
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
@@ -37,7 +37,7 @@ def open_model(path: Path, frame: Frame, chosen: Selection) -> Model:
     if _is_checkpoint(path):
         model = _of_checkpoint(path, frame, chosen)
     elif path.is_file() and not is_ply(path):
-        model = _of_export(path, chosen)
+        model = _of_export(path, frame, chosen)
     else:
         model = _of_ply(path, frame, chosen)
     if not model.scene.count:
@@ -53,13 +53,18 @@ def _of_ply(path: Path, frame: Frame, chosen: Selection) -> Model:
     return Model(source, read_sky(path) if sky else None, total)
 
 
-def _of_export(path: Path, chosen: Selection) -> Model:
-    """A file in a format of others; its frame is theirs: SPZ is y up, and what pages show y down."""
-    splats = read_model(path)
+def _of_export(path: Path, frame: Frame, chosen: Selection) -> Model:
+    """A file in a format of others; its frame is theirs: SPZ is y up, and what pages show y down.
+
+    The sky of an SPZ is in a file next to it.
+    """
+    splats, sky = read_model(path), None
     kept = splats.select(replace(chosen, part="all").keeps(splats, np.ones(len(splats), np.bool_)))
     if is_spz(path):
         kept = kept.turned(HALF_TURN)
-    return Model(InMemory(kept.reduced(chosen.degree)), None, len(splats))
+        if sky_of(path).is_file():
+            sky = read_model(sky_of(path)).turned(HALF_TURN).turned(frame.inverse).gaussians(exact=False)
+    return Model(InMemory(kept.reduced(chosen.degree)), sky, len(splats) + (0 if sky is None else len(sky)))
 
 
 def _of_checkpoint(path: Path, frame: Frame, chosen: Selection) -> Model:

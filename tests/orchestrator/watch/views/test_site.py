@@ -13,7 +13,8 @@ from playwright.sync_api import Browser, expect
 from scipy.spatial.transform import Rotation
 
 from panolog.export.frame import Frame
-from panolog.export.splats import InMemory, Selection
+from panolog.export.georeference import Georeference
+from panolog.export.splats import InMemory, Selection, Splats
 from panolog.export.spz import read_spz, write_spz
 from panolog.orchestrator.runs.folder import RunFolder, model_of, write_json
 from panolog.orchestrator.watch.views.site import build
@@ -232,6 +233,19 @@ def test_an_spz_is_upright_whatever_its_name(tmp_path: Path) -> None:
         write_spz(tmp_path / name, InMemory(scattered(30)))
         (piece,) = open_model(tmp_path / name, Frame(), Selection()).scene.pieces()
         assert np.allclose(piece.means, read_spz(tmp_path / name).means * (-1, -1, 1))
+
+
+def test_the_sky_of_an_spz_is_next_to_it(tmp_path: Path) -> None:
+    write_spz(tmp_path / "place.spz", InMemory(scattered(30)))
+    assert site_of_file(tmp_path / "place.spz", Wanted()).page.sky is None
+    write_spz(tmp_path / "place-sky.spz", InMemory(scattered(9)))
+    page = site_of_file(tmp_path / "place.spz", Wanted()).page
+    assert (page.total, page.sky is None) == (39, False)
+    frame = Georeference().upside_down
+    sky = open_model(tmp_path / "place.spz", frame, Selection()).sky
+    assert sky is not None
+    shown = Splats.of(sky).turned(frame).means
+    assert np.allclose(shown, read_spz(tmp_path / "place-sky.spz").means * (-1, -1, 1), atol=1e-5)
 
 
 WIDTH, HEIGHT = 800, 500  # pixels of a window
