@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from panolog.export.frame import Frame
 from panolog.orchestrator.cli.commands.models import Axes, as_ply, frame_in
+from panolog.orchestrator.cli.console import say
 from panolog.orchestrator.engine.driver.job import Job
 from panolog.orchestrator.engine.stages.scenes import scene_of
 from panolog.orchestrator.runs.folder import RunFolder
@@ -30,6 +31,7 @@ from panolog.scene.write import StageProgress, no_progress
 
 _WIDTH = 2048  # pixels of a panorama of a PLY without a run
 _NARROWEST, _WIDEST = 640, 3840  # pixels of a perspective view whose size is not given
+_BLURRED = 1.5  # times coarser than its pixels: then a view is said to be blurred
 _VIDEO = "video.mp4"
 FPS = 30  # frames per second of a video
 # VP9: all current browsers and players show it, and the FFmpeg in OpenCV's wheels can write it. Encoders of
@@ -137,6 +139,12 @@ def render_views(
     width = view.width or (job.width if job else _WIDTH)
     lens = view.lens(width)
     size = (lens.width, lens.height) if lens else (width, width // 2)
+    if lens and (blur := 2 * math.pi * lens.focal / lens.panorama_width) > _BLURRED:
+        say(
+            f"blurred: {lens.width} pixels over {lens.fov:g} degrees are {blur:.1f} times as fine as the "
+            "largest panorama that is rendered; "
+            f"a view of {math.ceil(lens.width / blur)} pixels has the same detail"
+        )
     if view.fps and (size[0] % 2 or size[1] % 2):
         raise InputError(f"a video cannot have {size[0]}x{size[1]} pixels: both must be even")
     paths = [output / _VIDEO] if view.fps else _paths(output, views)

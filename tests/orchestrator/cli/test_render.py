@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 from typer.testing import Result
 
@@ -54,6 +55,25 @@ def test_a_view_is_as_fine_in_its_middle_as_the_panoramas(
     panorama: int, fov: float, size: tuple[int, int]
 ) -> None:
     assert lens_like(panorama, fov) == Lens(*size, fov)
+
+
+@pytest.mark.parametrize(
+    ("fov", "size", "blurred"), [(2, "160x2", True), (2, "100x2", False), (170, "64x32", False)]
+)
+def test_a_view_that_no_panorama_is_as_fine_as_is_said_to_be_blurred(
+    ply: Path,
+    poses: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    fov: int,
+    size: str,
+    blurred: bool,
+) -> None:
+    small = np.zeros((8, 16, 3), np.uint8)
+    monkeypatch.setattr("panolog.orchestrator.cli.commands.render.render_panorama", lambda *_: small)
+    done = render(ply, "-o", tmp_path / "out", "--poses", poses, "--fov", fov, "--size", size)
+    assert done.exit_code == 0
+    assert ("a view of 92 pixels has the same detail" in done.stderr) == blurred
 
 
 def test_a_video_of_perspective_views(ply: Path, poses: Path, tmp_path: Path) -> None:
