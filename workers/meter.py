@@ -34,9 +34,12 @@ class Meter:
         reset_peaks(self.device)
 
     def count(self, loss: float | None = None, mse: float | None = None) -> None:
-        """One iteration is done. Optional: its loss and mean squared error of colours in [0, 1]."""
+        """One iteration is done. Optional: its loss and mean squared error of colours in [0, 1].
+
+        A view of which a mask leaves nothing has an error of 0, and no part in the means.
+        """
         self._count += 1
-        if loss is not None and mse is not None:
+        if loss is not None and mse:
             self._losses.append(loss)
             self._psnrs.append(-10 * math.log10(max(mse, 1e-10)))
 
