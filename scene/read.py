@@ -162,7 +162,11 @@ def read_split(root: Path, stems: Sequence[str]) -> tuple[tuple[int, ...], tuple
         raise SceneError(f"{root}: {stems[both[0]]} is in train.txt and in test.txt; remove it from one")
     for name, members in (("test", test), ("train", train)):
         if not members:
-            raise SceneError(f"{root}: the {name} split is empty; name at least one panorama in {name}.txt")
+            all_ = "; to train on all, remove train.txt and test.txt, and give --holdout none"
+            raise SceneError(
+                f"{root}: the {name} split is empty; name at least one panorama in {name}.txt"
+                f"{all_ if name == 'test' else ''}"
+            )
     return tuple(sorted(train)), tuple(sorted(test))
 
 

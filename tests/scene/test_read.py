@@ -311,7 +311,7 @@ def test_files_decide(
     [
         ({"test": ""}, "test split is empty"),
         ({"train": "\n"}, "train split is empty"),
-        ({"train": "\n".join(STEMS)}, "test split is empty"),
+        ({"train": "\n".join(STEMS)}, "test split is empty.* to train on all, remove .* --holdout none"),
         ({"test": "walk/99"}, "walk/99 is not a panorama"),
         ({"train": "walk/01", "test": "walk/01"}, "in train.txt and in test.txt"),
     ],
