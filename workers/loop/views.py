@@ -7,6 +7,7 @@ from torch import Tensor
 
 from panolog.renderer.camera import Camera
 from panolog.renderer.process import choose_device
+from panolog.scene.errors import ConfigError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache, View, load_view
 from panolog.scene.model import Scene
@@ -81,7 +82,7 @@ def load_views(
         device: of the tensors, "cpu" or "cuda".
 
     Raises:
-        ConfigError: the width is not possible.
+        ConfigError: the width is not possible, or there are no rows.
         DeviceError: there is no such device.
         SceneError: a panorama cannot be decoded.
 
@@ -93,6 +94,8 @@ def load_views(
     torch.Size([16, 32, 3]) 32 None
     """
     chosen = tuple(scene.train if rows is None else rows)
+    if not chosen:
+        raise ConfigError("rows: are none; name at least one row of scene.panoramas, or leave them out")
     targets = DepthTargets(scene, DepthConfig(), seed)
     with PanoramaCache(scene, chosen, width, _MEMORY, device=choose_device(device)) as cache:
         for iteration in range(iterations):

@@ -49,6 +49,8 @@ def test_a_width_or_device_that_there_is_not_is_an_error(scene: Scene) -> None:
         next(load_views(scene, 65, 1))
     with pytest.raises(DeviceError, match="tpu"):
         next(load_views(scene, 64, 1, device="tpu"))
+    with pytest.raises(ConfigError, match="rows: are none"):
+        next(load_views(scene, 64, 1, rows=[]))
 
 
 def test_the_first_model_has_points_then_a_sky(scene: Scene) -> None:
