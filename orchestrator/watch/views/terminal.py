@@ -3,10 +3,12 @@
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
+from rich.measure import Measurement
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
@@ -58,6 +60,9 @@ _MOST = 60  # blocks that are shown one by one; of more, those of _NOTABLE, at m
 _NOTABLE = (Status.RUNNING, Status.FAILED, Status.PAUSED)
 _BAR, _SHORT = 24, 8  # columns of a bar in a wide and a narrow terminal
 _COLOURS = {Status.RUNNING: "cyan", Status.DONE: "green", Status.FAILED: "red", Status.PAUSED: "yellow"}
+_COLUMNS = ("task", "", "iterations", "speed", "time", "loss", "Gaussians")
+_NUMBERS = 5  # columns from here on are numbers
+_FIRST_LEFT_OUT = ("", "loss", "Gaussians", "time")  # where a terminal is too narrow for all
 _LINES = 15.0  # seconds between two plain lines about one task
 _REQUESTS: dict[type[Record], str] = {
     PauseRequested: "will be paused",
@@ -69,7 +74,7 @@ _REQUESTS: dict[type[Record], str] = {
 
 def table(summary: Summary, *, root: Path | str, wide: bool) -> RenderableType:
     """The whole run for a terminal; `wide` also shows memory and PSNR. Args: root, the run in commands."""
-    now, rows = time.time(), _rows(wide=wide)
+    now, rows = time.time(), _Rows(wide)
     stages: dict[Stage, list[TaskView]] = {}
     for task in summary.tasks:
         stages.setdefault(TaskId.parse(task.name).stage, []).append(task)
@@ -80,9 +85,9 @@ def table(summary: Summary, *, root: Path | str, wide: bool) -> RenderableType:
         elif len(tasks) > _MOST:
             one_by_one = [task for task in tasks if task.status in _NOTABLE][:_MOST]
         if one_by_one != tasks:
-            rows.add_row(*_stage_row(stage, tasks, wide=wide))
+            rows.cells.append(_stage_row(stage, tasks, wide=wide))
         for task in one_by_one:
-            rows.add_row(*_task_row(task, stage, wide=wide))
+            rows.cells.append([*_task_row(task, stage, wide=wide)])
     shown = [rows] if stages else []
     waits = [Text(summary.waiting, style="yellow")] if summary.waiting not in ("", summary.label) else []
     waits += _leaving(summary, now)
@@ -92,14 +97,33 @@ def table(summary: Summary, *, root: Path | str, wide: bool) -> RenderableType:
     return Group(_headline(summary, root), *waits, *_gaussians(summary), *shown, *_failures(summary))
 
 
-def _rows(*, wide: bool) -> Table:
-    """The table without its rows."""
-    rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="dim", show_edge=False)
-    for name in ("task", "", "iterations", "speed", "time"):
-        rows.add_column(name, no_wrap=True)
-    for name in ("loss", "Gaussians", *(("PSNR", "memory") if wide else ())):
-        rows.add_column(name, no_wrap=True, justify="right")
-    return rows
+@dataclass
+class _Rows:
+    """The table of tasks, without the columns for which a terminal is too narrow."""
+
+    wide: bool
+    cells: list[list[RenderableType]] = field(default_factory=list)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        names = [*_COLUMNS, *(("PSNR", "memory") if self.wide else ())]
+        for left_out in _FIRST_LEFT_OUT:
+            if (
+                Measurement.get(console, options.update(max_width=WIDE), self._of(names)).maximum
+                <= options.max_width
+            ):
+                break
+            names[names.index(left_out)] = None
+        yield self._of(names)
+
+    def _of(self, names: Sequence[str | None]) -> Table:
+        """The columns that have a name."""
+        kept = [at for at, name in enumerate(names) if name is not None]
+        table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="dim", show_edge=False)
+        for at in kept:
+            table.add_column(names[at] or "", no_wrap=True, justify="left" if at < _NUMBERS else "right")
+        for row in self.cells:
+            table.add_row(*(row[at] for at in kept if at < len(row)))
+        return table
 
 
 def _gaussians(summary: Summary) -> Iterator[Text]:

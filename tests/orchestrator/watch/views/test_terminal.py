@@ -82,6 +82,14 @@ def test_a_run_fits_the_terminal_and_says_how_far_it_is(width: int) -> None:
     assert "1,739,000" in rows[4]
 
 
+def test_a_narrow_terminal_has_fewer_columns_and_no_broken_ones() -> None:
+    text = shown(LARGE, 55, running=True)
+    (task,) = [line for line in text.splitlines() if line.startswith("block 0")]
+    assert task.split() == ["block", "0", "12,345/30,000", "12.3", "it/s", "7:53:45", "left"]
+    assert all(len(line.rstrip()) <= 55 for line in text.splitlines())
+    assert "…" not in text and "━" not in text and "loss" not in text
+
+
 def test_the_dashboard_has_the_same_names_of_tasks() -> None:
     match = re.search(r"const TASKS = \{(.*?)\};", FORMAT.read_text(), re.DOTALL)
     assert match is not None
