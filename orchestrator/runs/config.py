@@ -294,7 +294,7 @@ def load_config(
     tree = _read_yaml(file) if file is not None else {}
     for setting in sets:
         key, equals, value = setting.partition("=")
-        if not equals:
+        if not (key.strip() and equals):
             raise ConfigError(f"--set {setting}: write it as KEY=VALUE, such as --set sky.count=20000")
         _put(tree, key.strip(), _parse_value(key, value))
     for key, value in (flags or {}).items():
@@ -340,7 +340,12 @@ def _nearest(key: str) -> str:
     near = get_close_matches(key, known, n=1, cutoff=0.6)
     if not near:  # right name, wrong group
         near = [name for name in known if name.rpartition(".")[2] == key.rpartition(".")[2]]
-    return f"; did you mean {near[0]}?" if near else f"; the settings are {', '.join(known)}"
+    if near:
+        return f"; did you mean {near[0]}?"
+    groups = dict.fromkeys(
+        f"{group}.*" if group else name for name in known for group in [name.rpartition(".")[0]]
+    )
+    return f"; the settings are {', '.join(groups)}"
 
 
 def _read_yaml(file: Path) -> dict[str, Any]:

@@ -30,7 +30,8 @@ def test_flags_win_over_settings_and_settings_over_the_file(tmp_path: Path) -> N
     [
         ("sky.cout=3", "unknown setting sky.cout; did you mean sky.count?"),
         ("tau_grad=3", "unknown setting tau_grad; did you mean partition.tau_grad?"),
-        ("qqqqqq=3", "the settings are exposure.learn, "),
+        ("qqqqqq=3", "the settings are exposure.*, movers.*, poses.*, near, "),
+        ("=3", "write it as KEY=VALUE"),
         ("sky.count=many", 'setting sky.count = "many"'),
         ("sky.count=-1", "setting sky.count = -1"),
         ("blocks=0x1x1", 'setting blocks = "0x1x1": a block grid needs'),
