@@ -66,14 +66,14 @@ def read_panoramas(folder: Path) -> ColmapModel:
     """Reads a model of panoramas from `folder` without observations; images in natural order.
 
     A panorama is an EQUIRECTANGULAR camera, SphereSfM's SPHERE (which projects alike), or the dummy
-    `PINHOLE W H W H W/2 H/2` of Pano360.
+    `PINHOLE W H W H W/2 H/2` of Pano360. A camera that no image has may be another one.
 
     Raises SceneError: the model is damaged, its poses are broken or its cameras are not panoramas; OSError: a
     file of it cannot be read.
     """
-    for camera in read_cameras(folder).values():
-        _check_panorama(folder, camera)
     model = read_colmap(folder, observations=False)
+    for camera in {image.camera.id: image.camera for image in model.images}.values():
+        _check_panorama(folder, camera)
     return replace(model, images=sorted(model.images, key=lambda image: natural_key(image.name)))
 
 

@@ -71,6 +71,7 @@ def set_image(text: str) -> Callable[[Path], None]:
         as_sphere,
         set_camera("# SphereSfM\n1 SPHERE 64 32 1 32 16"),
         set_camera("1 PINHOLE 64 32 64 32 32 16"),
+        set_camera("1 EQUIRECTANGULAR 64 32 64 32\n2 PINHOLE 64 48 50 50 32 24"),  # of no image
         *map(set_camera, ["1 SPHERICAL 64 32 64 32", "1 SPHERICAL 64 32", "1 EQUIRECTANGULAR 64 32"]),
     ],
 )
