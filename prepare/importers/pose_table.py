@@ -17,6 +17,7 @@ commas, semicolons, tabs or blanks. Names are `name`, `image`, `file` or `label`
 Angles are in degrees, or as the header says: `omega_rad`, `omega [rad]`. Pixel centres are assumed at +0.5.
 """
 
+import codecs
 import csv
 import re
 from collections.abc import Sequence
@@ -37,11 +38,12 @@ from panolog.scene.errors import SceneError
 from panolog.scene.write import PosedImage
 
 _SUFFIXES = (".csv", ".txt", ".tsv")
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _ALIASES = {
     "name": ("name", "image", "imagename", "file", "filename", "label", "photo"),
     "x": ("x", "easting", "east"),
     "y": ("y", "northing", "north"),
-    "z": ("z", "height", "altitude", "elevation", "up"),
+    "z": ("z", "height", "alt", "altitude", "elevation", "up"),
     "yaw": ("yaw", "heading"),
     **{name: (name,) for name in ("qw", "qx", "qy", "qz", "omega", "phi", "kappa", "pitch", "roll")},
 }
@@ -66,7 +68,7 @@ def detect(source: ImportSource) -> bool:
     path = source.path
     if not (path.is_file() and path.suffix.lower() in _SUFFIXES):
         return False
-    lines = read_head(path).decode("utf-8-sig", "replace").splitlines()
+    lines = _text(read_head(path), "replace").splitlines()
     return _header(lines) is not None
 
 
@@ -101,7 +103,7 @@ def _cells(path: Path, memory: int) -> tuple[list[int], list[str], list[list[str
     if path.stat().st_size > min(_LARGEST, memory // 8):
         raise SceneError(f"{path}: is too large to be a table of poses")
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = _text(path.read_bytes(), "strict").splitlines()
     except UnicodeDecodeError as error:
         raise SceneError(f"{path}: is not UTF-8; save it as UTF-8") from error
     found = _header(lines)
@@ -114,6 +116,11 @@ def _cells(path: Path, memory: int) -> tuple[list[int], list[str], list[list[str
         if len(line) != len(head):
             raise SceneError(f"{path}: line {row + 1}: has {len(line)} cells; the header has {len(head)}")
     return [row + 1 for row in rows], head, cells
+
+
+def _text(content: bytes, errors: str) -> str:
+    """UTF-8, or UTF-16 where the file begins as "Unicode text" of spreadsheets does."""
+    return content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig", errors)
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[str]] | None:

@@ -15,10 +15,10 @@ from panolog.scene.errors import InputError
 EAST, NORTH, UP = np.eye(3)
 
 
-def table(folder: Path, text: str, suffix: str = "csv") -> ImportSource:
+def table(folder: Path, text: str, suffix: str = "csv", encoding: str = "utf-8") -> ImportSource:
     for name in ("a.jpg", "b.jpg"):
         (folder / name).touch()
-    (folder / f"poses.{suffix}").write_text(text)
+    (folder / f"poses.{suffix}").write_text(text, encoding=encoding)
     return ImportSource(folder / f"poses.{suffix}")
 
 
@@ -78,6 +78,15 @@ def test_separators_comments_and_other_columns(suffix: str, tmp_path: Path) -> N
     assert [image.name for image in found.images] == ["a.jpg", "b.jpg"]
     np.testing.assert_allclose(found.images[0].translation, [-1, -2, -3])
     np.testing.assert_allclose(found.images[1].rotation.T @ [0, 0, 1], [1, 0, 0], atol=1e-4)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be"])
+def test_a_table_of_a_spreadsheet_and_of_realityscan(encoding: str, tmp_path: Path) -> None:
+    text = "#name x y alt heading pitch roll\na.jpg 1 2 3 90 0 0\nb.jpg 4 5 6 200 10 -5\n".replace(" ", "\t")
+    source = table(tmp_path, "\ufeff" * (encoding == "utf-16-be") + text, encoding=encoding)
+    assert choose_format(source, None) == "poses"
+    first = read(source).images[0]
+    np.testing.assert_allclose(-first.rotation.T @ first.translation, [1, 2, 3])
 
 
 HEAD = "name,x,y,z,qw,qx,qy,qz"
