@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 FLIP_YZ = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera (x right, y up, z backward) to ours, and back
 _TOLERANCE = 1e-3  # how far from orthonormal a rotation that was written as text may be
 _ENDS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
-_SUFFIXES = (*_ENDS, *(end.upper() for end in _ENDS))
+ENDINGS = (*_ENDS, *(end.upper() for end in _ENDS))
 _HEAD = 65_536  # bytes that `detect` may read of a file
 _LARGEST_LIST = 2**26  # bytes of a file of image names
 
@@ -178,8 +178,8 @@ def _spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
     """The paths that a program may mean by a name, the likeliest first."""
     for path in dict.fromkeys((name, PurePosixPath(name.name))):
         yield path
-        yield from (path.with_name(path.name + suffix) for suffix in _SUFFIXES)
-        yield from (path.with_name(stem_of(path.name) + suffix) for suffix in _SUFFIXES)
+        yield from (path.with_name(path.name + suffix) for suffix in ENDINGS)
+        yield from (path.with_name(stem_of(path.name) + suffix) for suffix in ENDINGS)
 
 
 def read_stems(path: Path) -> list[str]:
@@ -196,4 +196,4 @@ def read_stems(path: Path) -> list[str]:
     except UnicodeDecodeError as error:
         raise SceneError(f"{path}: is not UTF-8; save it as UTF-8") from error
     names = [PurePosixPath(line.strip().replace("\\", "/")) for line in lines if line.strip()]
-    return [str(name.with_suffix("")) if name.suffix in _SUFFIXES else str(name) for name in names]
+    return [str(name.with_suffix("")) if name.suffix in ENDINGS else str(name) for name in names]

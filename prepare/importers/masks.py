@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
-from panolog.prepare.importers.interface import ImportSource
+from panolog.prepare.importers.interface import ENDINGS, ImportSource
 from panolog.prepare.panorama_files import find_image_files
 from panolog.scene.files import some_of, stem_of
 from panolog.scene.image_files import check_layer
@@ -24,7 +24,7 @@ _LEFT_OUT = {
     "semantics": "make masks of them, black = ignore",
     "offset.json": "copy it to SCENE, if the world was not moved, to keep its place on the earth",
 }
-_ENDS = (".png", ".PNG", ".jpg", ".tif", ".tiff", ".webp", ".bmp")
+_ENDS = tuple(dict.fromkeys((".png", ".PNG", *ENDINGS)))  # the likeliest first
 
 
 def find_masks(

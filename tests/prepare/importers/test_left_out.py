@@ -86,7 +86,7 @@ def test_a_mask_is_not_that_of_two_panoramas(tmp_path: Path) -> None:
 
 def test_masks_that_belong_to_no_panorama_are_named(tmp_path: Path) -> None:
     _, source = WRITERS["spheresfm"][1](tmp_path / "source")
-    for name in ("pano_00.png", "left.png", "right.png", "a.png", "b.png"):
+    for name in ("pano_00.TIF", "left.png", "right.png", "a.png", "b.png"):
         write_mask(source.path / "masks" / name)
     (source.path / "depths").mkdir()
     (source.path / "offset.json").touch()
