@@ -109,11 +109,15 @@ def _cloud(source: ImportSource, path: Path, content: JsonNode) -> Path | None:
     if source.points:
         return source.points
     entry = content.get("ply_file_path")
-    if entry is None:  # versions of nerfstudio and other programs write it without an entry
+    if (
+        entry is None or not entry.value
+    ):  # versions of nerfstudio and other programs write it without an entry
         return source.cloud_file("sparse_pc.ply", "pointcloud.ply", "point_cloud.ply", "points3D.ply")
-    name = PurePosixPath(entry.text())
+    name = PurePosixPath(_name(entry, path.parent))
     if name.is_absolute() or ".." in name.parts:
         raise entry.error("leaves the folder of the file; give the cloud with --points")
+    if not (path.parent / name).is_file():
+        raise entry.error("there is no such file; give the cloud with --points, or remove the entry")
     return path.parent / name
 
 

@@ -53,6 +53,11 @@ NERFSTUDIO: list[tuple[Change, str]] = [
     (lambda p: p.update(camera_model="OPENCV"), "camera_model: the camera model is OPENCV; only EQUI"),
     (lambda p: p["frames"][2].update(camera_model="OPENCV"), "frames[2].camera_model: the camera model is O"),
     (lambda p: p["frames"][1].update(file_path="/x/pano_01.png"), "frames[1].file_path: is absolute where"),
+    (lambda p: p.update(ply_file_path="/x/sparse_pc.ply"), "ply_file_path: leaves the folder of the file"),
+    (
+        lambda p: p.update(ply_file_path="gone.ply"),
+        "ply_file_path: there is no such file; give the cloud with",
+    ),
 ]
 
 
@@ -76,8 +81,10 @@ def test_absolute_paths_among_relative_ones(tmp_path: Path) -> None:
     with changed_json(tmp_path / "transforms.json") as content:
         content["frames"][1]["file_path"] = str(tmp_path / "images" / known.names[1])
         content["train_filenames"] = [frame["file_path"] for frame in content["frames"][:2]]
+        content["ply_file_path"] = str(tmp_path / content["ply_file_path"])
     found = FORMATS["nerfstudio"].read(source)
     assert [image.name for image in found.images] == list(known.names)
+    assert len(found.points) == len(known.points)
     assert list(found.train) == [str(Path(name).with_suffix("")) for name in known.names[:2]]
 
 
