@@ -4,6 +4,7 @@ Any process that may write the run folder may send one. The driver polls the fol
 carries out what is possible (`answer`).
 """
 
+import errno
 import json
 import os
 import re
@@ -36,6 +37,7 @@ from panolog.scene.errors import InputError, RunFolderError
 from panolog.scene.files import write_bytes
 from panolog.workers.tasks import StrEnum, TaskId
 
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 _LIMIT = 100  # requests taken at a time
 _NAMED = 5  # machines named in a line at most
 _MAX_BYTES = 512  # of a request
@@ -111,13 +113,22 @@ def allowed(folder: RunFolder) -> str | None:
 def send(folder: RunFolder, action: str, block: int | None = None, node: str | None = None) -> None:
     """Leaves a request for the driver.
 
-    Raises InputError if it is invalid or the run takes none; OSError if it cannot be written.
+    Raises InputError if it is invalid, the run takes none or its disk is full; OSError if it cannot be
+    written.
     """
     wanted = request(action, block, node)
     if (why := allowed(folder)) is not None:
         raise RunFolderError(f"{folder.root}: {why}")
     name = f"{time.time_ns():020d}-{secrets.token_hex(4)}.json"  # names are in the order of requests
-    write_bytes(folder.control / name, json.dumps(vars(wanted)).encode())
+    try:
+        write_bytes(folder.control / name, json.dumps(vars(wanted)).encode())
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        raise RunFolderError(
+            f"{folder.root}: its disk is full, so no request reaches the driver; free some space, or stop "
+            "the run with Ctrl-C in its terminal or `kill -INT` and the number of its process"
+        ) from error
 
 
 def take(folder: RunFolder) -> list[ControlRequest | Noticed]:

@@ -1,5 +1,6 @@
 """Requests to a run reach its driver, and malformed ones are ignored."""
 
+import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,6 +54,17 @@ def folder(tmp_path: Path) -> Iterator[RunFolder]:
 
 def put(folder: RunFolder, name: str, content: bytes) -> None:
     (folder.control / name).write_bytes(content)
+
+
+def test_a_full_disk_takes_no_request_and_says_what_does(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("panolog.orchestrator.runs.control.write_bytes", full)
+    with pytest.raises(InputError, match=r"its disk is full.* free some space, or stop the run with Ctrl-C"):
+        control.send(folder, Action.STOP)
 
 
 def test_requests_are_taken_once_and_in_order(folder: RunFolder) -> None:
