@@ -24,6 +24,7 @@ _HEAD = 262_144  # bytes in which the pixels of a PNG must begin, if not all of 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _IEND = b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _JPEG_END, _JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", 0xDA
+_GREY, _MORE = 128, b"\x55\x2a" * 32  # what a JPEG's missing pixels are; bytes that any code decodes
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame, all codings
 _REDUCED = {
     1: cv2.IMREAD_COLOR,
@@ -106,6 +107,8 @@ def _decoded(path: Path, data: bytes, flags: int) -> NDArray[Any]:
     if data.startswith(_TIFF):
         data = without_orientation(data)
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _chunks_fit(data) else None
+    if pixels is not None and data.startswith(_JPEG) and _is_cut(data, pixels, flags):
+        raise _truncated(path)
     if pixels is None:
         kind = kind_of(data)
         named = f"it is {kind}, whatever its name says; save it as JPEG or PNG" if kind else None
@@ -363,6 +366,24 @@ def _jpeg(path: Path, file: BinaryIO) -> ImageInfo:
             return info
         file.seek(length, os.SEEK_CUR)
     raise _truncated(path)
+
+
+def _is_cut(data: bytes, pixels: NDArray[Any], flags: int) -> bool:
+    """Whether a JPEG has lost its last pixels, but not its end marker: programs put it there again.
+
+    OpenCV makes them grey without a word. In a whole file what is put in front of the marker changes nothing.
+    """
+    if (pixels[-1, -1] != _GREY).any():
+        return False
+    file = BytesIO(data)
+    for marker, length in jpeg_segments(file):
+        if marker == _JPEG_SCAN:
+            break
+        file.seek(length, os.SEEK_CUR)
+    end = data.index(_JPEG_END, file.tell())
+    longer = np.frombuffer(data[:end] + _MORE + data[end:], np.uint8)
+    again = cv2.imdecode(longer, flags)
+    return again is None or not np.array_equal(again, pixels)
 
 
 def _has_end(file: BinaryIO) -> bool:

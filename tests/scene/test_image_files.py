@@ -78,6 +78,24 @@ def test_any_truncation_is_noticed(tmp_path: Path, suffix: str, progressive: int
             decode_panorama(path)
 
 
+@pytest.mark.parametrize("reduction", [1, 8])
+@pytest.mark.parametrize("restarts", [0, 4])
+def test_a_jpeg_that_was_cut_and_closed_again_is_truncated(
+    tmp_path: Path, restarts: int, reduction: int
+) -> None:
+    """Its missing part is grey; a whole picture may be, too."""
+    path, large = tmp_path / "a.jpg", cv2.resize(PIXELS, (256, 128))
+    for pixels in (large, np.full_like(large, 128)):
+        cv2.imwrite(str(path), pixels, [cv2.IMWRITE_JPEG_RST_INTERVAL, restarts])
+        assert decode_panorama(path, reduction=reduction).shape == (128 // reduction, 256 // reduction, 3)
+    cv2.imwrite(str(path), large, [cv2.IMWRITE_JPEG_RST_INTERVAL, restarts])
+    data = path.read_bytes()
+    for length in (len(data) // 2, len(data) - 300):
+        path.write_bytes(data[:length] + b"\xff\xd9")
+        with pytest.raises(ImageError, match="truncated"):
+            decode_panorama(path, reduction=reduction)
+
+
 def test_the_end_of_a_thumbnail_is_not_the_end_of_the_image(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     cv2.imwrite(str(path), PIXELS)
