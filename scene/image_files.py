@@ -380,7 +380,8 @@ def _is_cut(data: bytes, pixels: NDArray[Any], flags: int) -> bool:
         if marker == _JPEG_SCAN:
             break
         file.seek(length, os.SEEK_CUR)
-    end = data.index(_JPEG_END, file.tell())
+    if (end := data.find(_JPEG_END, file.tell())) < 0:
+        return True
     longer = np.frombuffer(data[:end] + _MORE + data[end:], np.uint8)
     again = cv2.imdecode(longer, flags)
     return again is None or not np.array_equal(again, pixels)

@@ -109,9 +109,8 @@ def _cloud(source: ImportSource, path: Path, content: JsonNode) -> Path | None:
     if source.points:
         return source.points
     entry = content.get("ply_file_path")
-    if (
-        entry is None or not entry.value
-    ):  # versions of nerfstudio and other programs write it without an entry
+    # Versions of nerfstudio and other programs write it without an entry.
+    if entry is None or not entry.value:
         return source.cloud_file("sparse_pc.ply", "pointcloud.ply", "point_cloud.ply", "points3D.ply")
     name = PurePosixPath(_name(entry, path.parent))
     if name.is_absolute() or ".." in name.parts:
