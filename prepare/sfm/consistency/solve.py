@@ -239,7 +239,8 @@ def _unconfirmed(solution: Solution) -> set[int]:
         off = deviations(found, solution.evidence, pair)
         if pair.between in skeleton.tree or agrees(solution.evidence, pair, off, _CLOSE):
             held.update(pair.between)
-    return {row for row in found.poses if held[row] < 2}.difference(*skeleton.firm, *skeleton.star)
+    sure = (skeleton.firm if skeleton.ordered else frozenset()) | skeleton.star
+    return {row for row in found.poses if held[row] < 2}.difference(*sure)
 
 
 def _fitting(found: Posed, evidence: Evidence, pair: Pair, bound: float) -> NDArray[np.int64] | None:
