@@ -81,10 +81,10 @@ def find_skeleton(
     ordered = is_ordered(own, count - len(given))
     firm = _chain(own, LIKE_OTHERS) if ordered or _follow(own, count - len(given)) else frozenset()
     weak = _chain(own, _WEAK) - firm if ordered else frozenset()
-    tree = _strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], weak, given)
+    tree = frozenset(_strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], weak, given))
     return Skeleton(
         ordered,
-        frozenset(tree),
+        tree,
         firm & tree,
         frozenset(pair.between for pair in pairs if pair.rivalled and pair.between in tree),
         frozenset(given),
