@@ -74,7 +74,7 @@ class Video:
         self.path = path
         self.decoded = 0  # frames so far
         self.passed = 0  # the same with those that were left out, by the time
-        self._first = 0.0  # seconds
+        self.first = 0.0  # seconds: when its first frame is shown
         self.time = 0.0  # seconds: when the last frame is shown
         self.is_plain = True  # so far: nothing is damaged, and each frame has a time after the last one
         self.keys: list[float] = []  # seconds, of the frames so far from which decoding can begin
@@ -230,10 +230,10 @@ class Video:
         """`frame` is the last one now."""
         time = round(self._time(frame), 6)
         self.is_plain &= frame.pts is not None and (self.decoded == 0 or time > self.time)
-        self.time, self._first = time, self._first if self.decoded else time
+        self.time, self.first = time, self.first if self.decoded else time
         self.decoded, self.passed = self.decoded + 1, self.passed + 1
         if self._stream.codec_context.skip_frame != "DEFAULT":
-            due = round((time - self._first) * float(self._stream.average_rate or 0)) + 1
+            due = round((time - self.first) * float(self._stream.average_rate or 0)) + 1
             self.passed = max(self.passed, min(due, MAX_FRAMES))
         if frame.key_frame:
             self.keys.append(time)

@@ -13,7 +13,7 @@ from panolog.prepare.video.decode import Video, open_video, video_digest
 from panolog.prepare.video.motion import SHARP_WIDTH, MotionTracker, VideoMotion, load_motion
 from panolog.prepare.video.selection import choose_frames
 from panolog.prepare.video.stamp import stamped
-from panolog.prepare.video.streams import Effort
+from panolog.prepare.video.streams import Effort, first_shown, open_container
 from panolog.prepare.video.telemetry import Telemetry, read_telemetry
 from panolog.prepare.world.exif import Attitude
 from panolog.prepare.world.tracks import track_digest
@@ -92,12 +92,13 @@ def extract_frames(
 
 
 def frame_times(video: Path, folder: Path) -> list[float]:
-    """Seconds when the frames that `extract_frames` has written are shown; empty if it has not."""
+    """Seconds since the first frame, of those that `extract_frames` has written; empty if it has not."""
     known = load_motion(_Frames(video, folder).motion)
     if known is None:
         return []
-    times = known.times()
-    return [times[number] for number in known.chosen]
+    with open_container(video) as container:
+        times, first = known.times(), first_shown(container)
+    return [times[number] - first for number in known.chosen]
 
 
 class _Frames:
@@ -230,6 +231,6 @@ def _stamped(jpeg: bytes, source: Video, telemetry: Telemetry | None) -> bytes:
     spherical = source.spherical
     if attitude is None and spherical is not None and (spherical.pitch or spherical.roll):
         attitude = Attitude(None, spherical.pitch, spherical.roll)
-    taken = None if source.started is None else source.started + timedelta(seconds=source.time)
+    taken = None if source.started is None else source.started + timedelta(seconds=source.time - source.first)
     exposure = None if telemetry is None else telemetry.exposure(source.time)
     return stamped(jpeg, fix=fix, attitude=attitude, taken=taken, exposure=exposure)

@@ -50,6 +50,12 @@ def largest_streams(container: av.container.InputContainer) -> list[av.VideoStre
     return [it for it in streams if largest and (it.width, it.height) == (largest.width, largest.height)]
 
 
+def first_shown(container: av.container.InputContainer) -> float:
+    """Seconds at which its first picture is shown: not at 0 in MPEG-TS, nor where a video was cut."""
+    stream = next(iter(largest_streams(container)), None)
+    return 0.0 if stream is None else float((stream.start_time or 0) * (stream.time_base or 0))
+
+
 def prepare_stream(stream: av.VideoStream, effort: Effort) -> av.VideoStream:
     """The stream, which leaves out what `effort` allows."""
     options, large = dict(_DECODING), stream.width >= _LARGE

@@ -14,7 +14,7 @@ from av.stream import Discard
 from numpy.typing import NDArray
 
 from panolog.prepare.video import camm, gpmf
-from panolog.prepare.video.streams import FORMATS, begun
+from panolog.prepare.video.streams import FORMATS, begun, first_shown
 from panolog.prepare.world.exif import Attitude, GpsFix
 from panolog.prepare.world.tracks import find_track, read_track
 from panolog.scene.errors import SceneError
@@ -110,6 +110,7 @@ def read_telemetry(path: Path) -> tuple[Telemetry | None, list[str]]:
         options = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
         with av.open(str(path.resolve()), options=options, metadata_errors="replace") as container:
             started, lasts = begun(container), max(0, container.duration or 0) / av.time_base
+            first = first_shown(container)
             for start, duration, packet in _packets(container):
                 found.add(start, duration, packet)
                 if found.count > _MOST:
@@ -133,7 +134,8 @@ def read_telemetry(path: Path) -> tuple[Telemetry | None, list[str]]:
         recorded, line = _recorded(file, begin, lasts)
         notes.append(line)
         if recorded is not None:
-            telemetry = replace(telemetry, places=recorded, apart=_RECORDED)
+            places = replace(recorded, times=recorded.times + first)
+            telemetry = replace(telemetry, places=places, apart=_RECORDED)
     series = (telemetry.places, telemetry.ups, telemetry.shutter)
     return (telemetry if any(len(it.times) for it in series) else None), notes
 

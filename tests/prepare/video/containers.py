@@ -175,13 +175,15 @@ def add_spherical_xml(path: Path, **values: object) -> Path:
     return insert(path, "moov/trak", box(b"uuid", SPHERICAL, text.encode()))
 
 
-def as_matroska(path: Path) -> Path:
-    """The same video and metadata in Matroska's elements, as FFmpeg writes them."""
+def as_matroska(path: Path, later: float = 0.0) -> Path:
+    """The same video and metadata in Matroska's elements, by FFmpeg, shown so many seconds later."""
     target = path.with_suffix(".mkv")
     with av.open(str(path)) as source, av.open(str(target), "w") as file:
         stream = file.add_stream_from_template(source.streams.video[0])
         for packet in source.demux(video=0):
-            if packet.dts is not None:
+            if packet.dts is not None and packet.pts is not None:
+                shift = round(later / packet.time_base)
+                packet.dts, packet.pts = packet.dts + shift, packet.pts + shift
                 packet.stream = stream
                 file.mux(packet)
     return target

@@ -7,9 +7,10 @@ import av
 import numpy as np
 import pytest
 
-from panolog.prepare.video.frames import extract_frames
+from panolog.prepare.video.frames import extract_frames, frame_times
 from panolog.prepare.video.telemetry import read_telemetry
 from panolog.prepare.world.exif import read_exif
+from tests.prepare.video.containers import as_matroska
 from tests.prepare.video.videos import short_video
 
 BEGIN = datetime(2026, 5, 17, 10, 0, 0, tzinfo=timezone.utc)
@@ -87,19 +88,22 @@ def subtitles(path: Path, north: float) -> None:
     path.write_text("\n".join(cues))
 
 
-def test_frames_carry_the_places_of_the_file_that_is_there_now(tmp_path: Path) -> None:
-    """Frames are written once, but for those whose places have changed."""
-    clip = short_video(tmp_path / "walk.avi")
+@pytest.mark.parametrize("later", [0.0, 5.0])
+def test_frames_carry_the_places_of_the_file_that_is_there_now(later: float, tmp_path: Path) -> None:
+    """Frames are written once, but for those whose places have changed; times count from the first frame."""
+    clip = as_matroska(short_video(tmp_path / "walk.avi"), later)
     plain = extract_frames(clip, tmp_path / "frames", parallax=2.0)
     assert read_exif(plain[-1]).fix is None
-    last = int(plain[-1].stem.rpartition("_")[2]) / 30  # seconds
+    times = [int(it.stem.rpartition("_")[2]) / 30 for it in plain]
+    assert frame_times(clip, tmp_path / "frames") == pytest.approx(times, abs=2e-3)
+    last = times[-1]
     for north in (47.0, 48.0):
         subtitles(tmp_path / "walk.srt", north)
         files = extract_frames(clip, tmp_path / "frames", parallax=2.0)
         fixes = [read_exif(file).fix for file in files]
         assert files == plain
         norths = [None if fix is None else fix.latitude for fix in (fixes[0], fixes[-1])]
-        assert norths == pytest.approx([north, north + last])
+        assert norths == pytest.approx([north, north + last], abs=2e-3)
         before = [file.stat().st_mtime_ns for file in files]
         extract_frames(clip, tmp_path / "frames", parallax=2.0)
         assert [file.stat().st_mtime_ns for file in files] == before
