@@ -28,8 +28,8 @@ from panolog.prepare.stitching.lenses import Up
 from panolog.prepare.video.frames import PARALLAX, frame_times
 from panolog.prepare.world.exif import read_exif
 from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
-from panolog.scene.errors import SceneError
-from panolog.scene.files import natural_key
+from panolog.scene.errors import ConfigError, SceneError
+from panolog.scene.files import natural_key, some_of, stem_of
 from panolog.scene.write import NewScene, Offset, PosedImage, StageProgress, require_new, write_scene
 
 _APART = 0.1  # of the spread of a trajectory: poses that differ more are wrong, or belong to another
@@ -87,6 +87,7 @@ def make_scene(
         check_times(known, [it.is_video for it in sources.all])
     gathered = gather(sources, folder, settings, progress)
     panoramas = gathered.panoramas
+    settings = replace(settings, distance=_between(settings.distance, panoramas))
     layers = with_masks(panoramas, gathered.layers)
     places = None if known is None else _places(known, sources, folder, panoramas)
     sketcher = None if show is None else Sketcher(panoramas, show, gps=settings.gps)
@@ -153,6 +154,26 @@ def _write(output: Path, folder: Path, report: SfmReport, link: bool, progress: 
         progress=lambda d, n: progress("scene", d, n),
         complete=lambda folder: write_report(folder, report),
     )
+
+
+def _between(
+    distance: tuple[str, str, float] | None, panoramas: Sequence[PanoramaFile]
+) -> tuple[str, str, float] | None:
+    """The known distance, with names as the scene will have them: what was a TIFF may have become a PNG.
+
+    Raises ConfigError, before hours are spent on poses, if it is none, or not between two of the panoramas.
+    """
+    if distance is None:
+        return None
+    names, (*given, metres) = {stem_of(it.name): it.name for it in panoramas}, distance
+    first, second = (names.get(name, names.get(stem_of(name), "")) for name in given)
+    for name, it in zip(given, (first, second), strict=True):
+        if not it:
+            some = some_of(sorted(names.values(), key=natural_key), "panorama")
+            raise ConfigError(f"--distance: {name} is not there; name two of the {some}")
+    if first == second or not 0 < metres < np.inf:
+        raise ConfigError(f"--distance {first} {second} {metres:g}: give two panoramas and metres above 0")
+    return first, second, metres
 
 
 def _georeference(found: Reconstruction, settings: SfmSettings, first: bool) -> Georeference:

@@ -94,12 +94,14 @@ def scale_from_distance(
     """
     for name in (first, second):
         if name not in names:
-            raise ConfigError(f"scale: {name} is not among the {len(names)} registered panoramas")
+            raise ConfigError(f"--distance: {name} has no pose, as {len(names)} have; name two of those")
     apart = float(np.linalg.norm(centers[names.index(first)] - centers[names.index(second)]))
     if not 0 < metres < np.inf:
-        raise ConfigError(f"scale: {metres:g} m is not a distance; give metres above 0")
+        raise ConfigError(f"--distance: {metres:g} m is not a distance; give metres above 0")
     if apart <= 1e-9 * float(np.linalg.norm(np.ptp(centers, axis=0))) or apart == 0:
-        raise ConfigError(f"scale: {first} and {second} are at the same place; name two that are far apart")
+        raise ConfigError(
+            f"--distance: {first} and {second} are at the same place; name two that are far apart"
+        )
     return metres / apart
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
 from panolog.prepare.sfm.reconstruct import Reconstruction
-from panolog.scene.errors import SceneError
+from panolog.scene.errors import InputError, SceneError
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
 from tests.prepare.sfm.reports import in_a_row
@@ -45,7 +45,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("parts", [False, True])
 def test_each_part_becomes_a_scene_if_that_is_wanted(parts: bool, folder: Path, tmp_path: Path) -> None:
-    settings = replace(SfmSettings(parts=parts), distance=("0.png", "2.png", 5.0))
+    settings = replace(SfmSettings(parts=parts), distance=("0.tif", "2", 5.0))  # its names before
     report = make_scene(folder, tmp_path / "scene", settings, no_progress)
     assert report.as_json()["registered"] == 4
     assert report.as_json()["parts"] == [["4.png", "5.png", "6.png"]]
@@ -57,6 +57,26 @@ def test_each_part_becomes_a_scene_if_that_is_wanted(parts: bool, folder: Path, 
         names = [panorama.name for panorama in read_scene(tmp_path / "scene-2").panoramas]
         assert names == ["4.png", "5.png", "6.png"]
         assert (tmp_path / "scene-2" / "sfm.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("distance", "problem"),
+    [
+        (("0.png", "11.png", 5.0), "11.png is not there; name two of the 7 panoramas"),
+        (("0.png", "0.png", 5.0), "give two panoramas and metres above 0"),
+        (("0.png", "2.png", -5.0), "give two panoramas and metres above 0"),
+    ],
+)
+def test_a_distance_of_nothing_is_refused_before_there_are_poses(
+    distance: tuple[str, str, float],
+    problem: str,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delattr("panolog.prepare.sfm.pipeline.reconstruct")
+    with pytest.raises(InputError, match=problem):
+        make_scene(folder, tmp_path / "scene", SfmSettings(distance=distance), no_progress)
 
 
 def test_an_interrupted_call_is_resumed_where_some_parts_are_scenes(folder: Path, tmp_path: Path) -> None:
