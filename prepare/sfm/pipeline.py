@@ -77,6 +77,8 @@ def make_scene(
     what was done is kept for the next call. RunError if a process is killed, OSError if a file fails.
     """
     require_new(output)
+    if settings.distance is not None and settings.trajectory is not None:
+        raise ConfigError("--distance and --trajectory both say how large the world is; leave out one")
     known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
     given = [source] if isinstance(source, Path) else source
     for path in given:

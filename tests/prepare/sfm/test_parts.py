@@ -77,6 +77,9 @@ def test_a_distance_of_nothing_is_refused_before_there_are_poses(
     monkeypatch.delattr("panolog.prepare.sfm.pipeline.reconstruct")
     with pytest.raises(InputError, match=problem):
         make_scene(folder, tmp_path / "scene", SfmSettings(distance=distance), no_progress)
+    both = SfmSettings(distance=("0.png", "2.png", 5.0), trajectory=tmp_path / "walk.txt")
+    with pytest.raises(InputError, match="--distance and --trajectory both"):
+        make_scene(folder, tmp_path / "scene", both, no_progress)
 
 
 def test_an_interrupted_call_is_resumed_where_some_parts_are_scenes(folder: Path, tmp_path: Path) -> None:
