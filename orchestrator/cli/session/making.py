@@ -173,6 +173,7 @@ class Preparation:
         folder = self.folder.preparation
         pictures = [replace(panorama, root=folder) for panorama in panoramas]
         with self._step(Step.MASKS):
+            shutil.rmtree(folder / GIVEN, ignore_errors=True)  # the source may have fewer than it had
             for picture, given in zip(pictures, layers.get(MASKS, []), strict=False):
                 if given is not None:
                     kept = picture.layer(GIVEN)

@@ -190,7 +190,17 @@ def test_only_masks_for_all_panoramas_of_the_source_are_kept_as_they_are(
 
 
 def test_masks_of_the_source_are_joined_with_what_is_wanted(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:
-    start(with_masks(town, tmp_path / "source", 1), tmp_path / "run", nadir=45)
+    def kill(at: str) -> None:
+        if at == "features":
+            (source / "masks" / f"{images[1].stem}.png").unlink()  # which does not count any more
+            raise Killed
+
+    source, sfm.at = with_masks(town, tmp_path / "source", 2), kill
+    images = sorted((source / "images").iterdir())
+    with pytest.raises(Killed):
+        start(source, tmp_path / "run", nadir=45)
+    sfm.at = ignore
+    start(source, tmp_path / "run", nadir=45)
     made = tmp_path / "run" / "scene" / "masks"
     assert len(list(made.iterdir())) == 9
     joined, other = (cv2.imread(str(it), cv2.IMREAD_GRAYSCALE) for it in sorted(made.iterdir())[:2])
