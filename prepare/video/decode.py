@@ -13,7 +13,7 @@ import numpy as np
 from av.sidedata.sidedata import SideData
 from numpy.typing import NDArray
 
-from panolog.prepare.file_kinds import describe_file
+from panolog.prepare.file_kinds import VIDEOS, describe_file
 from panolog.prepare.panorama_files import SUFFIXES
 from panolog.prepare.stitching.lenses import APPROXIMATE, Up
 from panolog.prepare.video.colour import ColourError, Converter, check_colours
@@ -270,7 +270,8 @@ def open_video(path: Path, effort: Effort = "exact", up: Up | None = None) -> It
     try:
         container = open_container(path)
     except (av.FFmpegError, UnicodeError) as error:
-        reason = describe_file(path) or "it is damaged, truncated before its index, or no video"
+        other = None if path.suffix.lower() in VIDEOS else describe_file(path)
+        reason = other or "it is damaged, truncated before its index, or no video"
         raise SceneError(f"{path}: cannot be opened as a video; {reason}") from error
     with container, ThreadPoolExecutor(1) as ahead:
         lenses = video_lenses(path, up)

@@ -53,7 +53,7 @@ def test_garbage_is_one_line_and_nothing_is_printed(
 ) -> None:
     path = tmp_path / "x.mp4"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=re.escape(f"{path}: cannot be opened")):
+    with pytest.raises(InputError, match=re.escape(f"{path}: cannot be opened as a video; it is damaged")):
         extract_frames(path, tmp_path / "out")
     with pytest.raises(InputError, match="cannot be read"):
         extract_frames(tmp_path / "missing.mp4", tmp_path / "out")
