@@ -30,7 +30,7 @@ from panolog.prepare.provenance import (
     read_provenance,
 )
 from panolog.scene.errors import SceneError
-from panolog.scene.files import write_bytes
+from panolog.scene.files import stem_of, write_bytes
 from panolog.scene.image_files import decode_used, read_info, resize
 from panolog.scene.pictures.headers import ImageInfo
 from panolog.scene.read import MASKS
@@ -198,7 +198,8 @@ def _given(picture: PanoramaFile) -> Path | None:
                 "remove the one that should not count"
             )
         return path
-    return next((it for it in (kept, colmap) if it.is_file()), None)
+    next_to = picture.path.with_name(f"{stem_of(picture.path.name)}_mask.png")
+    return next((it for it in (kept, colmap, next_to) if it.is_file()), None)
 
 
 def _keep(picture: PanoramaFile) -> None:

@@ -92,11 +92,12 @@ def test_the_users_mask_is_combined_and_kept(scene: Path) -> None:
     assert masked(scene) == [False] * 3
 
 
-def test_a_mask_by_colmaps_name_is_combined_and_stays(scene: Path) -> None:
-    own = put_striped(scene / "masks" / "0.png.png")
+@pytest.mark.parametrize("name", ["masks/0.png.png", "images/0_mask.png"])
+def test_a_mask_by_another_name_is_combined_and_stays(name: str, scene: Path) -> None:
+    own = put_striped(scene / name)
     masked(scene)
     np.testing.assert_array_equal(pixels(scene / "masks" / NAMES[0]) > 0, own & ~nadir_cone(HEIGHT, 30))
-    np.testing.assert_array_equal(pixels(scene / "masks" / "0.png.png") > 0, own)
+    np.testing.assert_array_equal(pixels(scene / name) > 0, own)
 
 
 def test_a_changed_mask_is_the_users(scene: Path) -> None:
