@@ -106,7 +106,8 @@ class SfmReport:
         for part in content["parts"]:
             yield (
                 f"another part: {part[0]} to {part[-1]}, {len(part)} panoramas that agree, but are not "
-                "connected to these. More panoramas between help; --partial writes each part as a scene"
+                "connected to these. More panoramas between help; `panolog scene sfm --partial` writes each "
+                "part as a scene"
             )
         elsewhere = {name for part in content["parts"] for name in part}
         for image in content["missing"]:
