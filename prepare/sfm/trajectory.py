@@ -22,6 +22,7 @@ _LARGEST = 64 << 20  # bytes of a file
 _TIMES = ("t", "time", "timestamp")
 _NAMES = ("name", "image", "file", "filename")
 _FEWEST = 3  # panoramas with a place
+_LONGER = 500.0  # times as long as a video, in seconds: a trajectory in milliseconds
 _FLAT = 0.02  # of the length of a walk: if it is straighter, its turn about itself is unknown
 
 
@@ -72,7 +73,7 @@ def places_of(trajectory: Trajectory, names: Sequence[str], times: Sequence[floa
 
     Args: names, of the panoramas; times, seconds of a video's frames since its beginning. Photographs are
         matched by name, or by a time that is their name.
-    Raises: SceneError, fewer than three match.
+    Raises: SceneError, fewer than three match, or times are not in seconds.
     """
     stems = [Path(name).stem for name in names]
     found = np.full((len(names), 3), np.nan)
@@ -89,6 +90,12 @@ def places_of(trajectory: Trajectory, names: Sequence[str], times: Sequence[floa
             if place is not None:
                 found[row] = trajectory.places[place]
     elif trajectory.times is not None:
+        lasts = float(np.ptp(trajectory.times))
+        if times is not None and lasts > _LONGER * np.ptp(times):
+            raise SceneError(
+                f"{trajectory.path}: lasts {lasts:,.0f} seconds, and the frames of the video "
+                f"{np.ptp(times):,.1f}; give its times in seconds, not in parts of them"
+            )
         start = trajectory.times[0] if times is not None else 0.0
         wanted = np.array(list(times) if times is not None else [_number(stem) for stem in stems]) + start
         inside = (wanted >= trajectory.times[0] - 0.5) & (wanted <= trajectory.times[-1] + 0.5)

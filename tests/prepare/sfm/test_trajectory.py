@@ -33,6 +33,9 @@ def test_frames_of_a_video_count_from_its_beginning(tmp_path: Path) -> None:
         read_trajectory(_file(tmp_path, TUM)), ["v_0.jpg", "v_1.jpg", "v_2.jpg"], [0.0, 0.5, 2.0]
     )
     assert places.tolist() == [[0, 0, 1], [1, 0, 1], [4, 2, 1]]
+    in_milliseconds = _file(tmp_path, TUM.replace(".0 ", "000 "))
+    with pytest.raises(InputError, match="lasts 2,000 seconds, and the frames of the video 2"):
+        places_of(read_trajectory(in_milliseconds), ["v_0.jpg", "v_1.jpg", "v_2.jpg"], [0.0, 0.5, 2.0])
 
 
 @pytest.mark.parametrize(
