@@ -17,7 +17,7 @@ from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair
 Edge = tuple[int, int]  # rows of two panoramas, ascending
 _ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
 _WEAK = 0.5  # of the median coverage of neighbours: they come before others that share more, but are doubted
-_MORE_OFTEN = 3.0  # times, that neighbours share much, than others do
+_MORE_OFTEN = 10.0  # times, that neighbours share much, than others do
 _AMONG_BEST = 0.75  # of the best coverage of either panorama
 _AT_ONCE = 256  # panoramas whose ways to all others are found together
 
