@@ -289,9 +289,11 @@ def stage_of(state: RunState) -> str:
     """The key in STAGES of the stage that the run is in; "done" at its end."""
     if state.outcome in ("done", "limited"):
         return "done"
-    for status in (Status.RUNNING, Status.DONE):
-        if tasks := [task.id for task in state.tasks.values() if task.status == status]:
-            return str(max(tasks).stage)
+    known = state.tasks.values()
+    running = [task.id for task in known if task.status == Status.RUNNING]
+    begun = [task.id for task in known if task.status != Status.WAITING or task.since is not None]
+    if running or begun:
+        return str(max(running or begun).stage)
     return str(Stage.COARSE if state.prepared else Stage.PREPARE if state.preparing else Stage.CALIBRATE)
 
 

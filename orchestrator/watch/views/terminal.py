@@ -1,5 +1,6 @@
 """A run on the terminal: a table, live while the run lasts, or plain lines if the output is no terminal."""
 
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -185,14 +186,14 @@ def _headline(summary: Summary, root: Path | str) -> Text:
     text = Text(summary.label + (f" · {stage}" if stage else ""), style="bold")
     if summary.step:
         text.append(f": {summary.step}")
-    text.append(f" · {summary.progress:.0%}")
+    text.append(f" · {math.floor(summary.progress * 100)}%")  # 100% is only what is done
     if summary.seconds is not None:
         text.append(f" · {duration(summary.seconds)} elapsed")
     if summary.eta is not None:
         text.append(f" · about {duration(summary.eta)} left")
     retries = sum(task.retries for task in summary.tasks)
     if retries:
-        text.append(f" · {retries} retries", style="yellow")
+        text.append(f" · {retries} {'retry' if retries == 1 else 'retries'}", style="yellow")
     if held := summary.paused:
         unpause = command_line("unpause", root, held[0])
         text.append(f" · {len(held)} paused: `{unpause}` resumes block {held[0]}", style="yellow")
@@ -344,7 +345,7 @@ def _milestone(record: Record) -> str:
         case ModelSaved():
             return f"{task}: {record.gaussians:,} Gaussians after {duration(record.seconds)}"
         case PlanSaved():
-            return f"{task}: {len(record.blocks)} blocks"
+            return f"{task}: {len(record.blocks)} block{'s' * (len(record.blocks) != 1)}"
         case Merged():
             return f"{task}: {record.gaussians:,} Gaussians, {record.sky:,} of them sky"
         case EvaluationSaved():

@@ -16,13 +16,16 @@ from panolog.orchestrator.runs.records import (
     NodeLeaving,
     NodeLeft,
     NodeStaying,
+    Outcome,
     PauseRequested,
     Progressed,
     Record,
     RunContinued,
+    RunEnded,
     RunWaiting,
     StopRequested,
     Stored,
+    TaskFailed,
     TaskYielded,
 )
 from panolog.orchestrator.runs.state import RunState
@@ -123,6 +126,26 @@ def test_a_run_that_waits_for_its_disk_says_so_and_what_to_do() -> None:
     continued = shown([*waiting, (20_900, RunContinued(899.0))], 120, running=True)
     assert continued.startswith("running · Stage II · ")
     assert reason not in continued + shown(waiting, 120, running=False)
+
+
+def test_a_run_that_does_not_proceed_is_in_the_stage_that_has_begun_last() -> None:
+    def headline(*records: Record) -> str:
+        later: list[Timed] = [*STAGE_TWO, *((151, record) for record in records)]
+        return shown(later, 160, running=isinstance(records[-1], RunWaiting)).splitlines()[0]
+
+    waiting = RunWaiting("waiting: 2 blocks are paused (0, 1)")
+    yielded = TaskYielded(ZERO), TaskYielded(ONE)
+    assert headline(*yielded, waiting).startswith(f"{waiting.reason} · Stage II · ")
+    assert headline(*yielded, RunEnded(Outcome.INTERRUPTED)).startswith("stopped · Stage II · ")
+    lost = TaskFailed(ZERO, 1, "lost", final=False)
+    assert headline(lost, waiting).endswith(" · 1 retry")
+
+
+def test_progress_is_never_rounded_up() -> None:
+    summary = summarize(state(STAGE_TWO), running=True).model_copy(update={"progress": 0.996})
+    output = StringIO()
+    Console(file=output, width=160).print(page(summary, root="a", wide=True))
+    assert " · 99% · " in output.getvalue()
 
 
 LEAVES = NodeLeaving("3f2a81c4d5e6", "gpu-07", Leaving.PREEMPTION, 120.0)
