@@ -146,6 +146,16 @@ def test_runs_are_found_and_sorted_in_a_theme_that_stays(browser: Browser, shown
         assert page.evaluate(background) == light
 
 
+def test_runs_have_room_for_their_names_at_any_width(browser: Browser, shown: Served) -> None:
+    room = "[...document.querySelectorAll('td .run-name')].map((name) => name.getBoundingClientRect().width)"
+    with opened(browser, shown.url) as page:
+        expect(page.locator("#runs .run-name")).to_have_count(2)
+        for width in (PHONE, 721, 1000, 1001, 1180, 1320, 1321, DESK):
+            page.set_viewport_size({"width": width, "height": 900})
+            assert min(page.evaluate(room)) >= 100, width
+            assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0, width
+
+
 def test_the_map_says_why_a_camera_trains_its_blocks(town: Page) -> None:
     town.locator("#map-plot .scatterlayer .trace path.point").last.wait_for()
     town.locator("#map-plot").scroll_into_view_if_needed()
