@@ -1,7 +1,6 @@
 """The JSON of the API as models. static/shared/messages.d.ts is made from them: `make types`."""
 
 from datetime import datetime
-from pathlib import Path
 from typing import Any
 
 from pydantic import ConfigDict
@@ -11,7 +10,7 @@ from panolog.orchestrator.watch.views.comparison.schema import Comparison, Curve
 from panolog.orchestrator.watch.views.exposures import ExposureCurve
 from panolog.orchestrator.watch.views.pages.findings import Findings
 from panolog.orchestrator.watch.views.plan_page import BlockCameras, CameraView
-from panolog.orchestrator.watch.views.run_view import LiveView, RunView
+from panolog.orchestrator.watch.views.run_view import LiveView, RunView, scene_name
 from panolog.orchestrator.watch.views.summary import STAGES, SummaryHead, TaskView, Text, ViewModel
 
 
@@ -93,17 +92,15 @@ class RunRow(ViewModel):
     @staticmethod
     def of_page(page: RunPage, cover: int | None = None) -> "RunRow":
         """The row of a run that could be read. Args: cover, the event of its picture."""
-        summary, scene, made = page.summary, page.info.get("scene"), page.preparation
-        source = made.source if made else str(scene.get("path", "")) if isinstance(scene, dict) else ""
-        model, config = summary.model, page.info.get("config")
+        summary, config = page.summary, page.info.get("config")
+        model = summary.model
         settings = config if isinstance(config, dict) else {}
-        more = f" and {len(made.others)} more" if made and made.others else ""
         return RunRow(
             id=page.id,
             name=page.name,
             status=summary.status,
             label=summary.label,
-            scene=Path(source).name + more,
+            scene=scene_name(page),
             stage=summary.stage,
             stage_label=STAGES.get(summary.stage, ""),
             progress=page.progress,

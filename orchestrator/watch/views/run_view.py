@@ -108,6 +108,13 @@ class RunView(LiveView):
     config: tuple[SettingView, ...]
 
 
+def scene_name(run: RunView) -> str:
+    """The name of a run's scene, or of what the run makes its scene of."""
+    scene, made = run.info.get("scene"), run.preparation
+    source = made.source if made else str(scene.get("path", "")) if isinstance(scene, dict) else ""
+    return Path(source).name + (f" and {len(made.others)} more" if made and made.others else "")
+
+
 def view_run(
     history: History,
     info: dict[str, Any],

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -22,7 +21,7 @@ from panolog.orchestrator.watch.views.comparison.schema import (
     Trained,
 )
 from panolog.orchestrator.watch.views.palette import block_color
-from panolog.orchestrator.watch.views.run_view import RunView
+from panolog.orchestrator.watch.views.run_view import RunView, scene_name
 from panolog.orchestrator.watch.views.summary import STAGES, TaskView
 from panolog.scene.files import natural_key
 from panolog.workers.tasks import Stage, TaskId
@@ -80,7 +79,7 @@ def _shown(run: ReadRun | UnreadRun, color: str, first: ReadRun | None) -> Compa
         label=summary.label,
         stage=STAGES.get(summary.stage, ""),
         progress=finite(view.progress) or 0.0,
-        scene=Path(_text(known, "path") or "").name or None,
+        scene=scene_name(view)[:_LONG] or None,
         fingerprint=_text(known, "fingerprint"),
         version=_text(versions if isinstance(versions, dict) else {}, "panolog"),
         recipe=_text(settings, "recipe"),

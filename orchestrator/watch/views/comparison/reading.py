@@ -11,6 +11,7 @@ from panolog.orchestrator.runs.store import read_milestones
 from panolog.orchestrator.watch.views.comparison.measured import Measured, read_measured
 from panolog.orchestrator.watch.views.comparison.schema import MOST
 from panolog.orchestrator.watch.views.history import History
+from panolog.orchestrator.watch.views.preparation import view_preparation
 from panolog.orchestrator.watch.views.run_view import RunView, view_run
 from panolog.scene.errors import InputError, RunFolderError
 
@@ -77,7 +78,8 @@ def read_run(root: Path, name: str) -> ReadRun:
         running = lock.held(folder.lock)  # before the records, so that all that an ended driver wrote is read
         history = History.of(read_milestones(folder.database) if folder.database.exists() else ())
         waiting = presence.waiting(folder.presence) if running else ""
-        view = view_run(history, info, running=running, root=root, waiting=waiting)
+        made = view_preparation(folder, history.state, running=running)
+        view = view_run(history, info, running=running, root=root, waiting=waiting, preparation=made)
         measured = read_measured(folder)
     except DAMAGED as error:
         why = f"{type(error).__name__}: {error}"

@@ -16,8 +16,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.records import Outcome, Record, RunEnded
+from panolog.orchestrator.runs.preparation.notes import StepResult, result_path, write_note
+from panolog.orchestrator.runs.preparation.settings import Settings, Step, write_settings
+from panolog.orchestrator.runs.records import Outcome, Preparing, Record, RunEnded
 from panolog.orchestrator.watch.views.comparison.compare import compare
 from panolog.orchestrator.watch.views.comparison.curves import curves_of
 from panolog.orchestrator.watch.views.comparison.page import write_comparison
@@ -25,7 +28,7 @@ from panolog.orchestrator.watch.views.comparison.reading import names_of, pictur
 from panolog.orchestrator.watch.views.comparison.schema import Comparison
 from panolog.orchestrator.watch.views.comparison.terminal import table
 from panolog.scene.errors import InputError
-from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.tasks import COARSE, PREPARE, TaskId
 from tests.orchestrator.history import BEGAN, started
 from tests.orchestrator.watch.views.comparison.runs import finished, metrics, progressed, write, write_picture
 from tests.orchestrator.watch.views.pages.snapshots import self_contained, snapshot_of
@@ -62,6 +65,19 @@ def test_what_a_run_has_come_to(tmp_path: Path) -> None:
     assert (run.gaussians, run.bytes, run.memory, run.gpu_memory) == (700, 12_345, 5_000, None)
     assert (run.seconds, run.machines, run.recipe) == (190.0, ("host (cpu)",), "panolog")
     assert {stage.name: stage.seconds for stage in run.stages}["coarse"] == 60.0
+
+
+def test_a_run_that_makes_its_scene_has_the_name_of_what_it_makes_it_of(tmp_path: Path) -> None:
+    records: list[tuple[float, Record]] = [(0.0, BEGAN), (0.0, Preparing("masks", PREPARE))]
+    folder = write(tmp_path / "a", records=records)
+    source, more = "/films/walk.mp4", ("/films/b",)
+    made = Settings(source=source, others=more, video=True, panoramas=9, width=64, nadir=0, static=False)
+    write_settings(folder, made)
+    done = StepResult(step=Step.SFM, settings={}, seconds=1, lines=())
+    write_note(result_path(folder, Step.SFM), done)
+    with lock.hold(folder.lock):
+        run, _ = compared(folder, write(tmp_path / "b")).runs
+    assert run.scene == "walk.mp4 and 1 more" and run.progress > 0
 
 
 def test_settings_that_differ_also_from_an_older_version(tmp_path: Path) -> None:
