@@ -42,6 +42,7 @@ UNREADABLE = (
 _BATCH = 5_000  # records that are applied one by one; after more the state is read anew
 _RECENT = 2_000  # records that are kept for clients that are a little behind
 _UNUSED_S = 60.0  # after which only the row of a run without clients is kept
+_AGE_S = 10.0  # after which times of a live run are counted anew, though nothing has happened
 _MESSAGE = 200  # records in a message
 _ERROR = 300  # characters of an error at most
 _CHANGING = RunChanges.model_fields.keys() - {"summary", "tasks"}
@@ -148,8 +149,9 @@ class Watch:
             require_plain(self.entry)
             status = folder.info.stat()
             return (
-                lock.held(folder.lock),
+                running := lock.held(folder.lock),
                 presence.waiting(folder.presence),
+                _clock(running=running),
                 status.st_mtime_ns,
                 status.st_size,
                 stamp_of(folder),
@@ -193,7 +195,8 @@ class Watch:
         waiting = presence.waiting(folder.presence) if running else ""
         mirror = read_state(folder.mirror, running=running)
         store = mirror.brief if mirror else ""
-        page_stamp = (running, raw, stamp, available, result, waiting, stamp_of(folder), store)
+        files, clock = stamp_of(folder), _clock(running=running)
+        page_stamp = (running, raw, stamp, available, result, waiting, files, store, clock)
         if page_stamp == self._page_stamp:
             return
         try:
@@ -275,6 +278,11 @@ class Watch:
         self._forget()
         row = RunRow.unread(self.entry).model_copy(update={"status": "unreadable", "error": line})
         self.snapshot = Snapshot(row, version)
+
+
+def _clock(*, running: bool) -> int:
+    """A number that grows every _AGE_S: the times of a live run change also while it records nothing."""
+    return int(time.monotonic() / _AGE_S) if running else 0
 
 
 def _in_3d(folder: RunFolder) -> bool:

@@ -12,9 +12,11 @@ from typing import Any
 
 import pytest
 
+from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import ModelSaved, Noticed, RunBegan
 from panolog.orchestrator.runs.thinning import DENSE
+from panolog.orchestrator.watch.dashboard import watch as dashboard_watch
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.dashboard.watch import Watch
 from panolog.workers.tasks import COARSE, TaskId
@@ -49,6 +51,26 @@ def test_small_changes_are_small(tmp_path: Path) -> None:
         assert changes.keys() - {"tasks"} < whole.keys()
         append(folder, ModelSaved(TaskId.block(0), "x", 1, 1, 100, 1.0))  # the merge is worthless now
         assert until(messages, "run")["summary"]["model"] is None
+
+
+def test_the_times_of_a_live_run_go_on_while_it_records_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dashboard_watch, "_AGE_S", 1e-9)
+    folder = write_run(tmp_path / "run", [RunBegan("host", 1, resumed=False), started(COARSE)])
+    watch = Watch(RunEntry(tmp_path, "run"))
+
+    def elapsed() -> tuple[float, float]:
+        watch.refresh_row()
+        page = watch.snapshot.page
+        assert page is not None and page.summary.seconds is not None
+        return page.summary.seconds, watch.snapshot.row.seconds or 0.0
+
+    with lock.hold(folder.lock):
+        before, later = elapsed(), elapsed()
+    assert later[0] > before[0] and later[1] > before[1]
+    watch.refresh()
+    assert watch.refresh() == watch.refresh()  # of a run at rest nothing is sent again
 
 
 def test_a_run_can_vanish_and_come_back_with_and_without_clients(tmp_path: Path) -> None:
