@@ -86,7 +86,8 @@ def _held_out(runs: Sequence[Pair]) -> Iterator[str]:
         theirs = run.measured.views if run.measured else {}
         if theirs.keys() != views.keys():
             common = len(theirs.keys() & views.keys())
+            of = f"differences are of the {common:,} that both have" if common else "they have none in common"
             yield (
                 f"not measured on the same panoramas: {shown.name} on {len(views):,}, {other.name} on"
-                f" {len(theirs):,}; differences are of the {common:,} that both have"
+                f" {len(theirs):,}; {of}"
             )

@@ -1,7 +1,7 @@
 // The tables of a comparison: what the runs are, their metrics, and the settings that differ.
 
 /** @import { ComparedRun, Comparison, DifferentSetting, MetricView, Trained } from "../shared/messages.js" */
-import { bar, byId, el, pill, replaceIfChanged, setPill } from "panolog/shared/dom.js";
+import { bar, byId, el, pill, replaceIfChanged, setPill, toneOf } from "panolog/shared/dom.js";
 import { bytes, count, duration, fixed, METRICS, percent } from "panolog/shared/format.js";
 
 const MISSING = "–";
@@ -40,7 +40,7 @@ function iterationsText(trained) {
 function stateCell(run, lost) {
   const unsure = lost && run.status === "running";
   const mark = pill(run.status);
-  setPill(mark, unsure ? "unknown" : run.status, unsure ? "last state: running" : run.label);
+  setPill(mark, unsure ? "unknown" : toneOf(run), unsure ? "last state: running" : run.label);
   const where = run.status === "done" ? "" : [run.stage, percent(run.progress)].filter(Boolean).join(", ");
   return [
     mark,

@@ -17,6 +17,7 @@ import {
   setBar,
   setPill,
   setText,
+  toneOf,
 } from "panolog/shared/dom.js";
 import { ago, bytes, count, duration, fixed, percent, shellWord, short } from "panolog/shared/format.js";
 
@@ -154,7 +155,7 @@ function fillRow(row, run) {
   const unsure = lost && run.status === "running";
   setPill(
     first(".pill", row),
-    unsure ? "unknown" : run.label.startsWith("waiting") ? "paused" : run.status,
+    unsure ? "unknown" : toneOf(run),
     unsure ? "last state: running" : run.label || run.status,
   );
   setBar(first("progress", row), run.progress, `progress of ${title(run)}`);

@@ -54,6 +54,9 @@ export function setPill(node, status, label = status) {
   setText(node, label);
 }
 
+/** The status by which a run has its colour: one that waits is not at work. @param {{status: string, label: string}} run */
+export const toneOf = ({ status, label }) => (label.startsWith("waiting") ? "paused" : status);
+
 /** A progress bar; its label is for screen readers. @param {number} share @param {string} label */
 export function bar(share, label) {
   return el("progress", { max: 1, value: share, "aria-label": label });

@@ -108,6 +108,9 @@ UNFAIR: dict[str, dict[str, Any]] = {  # line -> how the second run differs from
     "not measured on the same panoramas: a on 3, b on 2; differences are of the 1 that both have": {
         "measured": metrics({"a.jpg": 1.0, "z.jpg": 2.0})
     },
+    "not measured on the same panoramas: a on 3, b on 1; they have none in common": {
+        "measured": metrics({"z.jpg": 2.0})
+    },
     "b: its metrics are of a model with 650 Gaussians, and the run's has 700": {
         "measured": metrics(gaussians=650)
     },
