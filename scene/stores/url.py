@@ -44,7 +44,7 @@ def parse_url(text: str) -> StoreUrl:
     """A URL, checked. The message of an error never repeats what may be a secret.
 
     Raises StoreError if it is none, is of no supported store, has a user, a password, a query or a fragment,
-    or its path has empty parts, `.`, `..` or characters that cannot be printed.
+    or its path has empty parts, `.`, `..` or characters that cannot be printed, or is relative (file://).
     """
     found = _URL.fullmatch(text)
     protocol, path = (found[1].lower(), found[2]) if found else ("", "")
@@ -59,6 +59,8 @@ def parse_url(text: str) -> StoreUrl:
             f"{shown}: user and password do not belong into a URL; set them as the provider's tools expect"
             " them (environment, profile or role)"
         )
+    if protocol == "file" and not path.startswith("/"):  # it would be another place from each folder
+        raise StoreError(f"{shown}: its path does not begin at /; write file:///FOLDER, with three slashes")
     parts = path.rstrip("/").removeprefix("/" if protocol in ("file", "memory") else "").split("/")
     if not path.isprintable() or any(part in ("", ".", "..") for part in parts):
         raise StoreError(

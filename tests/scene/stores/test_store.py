@@ -103,6 +103,8 @@ def test_urls_are_told_from_paths() -> None:
         == "abfs://box@account.dfs.core.windows.net/x"
     )
     assert parse_url("file:///tmp/x").path == "/tmp/x"
+    with pytest.raises(StoreError, match="does not begin at /; write file:///FOLDER, with three slashes"):
+        parse_url("file://tmp/x")
     assert is_url("s3://bucket/x")
     assert not is_url("runs/s3")
 
