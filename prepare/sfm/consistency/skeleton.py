@@ -17,7 +17,6 @@ from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair
 Edge = tuple[int, int]  # rows of two panoramas, ascending
 _ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
 _WEAK = 0.5  # of the median coverage of neighbours: they come before others that share more, but are doubted
-_MORE_OFTEN = 10.0  # times, that neighbours share much, than others do
 _AMONG_BEST = 0.75  # of the best coverage of either panorama
 _AT_ONCE = 256  # panoramas whose ways to all others are found together
 
@@ -28,14 +27,9 @@ class Skeleton:
 
     ordered: bool  # panoramas are in the order of capture
     tree: frozenset[Edge]
-    firm: frozenset[Edge] = frozenset()  # of the tree, what the order of capture or of known places confirms
+    guessed: frozenset[Edge] = frozenset()  # of the tree, where the order of capture does not decide
     rivalled: frozenset[Edge] = frozenset()  # of the tree, where another geometry explains about as much
     given: frozenset[int] = frozenset()  # rows of panoramas whose poses are known
-
-    @property
-    def guessed(self) -> frozenset[Edge]:
-        """What of the tree the order of capture does not decide; nothing where there is no order."""
-        return self.tree - self.firm if self.ordered or self.given else frozenset()
 
     @property
     def star(self) -> frozenset[Edge]:
@@ -54,9 +48,9 @@ class Skeleton:
 
     def among(self, rows: Collection[int]) -> "Skeleton":
         """What of it connects these panoramas."""
-        wanted, sets = set(rows), (self.tree, self.firm, self.rivalled)
-        tree, firm, rivalled = (frozenset(it for it in edges if wanted.issuperset(it)) for edges in sets)
-        return Skeleton(self.ordered, tree, firm, rivalled, self.given & wanted)
+        wanted, sets = set(rows), (self.tree, self.guessed, self.rivalled)
+        tree, guessed, rivalled = (frozenset(it for it in edges if wanted.issuperset(it)) for edges in sets)
+        return Skeleton(self.ordered, tree, guessed, rivalled, self.given & wanted)
 
 
 def find_skeleton(
@@ -75,17 +69,17 @@ def find_skeleton(
     pairs = [pair for pair in evidence.pairs if pair.between not in refuted]
     if places is not None:
         near = sorted(_near(pairs, places), key=lambda it: (it[1], it[0]))
-        tree = frozenset(_strongest_tree(pairs, count, [edge for edge, _ in near]))
-        return Skeleton(True, tree, tree)
+        tree = _strongest_tree(pairs, count, [edge for edge, _ in near])
+        return Skeleton(True, frozenset(tree))
     own = [pair for pair in pairs if not set(pair.between) & set(given)]
     ordered = is_ordered(own, count - len(given))
-    firm = _chain(own, LIKE_OTHERS) if ordered or _follow(own, count - len(given)) else frozenset()
+    firm = _chain(own, LIKE_OTHERS) if ordered else frozenset()
     weak = _chain(own, _WEAK) - firm if ordered else frozenset()
-    tree = frozenset(_strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], weak, given))
+    tree = _strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], weak, given)
     return Skeleton(
         ordered,
-        tree,
-        firm & tree,
+        frozenset(tree),
+        frozenset(tree - firm) if ordered or given else frozenset(),
         frozenset(pair.between for pair in pairs if pair.rivalled and pair.between in tree),
         frozenset(given),
     )
@@ -97,17 +91,6 @@ def is_ordered(pairs: Sequence[Pair], count: int) -> bool:
     near = [pair for pair in pairs if pair.apart == 1]
     fit = [pair for pair in near if pair.coverage >= _AMONG_BEST * min(best[row] for row in pair.between)]
     return count > 2 and len(fit) >= _ORDERED * (count - 1)
-
-
-def _follow(pairs: Sequence[Pair], count: int) -> bool:
-    """Whether panoramas share much with the next one, and far more often than with any other."""
-    near = [pair.coverage for pair in pairs if pair.apart == 1]
-    if count < 3 or not near:
-        return False
-    least = _WEAK * float(np.median(near))
-    others = sum(pair.coverage >= least for pair in pairs if pair.apart > 1) * 2 / (count - 2)
-    often = sum(coverage >= least for coverage in near)
-    return often >= max(_ORDERED * (count - 1), _MORE_OFTEN * others)
 
 
 def _chain(pairs: Sequence[Pair], share: float) -> frozenset[Edge]:

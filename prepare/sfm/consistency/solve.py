@@ -234,13 +234,13 @@ def _unconfirmed(solution: Solution) -> set[int]:
     A pair that looks alike gives a pose, too: only a second one shows that it is right.
     """
     skeleton, found = solution.skeleton, solution.found
+    firm = skeleton.certain if skeleton.ordered or skeleton.given else frozenset[Edge]()
     held = Counter[int]()
     for pair in solution.evidence.pairs:
         off = deviations(found, solution.evidence, pair)
         if pair.between in skeleton.tree or agrees(solution.evidence, pair, off, _CLOSE):
             held.update(pair.between)
-    sure = (skeleton.firm if skeleton.ordered else frozenset()) | skeleton.star
-    return {row for row in found.poses if held[row] < 2}.difference(*sure)
+    return {row for row in found.poses if held[row] < 2}.difference(*firm)
 
 
 def _fitting(found: Posed, evidence: Evidence, pair: Pair, bound: float) -> NDArray[np.int64] | None:

@@ -37,7 +37,7 @@ def _contradictions(
     unit = tuple(ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
     poses = {row: (np.eye(3), shift) for row, shift in enumerate(shifts)}
     found = Posed(poses, dict.fromkeys(range(COUNT), points))
-    skeleton = Skeleton(ordered, frozenset(walk), frozenset(walk))
+    skeleton = Skeleton(ordered, frozenset(walk))
     against_ = find_contradictions(Evidence(unit, tuple(pairs)), skeleton, found, 2.0, lambda _: None)
     return {it.between for it in against_}
 
