@@ -22,6 +22,14 @@ _setting, _machine, _note, _limit, _making = (
     partial(option, panel=panel) for panel in (_SETTINGS, _MACHINES, _TOLD, BUDGET, _MADE)
 )
 
+
+def _html(path: Path | None) -> Path | None:
+    """Raises InputError if a page would replace another kind of file, or be taken for one."""
+    if path is not None and path.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{path}: the page is HTML; give -o FILE.html")
+    return path
+
+
 SourcesArg = Annotated[
     list[str],
     argument(
@@ -40,7 +48,9 @@ LocalOption = Annotated[
     _machine("DIR", "Folder on this machine of a run with a URL. Default: in the cache.", "--local"),
 ]
 NewSceneOption = Annotated[Path, option("SCENE", "Folder of the new scene.", "--output", "-o")]
-PageOption = Annotated[Path | None, option("FILE.html", "Write the page to this file.", "--output", "-o")]
+PageOption = Annotated[
+    Path | None, option("FILE.html", "Write the page to this file.", "--output", "-o", callback=_html)
+]
 JsonOption = Annotated[bool, flag("Print one JSON object on stdout.", "--json")]
 LinkOption = Annotated[bool, flag("Link the panoramas instead of copying them.", "--link")]
 AddressOption = Annotated[

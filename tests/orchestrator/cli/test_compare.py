@@ -62,6 +62,8 @@ def test_wrong_arguments_are_one_line(two: tuple[RunFolder, RunFolder], tmp_path
     assert "/nowhere: is not a run folder" in one_line(call("compare", first, "/nowhere"))
     assert "at most 8 runs" in one_line(call("compare", *[first] * 9))
     assert "give -o FILE.html" in one_line(call("report", first, second))
+    for command in ("report", "compare"):
+        assert "the page is HTML" in one_line(call(command, first, second, "-o", tmp_path / "page.pdf"))
     gone = tmp_path / "none" / "page.html"
     assert "there is no such folder" in one_line(call("report", first, second, "-o", gone))
     second.joinpath("run.json").write_text("{")
