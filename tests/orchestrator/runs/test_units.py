@@ -2,7 +2,7 @@
 
 import pytest
 
-from panolog.orchestrator.runs.units import seconds_of
+from panolog.orchestrator.runs.units import gib, seconds_of
 
 
 @pytest.mark.parametrize(
@@ -26,3 +26,11 @@ def test_durations(text: str, seconds: float) -> None:
 )
 def test_what_is_none(text: str) -> None:
     assert seconds_of(text) is None
+
+
+@pytest.mark.parametrize(
+    ("size", "text"),
+    [(0, "0 MiB"), (7500, "7.3 KiB"), (2**20, "1 MiB"), (50 * 2**20, "50 MiB"), (2**30, "1.0 GiB")],
+)
+def test_sizes(size: int, text: str) -> None:
+    assert gib(size) == text

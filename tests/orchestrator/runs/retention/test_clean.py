@@ -147,7 +147,7 @@ def test_models_of_parts_go_when_the_run_is_done_and_readers_say_why(tmp_path: P
         model_of(folder, BLOCKS[1])
     state = replay(read_milestones(folder.database))
     assert state.outcome == Outcome.DONE
-    said = "the models of the parts were removed, 0 MiB: the merged model has their Gaussians"
+    said = "the models of the parts were removed, 0.5 KiB: the merged model has their Gaussians"
     assert [record.message for record in state.notices] == [said]
     before = len(read_records(folder.database))
     assert clean(folder.root, "--blocks")[0] == 0
