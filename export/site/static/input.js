@@ -129,9 +129,9 @@ export function listenToKeys(flight, commands, grab) {
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return;
     const element = /** @type {HTMLElement} */ (event.target);
-    const writes = element.matches("input[type=search]"),
+    const writes = element.matches("input[type=search], input[type=number]"),
       slides = element.matches("input[type=range]");
-    if (event.key === "Escape" || !(writes || slides)) {
+    if (event.key === "Escape" || !writes) {
       const command = commands[event.key.toLowerCase()];
       if (command && !event.repeat && !(event.key === "Enter" && element.matches("button, a"))) command(event);
     }

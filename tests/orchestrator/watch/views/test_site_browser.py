@@ -177,6 +177,15 @@ def test_keys_move_turn_and_close(page: Page) -> None:
     expect(page.locator("#measure")).to_have_attribute("aria-pressed", "true")
     page.keyboard.press("Escape")
     expect(page.locator("#measure")).to_have_attribute("aria-pressed", "false")
+    page.click("#more")
+    at = place(page)
+    page.fill("#seconds", "")
+    page.locator("#seconds").press_sequentially("20")  # the 0 is no key of the view
+    assert not page.evaluate("panolog.flight.travels") and place(page) == at
+    page.keyboard.press("Escape")
+    page.focus("#along")
+    page.keyboard.press(".")
+    expect(page.locator("#where")).to_have_text("7 / 12 · street/006.png")
 
 
 def test_the_walk_plays_pauses_and_follows_its_slider(page: Page) -> None:
