@@ -14,6 +14,8 @@ const FAINTEST = 0.9; // opacity at the end of its slider
 const LARGEST = 20; // steps: size at the end of its slider, where nothing is left out
 const RANGE = 1000; // times the size at its beginning
 const NEAR = 0.1; // of a step: what is nearer is behind the view; lines far outside of the picture take long
+const FAR = 1e9; // of a side that was not moved: it is no limit, as the page need not show all of the model
+const FINE = 3; // digits of a side after those of a step
 const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((from) =>
   [1, 2, 4].filter((bit) => !(from & bit)).map((bit) => /** @type {const} */ ([from, from | bit])),
 );
@@ -30,6 +32,9 @@ export function into(box, { rotation, origin }) {
   return matrix;
 }
 
+/** @param {number} value  Of a side, for the command line. */
+const written = (value) => (Math.abs(value) < FAR ? String(value) : value.toExponential());
+
 /** As the command line has it. @param {number} value */
 const rounded = (value) => Number(value.toPrecision(4));
 
@@ -42,13 +47,14 @@ export class Crop {
     this._stage = stage;
     this._frame = frame;
     this._near = step * NEAR;
+    this._digits = Math.max(0, FINE - Math.floor(Math.log10(step)));
     /** All of the model. */
     this.whole = around(corners(boxOf(stage.bounds)).map((corner) => placed(frame, corner)));
     /** Called after each change. */
     this.onChanged = () => {};
     this._reach = reach(this.whole, around(cameras.map((camera) => placed(frame, camera))), MARGIN * step);
     /** What is kept. @type {Box} */
-    this.box = { lower: [...this.whole.lower], upper: [...this.whole.upper] };
+    this.box = { lower: [-FAR, -FAR, -FAR], upper: [FAR, FAR, FAR] };
     this._sliders = ["lower", "upper"].flatMap((side) => [0, 1, 2].map((axis) => this._slider(side, axis)));
     stage.onDrawn.push(() => this._draw());
     this._show();
@@ -63,7 +69,7 @@ export class Crop {
   /** For the command line, "" if nothing is left out. */
   get option() {
     if (!this.cuts) return "";
-    return `--crop=${[...this.box.lower, ...this.box.upper].map((value) => Number(value.toPrecision(6))).join(",")}`;
+    return `--crop=${[...this.box.lower, ...this.box.upper].map(written).join(",")}`;
   }
 
   /** Shows all of the model again. */
@@ -96,10 +102,9 @@ export class Crop {
     for (const one of this._sliders) {
       const part = Number(one.slider.value) / PARTS,
         { lower, upper } = this._reach,
+        value = lower[one.axis] + part * (upper[one.axis] - lower[one.axis]),
         end = one.side === "lower" ? part <= 0 : part >= 1;
-      this.box[one.side][one.axis] = end
-        ? this.whole[one.side][one.axis]
-        : lower[one.axis] + part * (upper[one.axis] - lower[one.axis]);
+      this.box[one.side][one.axis] = end ? (part ? FAR : -FAR) : Number(value.toFixed(this._digits));
     }
     this._show();
   }

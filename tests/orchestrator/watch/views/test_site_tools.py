@@ -54,6 +54,7 @@ def test_views_are_saved_cropped_and_rendered_from(browser: Browser, tmp_path: P
     a, b, c, x, y, z = map(float, option.removeprefix("--crop=").split(","))
     kept = Selection(crop=((a, b, c), (x, y, z))).keeps(Splats.of(model), np.ones(len(model), bool))
     assert 0 < kept.sum() < len(model)
+    assert np.array_equal(kept, model.means[:, 0].numpy() >= np.float32(a))  # no other side was moved
     inside = torch.from_numpy(kept)
     quality = psnr(cropped, rendered(model.select(inside), viewpoints, SIZE, background=cropped[0, 0]))
     assert quality >= 25, f"{quality:.1f} dB"
