@@ -163,7 +163,10 @@ def say_results(root: Path, state: Any) -> None:
         say("there is no model: the limit has ended the run before its first checkpoint")
         return
     say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")
-    say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {}) or NOTHING_HELD_OUT})")
+    if folder.metrics.exists():
+        say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {}) or NOTHING_HELD_OUT})")
+    else:
+        say(f"metrics   are missing; {command('eval', root)} measures them again")
     if folder.images.is_dir():
         say(f"pictures  {folder.images}")
     if folder.web.is_dir():

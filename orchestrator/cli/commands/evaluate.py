@@ -1,6 +1,5 @@
 """`panolog eval`: the metrics of a run, read if they are stored and measured if not."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from panolog.orchestrator.engine.scheduling.pool import InProcess
 from panolog.orchestrator.engine.stages.evaluation import Evaluation
 from panolog.orchestrator.engine.stages.scenes import scene_of
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.folder import RunFolder, command_line
+from panolog.orchestrator.runs.folder import RunFolder, command_line, read_object
 from panolog.orchestrator.runs.info import read_info
 from panolog.orchestrator.watch.views.terminal import metrics_line
 from panolog.renderer.process import choose_device
@@ -23,6 +22,8 @@ from panolog.workers.events import Progress
 from panolog.workers.tasks import NOTHING_HELD_OUT
 
 Report = dict[str, Any]
+_SAID = {"views", "mean", "bytes", "lpips_reason"}  # of metrics.json
+_MOST = 100_000_000  # bytes of a file
 _FITTED = 0.3  # dB: from here on a fit of colours is worth a line
 
 
@@ -57,7 +58,11 @@ def evaluate_run(
     if not ply.exists():
         hint = "" if model else f" yet; see `{command_line('status', root)}`"
         raise InputError(f"{ply}: does not exist{hint}")
-    if model is None and (known := _known(folder, crop)) is not None and (folder.seams.exists() or not seams):
+    if (
+        model is None
+        and (known := _known(folder, crop)) is not None
+        and (not seams or "faces" in read_object(folder.seams, _MOST))
+    ):
         return known | (_read_seams(folder) if seams else {})
     job = Job(folder, scene_of(info, folder), info.config.model_copy(update={"device": device})).learnt
     specs = Specs(job, InProcess())
@@ -105,16 +110,15 @@ def _seam_line(face: Report) -> str:
 
 
 def _known(folder: RunFolder, crop: float) -> Report | None:
-    """metrics.json, if it was measured on the present merged model with this crop."""
-    if not folder.metrics.exists():
-        return None
-    stored: Report = json.loads(folder.metrics.read_bytes())
+    """metrics.json, if it was measured on the present merged model with this crop, and is whole."""
+    stored = read_object(folder.metrics, _MOST)
     count, _ = ply_header(folder.point_cloud)
-    return stored if (stored["gaussians"], stored["crop_bottom"]) == (count, crop) else None
+    same = (stored.get("gaussians"), stored.get("crop_bottom")) == (count, crop)
+    return stored if same and stored.keys() >= _SAID else None
 
 
 def _read_seams(folder: RunFolder) -> Report:
-    return {"seams": json.loads(folder.seams.read_bytes())}
+    return {"seams": read_object(folder.seams, _MOST)}
 
 
 def _measure(spec: EvaluateSpec, evaluation: Evaluation, progress: StageProgress) -> Evaluation:

@@ -78,7 +78,18 @@ def test_all_say_that_nothing_is_measured(run: RunFolder) -> None:
     assert NOTHING_HELD_OUT in call("eval", run.root).stdout.splitlines()
     assert shown("eval", run.root) == measured
     run.metrics.unlink()
-    assert shown("eval", run.root)["unmeasured"] == NOTHING_HELD_OUT  # measured anew
+    resumed = call("resume", run.root)
+    assert f"metrics   are missing; `panolog eval {run.root}` measures them again" in resumed.stderr
+    for damaged in (
+        None,
+        '{"mean": ',
+        "[]",
+        json.dumps({"gaussians": measured["gaussians"], "crop_bottom": 0}),
+    ):
+        if damaged is not None:
+            run.metrics.write_text(damaged)
+        assert shown("eval", run.root)["unmeasured"] == NOTHING_HELD_OUT  # measured anew
+        assert json.loads(run.metrics.read_bytes()) == measured
     assert not run.images.exists()
     assert call("status", run.root).exit_code == call("events", run.root).exit_code == 0
 
