@@ -15,6 +15,7 @@ from panolog.export.gltf.tiles import TILESET
 from panolog.export.site.write import DESCRIPTION
 from panolog.export.splats import Selection
 from panolog.export.spz import Version
+from panolog.orchestrator.cli.commands.models import say_unmerged
 from panolog.orchestrator.cli.session.delivery import provenance
 from panolog.orchestrator.engine.stages.scenes import scene_of
 from panolog.orchestrator.runs.folder import RunFolder, model_of, write_json
@@ -93,8 +94,8 @@ def export_model(
         write_json(output / _GEOREFERENCE, model.place.as_json(model.made_of))
         written.append(output / _GEOREFERENCE)
     faults = describe_faults(model.ply) if model.run is None else []
-    if model.run is not None and model.ply != model.run.point_cloud:
-        faults = [f"{model.run.root}: is not merged yet; this is its model of Stage I"]
+    if model.run is not None:
+        say_unmerged(model.run, model.ply)
     for line in (*faults, *_doubts(model.place, formats)):
         say(line)
     progress("writing", len(jobs), len(jobs))

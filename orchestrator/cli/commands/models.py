@@ -10,6 +10,7 @@ from panolog.export.frame import Frame
 from panolog.export.georeference import georeference_of
 from panolog.export.reading import convert_to_ply, is_ply, is_spz, sky_of
 from panolog.orchestrator.cli.console import say
+from panolog.orchestrator.runs.folder import RunFolder
 from panolog.scene.model import Scene
 from panolog.scene.ply import describe_faults, ply_exported
 
@@ -34,6 +35,12 @@ def say_missing_sky(path: Path) -> None:
     """Says of an SPZ without a sky where that would be: it may have been left behind."""
     if is_spz(path) and not path.stem.endswith("-sky") and not sky_of(path).is_file():
         say(f"{path}: has no sky; if it was exported with one, that is {sky_of(path).name}, to be next to it")
+
+
+def say_unmerged(run: RunFolder, model: Path) -> None:
+    """Says so if a model is shown in place of the merged one, which is to come or was removed."""
+    if model != run.point_cloud:
+        say(f"{run.root}: has no merged model; this is its model of Stage I")
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from urllib.parse import quote, unquote, urlsplit
 
 from panolog.export.site.page import Page, described, photograph_number
 from panolog.export.site.write import DESCRIPTION, MOST_IN_ONE, media_type, site_files, write_site
+from panolog.orchestrator.cli.commands.models import say_unmerged
 from panolog.orchestrator.runs.folder import RunFolder, read_head, shown_model
 from panolog.orchestrator.watch.views.site.build import (
     Shown,
@@ -51,6 +52,11 @@ def page_of(source: Path, wanted: Wanted) -> Shown:
     return site_of_run(RunFolder(source), wanted) if source.is_dir() else site_of_file(source, wanted)
 
 
+def _say_part(source: Path, wanted: Wanted) -> None:
+    if source.is_dir() and wanted.task is None:
+        say_unmerged(RunFolder(source), shown_model(RunFolder(source)))
+
+
 def write_view(source: Path, wanted: Wanted, output: Path, progress: StageProgress = no_progress) -> Shown:
     """Writes the page to `output`: FILE.html as one file, anything else as a folder for any web server.
 
@@ -59,11 +65,13 @@ def write_view(source: Path, wanted: Wanted, output: Path, progress: StageProgre
     if output.suffix.lower() not in _HTML:
         shown = page_of(source, wanted)
         write_folder(shown, output, progress)
+        _say_part(source, wanted)
         return shown
     if (wanted.most or 0) > MOST_IN_ONE:
         raise InputError(f"{output}: one file shows at most {MOST_IN_ONE:,} Gaussians; give a folder")
     shown = page_of(source, replace(wanted, most=wanted.most or MOST_IN_ONE))
     write_file(shown, output)
+    _say_part(source, wanted)
     return shown
 
 
@@ -90,6 +98,7 @@ def site_of(source: Path, wanted: Wanted, progress: StageProgress = no_progress)
     shown = page_of(source, wanted)
     with TemporaryDirectory(prefix="panolog-view-") as folder:
         write_site(Path(folder) / "web", shown.write_model, shown.page)
+        _say_part(source, wanted)
         yield Site(Path(folder) / "web", shown.scene, shown=shown.page)
 
 
