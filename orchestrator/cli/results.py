@@ -155,7 +155,8 @@ def view(
         int | None,
         option(
             "N",
-            "Show at most N Gaussians, those that cover most. Default: all; 1,000,000 in one file.",
+            "Show at most N Gaussians that are not sky: those that cover most."
+            " Default: all; 1,000,000 in one file.",
             "--max-gaussians",
             min=1,
         ),
