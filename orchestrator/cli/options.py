@@ -25,7 +25,7 @@ _setting, _machine, _note, _limit, _making = (
 
 def _html(path: Path | None) -> Path | None:
     """Raises InputError if a page would replace another kind of file, or be taken for one."""
-    if path is not None and path.suffix.lower() not in (".html", ".htm"):
+    if path is not None and path.suffix.lower() not in ("", ".html", ".htm"):
         raise InputError(f"{path}: the page is HTML; give -o FILE.html")
     return path
 
