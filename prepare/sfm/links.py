@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
+from panolog.prepare.sfm.sparse_model import SparseModel
+
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -30,6 +32,12 @@ class Link:
     smaller: tuple[int, ...]  # rows of the smaller part
     points: int  # seen by two or more panoramas of both parts
     scale_error: float  # relative standard deviation of the scale across, at least; inf without such points
+
+
+def links_of(model: SparseModel, width: int) -> list[Link]:
+    """Between parts of a model of panoramas of that width in pixels, the weakest first."""
+    sigma = float(np.median(np.concatenate(model.errors(width)))) * 2 * np.pi / width
+    return find_links(model.centers, model.points, [rows for rows, _ in model.sightings], sigma)
 
 
 def find_links(centers: Array, points: Array, seen: Sequence[Rows], sigma: float) -> list[Link]:

@@ -11,7 +11,7 @@ from panolog.prepare.panorama_files import LayerFiles, PanoramaFile
 from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.consistency.solve import Solver
 from panolog.prepare.sfm.features import MEMORY, find_features
-from panolog.prepare.sfm.links import Link, find_links
+from panolog.prepare.sfm.links import Link, links_of
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing, best_matches, choose_pairs, match_pairs
 from panolog.prepare.sfm.sketch import Sketcher
@@ -123,12 +123,6 @@ def featured(
         where = work.panoramas[0].path.parent
         raise SceneError(f"{where}: no features in any panorama; are they masked, or empty?")
     return size, features
-
-
-def links_of(model: SparseModel, width: int) -> list[Link]:
-    """Between parts of a model of panoramas of that width in pixels, the weakest first."""
-    sigma = float(np.median(np.concatenate(model.errors(width)))) * 2 * np.pi / width
-    return find_links(model.centers, model.points, [rows for rows, _ in model.sightings], sigma)
 
 
 def _refusal(

@@ -25,7 +25,9 @@ from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, best_covera
 from panolog.prepare.sfm.consistency.guided import Guide
 from panolog.prepare.sfm.consistency.motion import Geometries, look_again
 from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, components, find_skeleton, hops
+from panolog.prepare.sfm.links import links_of
 from panolog.prepare.sfm.mapping import Mapper, map_pairs
+from panolog.prepare.sfm.sparse_model import from_colmap
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
 
@@ -36,6 +38,7 @@ _PURE = 0.8  # share of the matches of a pair that fit, for those to count that 
 _ROUNDS = 4  # of mapping with the pairs that fit
 _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
 _GUESSES = 4  # of what connects panoramas with a scene that they are added to
+_LOOSE = 0.5  # relative error of the scale across a link, from which it holds nothing
 _RIM = 0.1  # share of the panoramas that may be left out without an order: all others agree
 
 Kept = dict[Edge, NDArray[np.int64]]  # matches (M, 2) of the pairs that are mapped
@@ -76,7 +79,7 @@ class Solver:
         their points, of panoramas of the database.
         """
         self._work, self._mapper, self._max_error, self._progress = work, mapper, max_error, progress
-        self._ids, evidence = work.ids(), read_evidence(work, size)
+        self._size, self._ids, evidence = size, work.ids(), read_evidence(work, size)
         self._geometries = Geometries(work, size, max_error, evidence)
         evidence = look_again(self._geometries.marked(evidence), self._geometries)
         self._known, self._given, self._refuted, self._places = known, set[int](), set[Edge](), places
@@ -94,7 +97,8 @@ class Solver:
     def parts(self, least: int, doubtful: bool = False) -> list[Solution]:
         """Reconstructions of different panoramas, each without a contradiction, the largest first.
 
-        What contradicts itself is cut where it is weakest, and each side is reconstructed again.
+        What contradicts itself is cut where it is weakest, and what has a scale of its own where it is linked
+        with the rest, and each side is reconstructed again.
         Args: least, panoramas of a part; doubtful, also without an order where the cut does not only leave
             out a few: nothing says then which of the pairs within a side that agree are wrong together.
         """
@@ -102,7 +106,9 @@ class Solver:
         while todo:
             rows = todo.pop()
             part = self._part(rows, doubtful or self._skeleton.ordered) if len(rows) >= least else None
-            if part is not None and len(part.found.poses) >= least:
+            if part is not None and (loose := self._loose(part)):
+                todo += [rows - loose, loose]
+            elif part is not None and len(part.found.poses) >= least:
                 found.append(part)
                 todo += self._sides(rows - part.found.poses.keys())
         return sorted(found, key=lambda part: -len(part.found.poses))
@@ -153,6 +159,17 @@ class Solver:
             self.unconfirmed |= loose
             found = self._guessed(found.found.poses.keys() - loose)
         return found if found is not None and found.trusted else None
+
+    def _loose(self, part: Solution) -> set[int]:
+        """The panoramas whose scale against the others is unknown, which no pair contradicts.
+
+        Where a step seems to lead back, all that follows fits if it is small enough.
+        """
+        model = from_colmap(part.model, self._work.numbers, self._size)
+        weakest = next(iter(links_of(model, self._size[0])), None)
+        if weakest is None or weakest.scale_error < _LOOSE:
+            return set()
+        return {model.rows[place] for place in weakest.smaller}
 
     def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
         """The pairs of these edges with what matches along their motion."""

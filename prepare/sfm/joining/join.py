@@ -17,9 +17,10 @@ from panolog.prepare.sfm.consistency.guided import Guide
 from panolog.prepare.sfm.consistency.solve import Solver, write_pairs
 from panolog.prepare.sfm.features import MEMORY
 from panolog.prepare.sfm.joining.known import KnownScene, read_known, with_new
+from panolog.prepare.sfm.links import links_of
 from panolog.prepare.sfm.pairs import Pairing, Pairs, best_matches, choose_pairs, match_pairs
 from panolog.prepare.sfm.pipeline import SfmSettings, workspace_folder
-from panolog.prepare.sfm.reconstruct import Reconstruction, featured, links_of, max_error
+from panolog.prepare.sfm.reconstruct import Reconstruction, featured, max_error
 from panolog.prepare.sfm.report import Into, SfmReport, write_report
 from panolog.prepare.sfm.sparse_model import from_colmap
 from panolog.prepare.sfm.triangulate import neighbours, points_of

@@ -7,6 +7,8 @@ import pycolmap
 import pytest
 
 from panolog.prepare.sfm.consistency.solve import Solution, Solver
+from panolog.prepare.sfm.links import Link
+from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.prepare.sfm.workspace import silence_colmap
 from panolog.scene.write import no_progress
 from tests.prepare.sfm.accuracy import drift, length
@@ -72,6 +74,17 @@ def test_a_pose_that_a_single_pair_holds_needs_the_order(tmp_path: Path, ordered
     assert found.skeleton.ordered == ordered
     assert solver.unconfirmed == (set() if ordered else {first, last})
     assert found.found.poses.keys() == {*range(COUNT)} - solver.unconfirmed
+
+
+def test_what_has_a_scale_of_its_own_is_another_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def links(model: SparseModel, width: int) -> list[Link]:
+        return [Link((9, 10), tuple(range(10, COUNT)), 3, 2.0)] if len(model.rows) == COUNT else []
+
+    place = square(tmp_path, count=COUNT)
+    monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.links_of", links)
+    with silence_colmap():
+        found = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    assert [sorted(part.found.poses) for part in found] == [[*range(10)], [*range(10, COUNT)]]
 
 
 def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
