@@ -38,7 +38,7 @@ _PURE = 0.8  # share of the matches of a pair that fit, for those to count that 
 _ROUNDS = 4  # of mapping with the pairs that fit
 _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
 _GUESSES = 4  # of what connects panoramas with a scene that they are added to
-_LOOSE = 0.5  # relative error of the scale across a link, from which it holds nothing
+_LOOSE = 100.0  # relative error of the scale across a link: one side is a point for the other
 _RIM = 0.1  # share of the panoramas that may be left out without an order: all others agree
 
 Kept = dict[Edge, NDArray[np.int64]]  # matches (M, 2) of the pairs that are mapped
@@ -161,15 +161,14 @@ class Solver:
         return found if found is not None and found.trusted else None
 
     def _loose(self, part: Solution) -> set[int]:
-        """The panoramas whose scale against the others is unknown, which no pair contradicts.
+        """The panoramas that have shrunk to a point, or those of which only a point is left.
 
-        Where a step seems to lead back, all that follows fits if it is small enough.
+        No pair contradicts that: where a step seems to lead back, what follows fits if it is small enough.
         """
         model = from_colmap(part.model, self._work.numbers, self._size)
-        weakest = next(iter(links_of(model, self._size[0])), None)
-        if weakest is None or weakest.scale_error < _LOOSE:
-            return set()
-        return {model.rows[place] for place in weakest.smaller}
+        links = links_of(model, self._size[0])
+        loose = next((it.smaller for it in links if _LOOSE <= it.scale_error < np.inf), ())
+        return {model.rows[place] for place in loose}
 
     def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
         """The pairs of these edges with what matches along their motion."""

@@ -76,15 +76,21 @@ def test_a_pose_that_a_single_pair_holds_needs_the_order(tmp_path: Path, ordered
     assert found.found.poses.keys() == {*range(COUNT)} - solver.unconfirmed
 
 
-def test_what_has_a_scale_of_its_own_is_another_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("error", "parts"), [(1e8, 2), (9.0, 1), (np.inf, 1)])
+def test_what_has_shrunk_to_a_point_is_another_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float, parts: int
+) -> None:
+    """Links that no points hold are known to be weak, but need not be wrong."""
+
     def links(model: SparseModel, width: int) -> list[Link]:
-        return [Link((9, 10), tuple(range(10, COUNT)), 3, 2.0)] if len(model.rows) == COUNT else []
+        return [Link((9, 10), tuple(range(10, COUNT)), 3, error)] if len(model.rows) == COUNT else []
 
     place = square(tmp_path, count=COUNT)
     monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.links_of", links)
     with silence_colmap():
         found = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
-    assert [sorted(part.found.poses) for part in found] == [[*range(10)], [*range(10, COUNT)]]
+    rows = [[*range(10)], [*range(10, COUNT)]] if parts == 2 else [[*range(COUNT)]]
+    assert [sorted(part.found.poses) for part in found] == rows
 
 
 def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
