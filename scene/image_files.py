@@ -24,6 +24,7 @@ _HEAD = 262_144  # bytes in which the pixels of a PNG must begin, if not all of 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _IEND = b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _JPEG_END, _JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", 0xDA
+_BLOCK = 2  # pixels of a row that a JPEG loses at once, at least, reduced eight times
 _GREY, _MORE = 128, b"\x55\x2a" * 32  # what a JPEG's missing pixels are; bytes that any code decodes
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame, all codings
 _REDUCED = {
@@ -373,7 +374,7 @@ def _is_cut(data: bytes, pixels: NDArray[Any], flags: int) -> bool:
 
     OpenCV makes them grey without a word. In a whole file what is put in front of the marker changes nothing.
     """
-    if (pixels[-1, -1] != _GREY).any():
+    if (pixels[-1, -_BLOCK:] != _GREY).any():
         return False
     file = BytesIO(data)
     for marker, length in jpeg_segments(file):
