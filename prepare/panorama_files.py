@@ -21,7 +21,7 @@ from panolog.scene.pictures.kinds import require_panorama
 from panolog.scene.read import check_names, image_folder, model_folder
 
 _ADDED = ("@eaDir", "__MACOSX")  # folders of Synology's thumbnails and of macOS's archives
-SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")  # the likeliest first
 LayerFiles = dict[str, list[Path | None]]  # by the name of the layer, for each panorama
 In = TypeVar("In")
 Out = TypeVar("Out")

@@ -17,7 +17,7 @@ from typing import TypeAlias
 
 StrPath: TypeAlias = str | os.PathLike[str]  # what users may give where a path is needed
 SUFFIX = ".part"
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FULL = (errno.ENOSPC, errno.EDQUOT)  # errors of a disk without room
 _NUMBER = re.compile("0*([0-9]+)")
 Locate = Callable[[Path], Path]  # a path as the run has it -> where the file is on this machine
 
@@ -125,7 +125,7 @@ def _named(path: Path, temporary: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in _FULL or str(error.filename) == str(temporary):
+        if error.errno in (*FULL, errno.EFBIG) or str(error.filename) == str(temporary):
             error.filename = str(path)
         raise
 

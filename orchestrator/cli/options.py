@@ -21,11 +21,12 @@ _MADE = "Panoramas or a video instead of a scene"
 _setting, _machine, _note, _limit, _making = (
     partial(option, panel=panel) for panel in (_SETTINGS, _MACHINES, _TOLD, BUDGET, _MADE)
 )
+HTML = (".html", ".htm")  # endings of a page that is one file
 
 
 def _html(path: Path | None) -> Path | None:
     """Raises InputError if a page would replace another kind of file, or be taken for one."""
-    if path is not None and path.suffix.lower() not in ("", ".html", ".htm"):
+    if path is not None and path.suffix.lower() not in ("", *HTML):
         raise InputError(f"{path}: the page is HTML; give -o FILE.html")
     return path
 

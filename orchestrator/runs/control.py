@@ -4,7 +4,6 @@ Any process that may write the run folder may send one. The driver polls the fol
 carries out what is possible (`answer`).
 """
 
-import errno
 import json
 import os
 import re
@@ -34,10 +33,9 @@ from panolog.orchestrator.runs.records import (
 from panolog.orchestrator.runs.state import RunState, Status, TaskState, replay
 from panolog.orchestrator.runs.store import read_milestones
 from panolog.scene.errors import InputError, RunFolderError
-from panolog.scene.files import write_bytes
+from panolog.scene.files import FULL, write_bytes
 from panolog.workers.tasks import StrEnum, TaskId
 
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 _LIMIT = 100  # requests taken at a time
 _NAMED = 5  # machines named in a line at most
 _MAX_BYTES = 512  # of a request
@@ -123,7 +121,7 @@ def send(folder: RunFolder, action: str, block: int | None = None, node: str | N
     try:
         write_bytes(folder.control / name, json.dumps(vars(wanted)).encode())
     except OSError as error:
-        if error.errno not in _FULL:
+        if error.errno not in FULL:
             raise
         raise RunFolderError(
             f"{folder.root}: its disk is full, so no request reaches the driver; free some space, or stop "

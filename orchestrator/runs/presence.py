@@ -17,10 +17,10 @@ from pathlib import Path
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import read_object
 from panolog.orchestrator.runs.units import gib
+from panolog.scene.files import FULL
 
 _SIZE = 1024  # bytes; of a longer reason the beginning is kept
 _REASON = 160  # characters of a reason, each at most six bytes in JSON
-_FULL = {errno.ENOSPC, errno.EDQUOT}
 _AWAY = {
     errno.EIO,
     errno.EROFS,
@@ -88,7 +88,7 @@ def why_waiting(error: BaseException, root: Path, size: int = 0) -> str:
         holders = ", ".join(lock.holders(root / "run.db")) or "another program"
         return f"waiting for {root / 'run.db'}, which {holders} has locked: end it or stop the run"
     code = _code(error)
-    if code in _FULL:
+    if code in FULL:
         return f"disk full, waiting: free {_missing(root, size)} on the disk of {root} or stop the run"
     if code in _AWAY | {errno.ENOENT} and not root.exists():
         return f"waiting for {root}, which is gone: put it back or stop the run"

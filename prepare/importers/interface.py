@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.importers.json_xml import MEMORY, JsonNode
 from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
+from panolog.prepare.panorama_files import SUFFIXES
 from panolog.scene.errors import SceneError
 from panolog.scene.files import file_of, stem_of
 from panolog.scene.write import UNSEEN, Origin, PosedImage
@@ -21,8 +22,7 @@ from panolog.scene.write import UNSEEN, Origin, PosedImage
 Array = NDArray[np.float64]
 FLIP_YZ = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera (x right, y up, z backward) to ours, and back
 _TOLERANCE = 1e-3  # how far from orthonormal a rotation that was written as text may be
-_ENDS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
-ENDINGS = (*_ENDS, *(end.upper() for end in _ENDS))
+ENDINGS = (*SUFFIXES, *(end.upper() for end in SUFFIXES))
 _HEAD = 65_536  # bytes that `detect` may read of a file
 _LARGEST_LIST = 2**26  # bytes of a file of image names
 

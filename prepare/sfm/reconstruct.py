@@ -11,11 +11,11 @@ from panolog.prepare.panorama_files import LayerFiles, PanoramaFile
 from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.consistency.solve import Solver
 from panolog.prepare.sfm.features import MEMORY, find_features
-from panolog.prepare.sfm.links import Link, links_of
+from panolog.prepare.sfm.links import Link
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing, best_matches, choose_pairs, match_pairs
 from panolog.prepare.sfm.sketch import Sketcher
-from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
+from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.prepare.sfm.trajectory import near_pairs
 from panolog.prepare.sfm.workspace import Workspace, file_state, silence_colmap
 from panolog.scene.errors import SceneError
@@ -80,8 +80,8 @@ def reconstruct(
         solver = Solver(work, size, mapper, allowed, progress, places)
         least = min(len(panoramas), max(3, min(_LEAST, len(panoramas) // 2 + 1)))
         solved = solver.parts(least, doubtful=partial)
-    models = [from_colmap(part.model, work.numbers, size) for part in solved]
-    models = [model for model in models if model.points_seen_by(min(3, len(panoramas))) >= FIRM]
+    firm = [part for part in solved if part.sparse.points_seen_by(min(3, len(panoramas))) >= FIRM]
+    models = [part.sparse for part in firm]
     shared = best_matches(work)
     if not models or not (partial or 2 * len(models[0].rows) > len(panoramas)):
         raise SceneError(_refusal(work, models, shared, solver.cuts))
@@ -92,7 +92,7 @@ def reconstruct(
             layers=layers,
             size=size,
             model=model,
-            links=links_of(model, size[0]),
+            links=part.links,
             contradictions=[it for it in against if set(it.between) & set(model.rows)],
             missing={row: shared[row] for row in range(len(panoramas)) if row not in model.rows},
             unconfirmed=frozenset(solver.unconfirmed.difference(model.rows)),
@@ -100,7 +100,7 @@ def reconstruct(
             features=features,
             pairs=len(pairs),
         )
-        for model in models
+        for part, model in zip(firm, models, strict=True)
     ]
 
 

@@ -6,7 +6,6 @@ reserved under a lock before bytes arrive, so the bound holds for all processes 
 no room, or a full disk, is read past the cache.
 """
 
-import errno
 import fcntl
 import hashlib
 import os
@@ -19,7 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from panolog.scene.errors import ConfigError
-from panolog.scene.files import SUFFIX, user_folder
+from panolog.scene.files import FULL, SUFFIX, user_folder
 from panolog.scene.stores.store import PATIENCE_S, Version, open_store
 
 FOLDER, BOUND = "PANOLOG_STORE_CACHE", "PANOLOG_STORE_CACHE_GIB"
@@ -86,7 +85,7 @@ class Cache:
                 part.write_bytes(data)
                 part.replace(kept)
         except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            if error.errno not in FULL:
                 raise
         finally:
             part.unlink(missing_ok=True)

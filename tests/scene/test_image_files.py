@@ -83,7 +83,7 @@ def test_any_truncation_is_noticed(tmp_path: Path, suffix: str, progressive: int
 def test_a_jpeg_that_was_cut_and_closed_again_is_truncated(
     tmp_path: Path, restarts: int, reduction: int
 ) -> None:
-    """Its missing part is grey; a whole picture may be, too."""
+    """The missing part of a JPEG is decoded as grey, but a whole picture may be grey, too."""
     path, large = tmp_path / "a.jpg", cv2.resize(PIXELS, (256, 128))
     for pixels in (large, np.full_like(large, 128)):
         cv2.imwrite(str(path), pixels, [cv2.IMWRITE_JPEG_RST_INTERVAL, restarts])

@@ -15,6 +15,7 @@ from urllib.parse import quote, unquote, urlsplit
 from panolog.export.site.page import Page, described, photograph_number
 from panolog.export.site.write import DESCRIPTION, MOST_IN_ONE, media_type, site_files, write_site
 from panolog.orchestrator.cli.commands.models import say_unmerged
+from panolog.orchestrator.cli.options import HTML
 from panolog.orchestrator.runs.folder import RunFolder, read_head, shown_model
 from panolog.orchestrator.watch.views.site.build import (
     Shown,
@@ -31,7 +32,6 @@ from panolog.scene.write import StageProgress, no_progress
 
 _CACHED = 32  # photographs, of some hundred kilobytes each
 _TIMEOUT_S = 60.0  # for a request, and between two of a connection
-_HTML = (".html", ".htm")
 _LOCAL = {"localhost", "127.0.0.1"}  # names under which a browser on this machine reaches the server
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:;"
@@ -53,6 +53,7 @@ def page_of(source: Path, wanted: Wanted) -> Shown:
 
 
 def _say_part(source: Path, wanted: Wanted) -> None:
+    """Says that a page is of Stage I once it is written: an error before is one line."""
     if source.is_dir() and wanted.task is None:
         say_unmerged(RunFolder(source), shown_model(RunFolder(source)))
 
@@ -62,7 +63,7 @@ def write_view(source: Path, wanted: Wanted, output: Path, progress: StageProgre
 
     Raises InputError or RunError if the model cannot be read or the output is something else; OSError.
     """
-    if output.suffix.lower() not in _HTML:
+    if output.suffix.lower() not in HTML:
         shown = page_of(source, wanted)
         write_folder(shown, output, progress)
         _say_part(source, wanted)

@@ -107,11 +107,9 @@ class _Rows:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         names = [*_COLUMNS, *(("PSNR", "memory") if self.wide else ())]
+        unbound = options.update(max_width=WIDE)
         for left_out in _FIRST_LEFT_OUT:
-            if (
-                Measurement.get(console, options.update(max_width=WIDE), self._of(names)).maximum
-                <= options.max_width
-            ):
+            if Measurement.get(console, unbound, self._of(names)).maximum <= options.max_width:
                 break
             names[names.index(left_out)] = None
         yield self._of(names)

@@ -8,6 +8,7 @@ of panoramas that it has not reached, the mapper starts again, until its result 
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pycolmap
@@ -25,9 +26,9 @@ from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, best_covera
 from panolog.prepare.sfm.consistency.guided import Guide
 from panolog.prepare.sfm.consistency.motion import Geometries, look_again
 from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, components, find_skeleton, hops
-from panolog.prepare.sfm.links import links_of
+from panolog.prepare.sfm.links import Link, links_of
 from panolog.prepare.sfm.mapping import Mapper, map_pairs
-from panolog.prepare.sfm.sparse_model import from_colmap
+from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
 
@@ -54,11 +55,23 @@ class Solution:
     skeleton: Skeleton
     found: Posed
     kept: Kept
+    numbers: Sequence[str]  # the name of each panorama in the database
+    size: tuple[int, int]  # (width, height) of the panoramas
 
     @property
     def trusted(self) -> bool:
         """Whether its poses can be used as they are."""
         return is_trusted(self.contradictions, self.skeleton, self.found.poses)
+
+    @cached_property
+    def sparse(self) -> SparseModel:
+        """The poses and points in our convention."""
+        return from_colmap(self.model, self.numbers, self.size)
+
+    @cached_property
+    def links(self) -> list[Link]:
+        """Between parts of it, the weakest first."""
+        return links_of(self.sparse, self.size[0])
 
 
 class Solver:
@@ -97,8 +110,8 @@ class Solver:
     def parts(self, least: int, doubtful: bool = False) -> list[Solution]:
         """Reconstructions of different panoramas, each without a contradiction, the largest first.
 
-        What contradicts itself is cut where it is weakest, and what has a scale of its own where it is linked
-        with the rest, and each side is reconstructed again.
+        What contradicts itself is cut where it is weakest, what is a point for the rest is cut off, and each
+        side is reconstructed again.
         Args: least, panoramas of a part; doubtful, also without an order where the cut does not only leave
             out a few: nothing says then which of the pairs within a side that agree are wrong together.
         """
@@ -106,7 +119,7 @@ class Solver:
         while todo:
             rows = todo.pop()
             part = self._part(rows, doubtful or self._skeleton.ordered) if len(rows) >= least else None
-            if part is not None and (loose := self._loose(part)):
+            if part is not None and (loose := _shrunk(part)):
                 todo += [rows - loose, loose]
             elif part is not None and len(part.found.poses) >= least:
                 found.append(part)
@@ -160,16 +173,6 @@ class Solver:
             found = self._guessed(found.found.poses.keys() - loose)
         return found if found is not None and found.trusted else None
 
-    def _loose(self, part: Solution) -> set[int]:
-        """The panoramas that have shrunk to a point, or those of which only a point is left.
-
-        No pair contradicts that: where a step seems to lead back, what follows fits if it is small enough.
-        """
-        model = from_colmap(part.model, self._work.numbers, self._size)
-        links = links_of(model, self._size[0])
-        loose = next((it.smaller for it in links if _LOOSE <= it.scale_error < np.inf), ())
-        return {model.rows[place] for place in loose}
-
     def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
         """The pairs of these edges with what matches along their motion."""
 
@@ -205,7 +208,7 @@ class Solver:
                 break
             found = posed(model, self._ids)
             against = find_contradictions(evidence, skeleton, found, _CLOSE, self._geometries.motion)
-            new = Solution(model, against, evidence, skeleton, found, kept)
+            new = Solution(model, against, evidence, skeleton, found, kept, self._work.numbers, self._size)
             better = best is None or (new.trusted, len(found.poses)) >= (best.trusted, len(best.found.poses))
             if turn <= 1 or better:  # the tree alone is not judged by all that its poses decide
                 best = new
@@ -242,6 +245,15 @@ def _agreeing(solution: Solution, drift: float) -> Kept:
         elif matches is not None and len(matches):
             kept[pair.between] = matches
     return kept
+
+
+def _shrunk(solution: Solution) -> set[int]:
+    """The panoramas on the smaller side of a link across which one side is a point for the other.
+
+    No pair contradicts that: where a step seems to lead back, what follows fits if it is small enough.
+    """
+    loose = next((it.smaller for it in solution.links if _LOOSE <= it.scale_error < np.inf), ())
+    return {solution.sparse.rows[place] for place in loose}
 
 
 def _unconfirmed(solution: Solution) -> set[int]:

@@ -176,7 +176,7 @@ def add_spherical_xml(path: Path, **values: object) -> Path:
 
 
 def as_matroska(path: Path, later: float = 0.0) -> Path:
-    """The same video and metadata in Matroska's elements, by FFmpeg, shown so many seconds later."""
+    """A copy of a video and its metadata in Matroska's elements, by FFmpeg, shown `later` seconds later."""
     target = path.with_suffix(".mkv")
     with av.open(str(path)) as source, av.open(str(target), "w") as file:
         stream = file.add_stream_from_template(source.streams.video[0])
