@@ -20,7 +20,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,7 +28,7 @@ from threading import Condition, Thread
 from unittest.mock import Mock, patch
 
 import torch
-from playwright.sync_api import Page
+from playwright.sync_api import Page, ViewportSize
 
 from panolog.orchestrator.engine.driver.job import Job, Specs
 from panolog.orchestrator.engine.driver.saving import save
@@ -52,6 +52,7 @@ from tests.orchestrator.watch.dashboard.browser import chromium
 _TURN = 20  # iterations
 _NOTHING = PreviewConfig(every=10**9)
 _WAIT_S = 600.0
+_WINDOW: ViewportSize = {"width": 1440, "height": 1000}
 
 
 def load() -> str:
@@ -80,17 +81,17 @@ def watch(scene: Path, root: Path, options: argparse.Namespace) -> None:
     """Prints how soon a run of a scene shows something."""
     given = ["--iterations", str(options.iterations), "--width", str(options.width)]
     command = [sys.executable, "-m", "panolog.orchestrator.cli", "run", str(scene), "-o", str(root), *given]
-    began = time.monotonic()
-
-    def say(what: str) -> None:
-        print(f"{time.monotonic() - began:6.1f} s  {what} ({load()})", flush=True)
-
-    say("start")
-    with dashboard_of([*command, "--dashboard"]) as url, chromium(SOFTWARE) as browser:
-        say("the dashboard's address")
-        context = browser.new_context(viewport={"width": 1440, "height": 1000})
+    with ExitStack() as stack:
+        context = stack.enter_context(chromium(SOFTWARE)).new_context(viewport=_WINDOW)  # as people have one
         context.set_default_timeout(1000 * _WAIT_S)
-        page = context.new_page()
+        page, began = context.new_page(), time.monotonic()
+
+        def say(what: str) -> None:
+            print(f"{time.monotonic() - began:6.1f} s  {what} ({load()})", flush=True)
+
+        say("start")
+        url = stack.enter_context(dashboard_of([*command, "--dashboard"]))
+        say("the dashboard's address")
         page.goto(url)
         if page.locator("#runs a").count():
             page.locator("#runs a").first.click()

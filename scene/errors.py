@@ -27,6 +27,11 @@ def in_one_line(error: BaseException, most: int | None = None) -> str:
     return " ".join(str(error).split())[:most] or type(error).__name__
 
 
+def first_line(text: str) -> str:
+    """The first line of a text; "" where it has none."""
+    return (text.strip().splitlines() or [""])[0]
+
+
 class PanologError(Exception):
     """Root of all errors that PanoLOG raises on purpose."""
 

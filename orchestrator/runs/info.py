@@ -23,6 +23,7 @@ from panolog.orchestrator.runs.store import read_milestones
 from panolog.scene.errors import ConfigError, RunFolderError
 from panolog.scene.files import SUFFIX
 from panolog.scene.model import NO_OFFSET, Vector
+from panolog.scene.read import MASKS
 from panolog.workers.training.recipes import RECIPES
 
 _PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
@@ -114,7 +115,14 @@ def clear(folder: RunFolder, *, keep_info: bool = False) -> None:
 
 
 def discard(folder: RunFolder, made: Sequence[Path]) -> None:
-    """Leaves the folder of a run that has not started as it was. Args: made, folders that were missing."""
+    """Leaves the folder of a run that has not started as it was, unless a next driver would use its scene.
+
+    Args: made, folders that were missing.
+    """
+    work = folder.scene.with_name(f"{folder.scene.name}.sfm")
+    if any(it.is_dir() and any(it.iterdir()) for it in (folder.scene, work, folder.preparation / MASKS)):
+        return
+    shutil.rmtree(folder.preparation, ignore_errors=True)
     clear(folder)
     folder.lock.unlink(missing_ok=True)
     with suppress(OSError):  # something else is there by now

@@ -21,7 +21,6 @@ from panolog.orchestrator.engine.driver.requests import interrupt
 from panolog.orchestrator.engine.stages.outline import write_outline, write_sketch
 from panolog.orchestrator.engine.stages.scenes import divided
 from panolog.orchestrator.runs import control
-from panolog.orchestrator.runs import info as run_info
 from panolog.orchestrator.runs.clock import repeated
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.control import Action, ControlRequest
@@ -46,15 +45,6 @@ from panolog.workers.tasks import PREPARE
 
 _SHOWN_S = 0.5  # between two reports of progress
 _POLL_S = 0.5  # between two looks for a request to stop
-
-
-def discard(folder: RunFolder, made: list[Path]) -> None:
-    """Leaves the folder of a run as it was, unless something is in it that a next driver would use."""
-    work = folder.scene.with_name(f"{folder.scene.name}.sfm")
-    if any(it.is_dir() and any(it.iterdir()) for it in (folder.scene, work, folder.preparation / MASKS)):
-        return
-    shutil.rmtree(folder.preparation, ignore_errors=True)
-    run_info.discard(folder, made)
 
 
 def stoppable(folder: RunFolder) -> AbstractContextManager[None]:

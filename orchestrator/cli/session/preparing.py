@@ -18,7 +18,6 @@ from panolog.orchestrator.runs.preparation.settings import (
     Step,
     read_settings,
 )
-from panolog.prepare.networks.depth_maps import plan_depth
 from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.scene.errors import ConfigError, RunFolderError, SceneError
@@ -100,10 +99,12 @@ def settings_of(source: Path | Sequence[Path], options: Options) -> Settings | N
             if len(sources) > 1:
                 raise ConfigError(f"{path}: is a scene already, which is run by itself; give it alone")
             return None
-    # opens the networks: nothing of them is to be wrong hours later
+    # opens the networks, which import torch: nothing of them is to be wrong hours later
     if options.mask_model is not None:
         MoverNetwork(Path(options.mask_model))
     if options.depth_model is not None:
+        from panolog.prepare.networks.depth_maps import plan_depth
+
         plan_depth((), Path(options.depth_model))
     sfm, trajectory = dict(options.sfm), options.sfm.get("trajectory")
     if trajectory is not None:

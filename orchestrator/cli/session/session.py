@@ -1,4 +1,7 @@
-"""A run from its start or from where it stopped: checks, lock, pool, driver."""
+"""A run from its start or from where it stopped: checks, lock, pool, driver.
+
+What needs torch is imported when the place of a run is shown already: that takes seconds.
+"""
 
 import logging
 import os
@@ -9,59 +12,41 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
-from panolog.orchestrator.cli.session import making, preparing
-from panolog.orchestrator.cli.session.delivery import deliver
-from panolog.orchestrator.engine.driver.driver import Driver, Hooks
+from panolog.orchestrator.cli.session import preparing
 from panolog.orchestrator.engine.driver.ending import end_recorded
-from panolog.orchestrator.engine.driver.job import Job
 from panolog.orchestrator.engine.driver.journal import Journal, Patience
-from panolog.orchestrator.engine.driver.local_pool import local_pool
-from panolog.orchestrator.engine.driver.purse import require_enough
-from panolog.orchestrator.engine.driver.requests import interruptible, on_signals
-from panolog.orchestrator.engine.estimates.preflight import Preflight, examine, require_memory
-from panolog.orchestrator.engine.scheduling.pool import Pool
-from panolog.orchestrator.engine.stages.measuring import Measuring
+from panolog.orchestrator.engine.driver.requests import interruptible
 from panolog.orchestrator.engine.stages.outline import write_outline
-from panolog.orchestrator.engine.stages.scenes import measured_scene, save_measured, scene_of
+from panolog.orchestrator.engine.stages.scenes import scene_of
 from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs import folder as run_folder
 from panolog.orchestrator.runs import info as run_info
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import RunInfo
-from panolog.orchestrator.runs.money.limits import Wanted, prices_of
+from panolog.orchestrator.runs.money.limits import Wanted
 from panolog.orchestrator.runs.money.losses import lost_with_driver
 from panolog.orchestrator.runs.money.prices import PriceList
 from panolog.orchestrator.runs.money.records import BudgetSet
 from panolog.orchestrator.runs.preparation.settings import Options, Settings, read_settings, write_settings
 from panolog.orchestrator.runs.presence import Presence, why_waiting
-from panolog.orchestrator.runs.records import (
-    Noticed,
-    Outcome,
-    Part,
-    PreflightSaved,
-    Preparing,
-    Record,
-    RunBegan,
-)
+from panolog.orchestrator.runs.records import Noticed, Outcome, Preparing, Record, RunBegan
 from panolog.orchestrator.runs.retention.clean import remove_all
 from panolog.orchestrator.runs.retention.survey import models_of_parts
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import report_or_notice
-from panolog.partition.plan import Plan
-from panolog.prepare.check.layers import look_at_layers
-from panolog.renderer.process import choose_device
-from panolog.scene.errors import ClusterError, MissingPackageError, RunFolderError, RunLockedError, installed
+from panolog.scene.errors import RunFolderError, RunLockedError, installed
 from panolog.scene.files import remove_partial
 from panolog.scene.model import Scene
-from panolog.workers.tasks import NOTHING_HELD_OUT
 
-_FAR = "the scene is far from its origin: add {} to the coordinates of the run for the scene's"
+if TYPE_CHECKING:
+    from panolog.orchestrator.cli.session.driving import Driving
+    from panolog.orchestrator.engine.estimates.preflight import Preflight
+    from panolog.orchestrator.engine.scheduling.pool import Pool
+
 _LOG = logging.getLogger(__name__)
 
 
@@ -72,7 +57,7 @@ def start(
     config: RunConfig,
     address: str | None,
     on_change: OnChange,
-    pool: Pool | None = None,
+    pool: "Pool | None" = None,
     nice: int | None = None,
     options: Options | None = None,
     wanted: Wanted | None = None,
@@ -90,14 +75,15 @@ def start(
     budget = (wanted or Wanted()).budget(RunState())
     new = preparing.found(source, config, options or Options())
     new.check_output(root)
-    if address is None and config.device == "cuda":
-        choose_device(config.device)  # which refuses what is missing
-    require_memory(new.scene, new.config)
+    if config.memory is not None or config.device == "cuda":  # importing torch takes seconds
+        from panolog.orchestrator.cli.session.driving import require
+
+        require(new.scene, new.config, local=address is None)
     folder = RunFolder(root)
     made = run_folder.make(root)
     with lock.hold(folder.lock), ExitStack() as undo:
         new.check_output(root)  # another driver may have been quicker
-        undo.callback(making.discard, folder, made)
+        undo.callback(run_info.discard, folder, made)
         info = run_info.make_info(new.reference(folder), new.config, config)
         if new.settings is not None:  # first, so that this can be resumed from now on
             write_settings(folder, new.settings)
@@ -111,8 +97,8 @@ def start(
             with end_recorded(begin.journal):
                 begin.take_over(info.config, budget)
                 info = begin.prepare(info, new.settings)
-                with begin.workers(lambda: begin.measure(info)) as workers:
-                    config = begin.preflight(workers, info)
+                with begin.workers(lambda: begin.driving.measure(info)) as workers:
+                    config = begin.driving.preflight(workers, info)
                     undo.pop_all()  # from here on it is a run
                     return begin.drive(workers, config)
 
@@ -122,7 +108,7 @@ def resume(
     root: Path,
     address: str | None,
     on_change: OnChange,
-    pool: Pool | None = None,
+    pool: "Pool | None" = None,
     nice: int | None = None,
     after: str = "",
     wanted: Wanted | None = None,
@@ -156,12 +142,12 @@ def resume(
             if after:
                 journal.record([Noticed(None, f"resumed by the supervisor after: {after}")])
             info = begin.prepare(info, settings)
-            with begin.workers(ignore if prepared else lambda: begin.measure(info)) as workers:
+            with begin.workers(ignore if prepared else lambda: begin.driving.measure(info)) as workers:
                 config = info.config
                 if prepared:
-                    _device(config.device, workers, begin.warn, local=address is None)
+                    begin.driving.require_device(workers, config)
                 else:
-                    config = begin.preflight(workers, info)
+                    config = begin.driving.preflight(workers, info)
                 return begin.drive(workers, config)
 
 
@@ -195,24 +181,29 @@ class _Beginning:
     folder: RunFolder
     journal: Journal
     address: str | None
-    pool: Pool | None
+    pool: "Pool | None"
     nice: int | None
     made: Scene | None = None  # None until it is prepared
 
     @property
-    def scene(self) -> Scene:
-        """The scene, once there is one."""
+    def driving(self) -> "Driving":
+        """What the run does once it has its scene."""
+        from panolog.orchestrator.cli.session.driving import Driving
+
         assert self.made is not None  # `prepare` comes first
-        return self.made
+        return Driving(self.folder, self.journal, self.made, local=self.address is None)
 
     def prepare(self, info: RunInfo, settings: Settings | None) -> RunInfo:
         """Makes the scene of a run that was given none, and returns run.json with it. Raises as `make`."""
         if settings is not None:
-            self.made = making.Preparation(self.folder, settings, info.config, self.journal).make()
+            from panolog.orchestrator.cli.session.making import Preparation
+
+            self.made = Preparation(self.folder, settings, info.config, self.journal).make()
             config = preparing.with_width(self.made.width, info.config)
             info = info.model_copy(update={"scene": preparing.reference(self.made), "config": config})
             self.journal.until_done(lambda: run_info.write_info(self.folder, info))
-        self.journal.until_done(lambda: write_outline(self.folder, self.scene, info.config))
+        scene = self.made
+        self.journal.until_done(lambda: write_outline(self.folder, scene, info.config))
         return info
 
     def take_over(
@@ -239,11 +230,12 @@ class _Beginning:
         self.journal.record([*lost_with_driver(state), began, *said, *control.begin(self.folder)])
 
     @contextmanager
-    def workers(self, meanwhile: Callable[[], None]) -> Iterator[Pool]:
+    def workers(self, meanwhile: Callable[[], None]) -> Iterator["Pool"]:
         """The pool that was given, else that of `_workers`: Ray's also exports the state as metrics."""
         exports = self.pool is None and not _works_without_ray(self.address, self.nice)
         if exports:
-            self._does("connecting to the cluster" if self.address else "starting Ray")
+            what = "connecting to the cluster" if self.address else "starting Ray"
+            self.journal.record([Preparing(what)])
         with _workers(self.address, self.folder.root, self.pool, self.nice, meanwhile) as workers:
             if exports:
                 from panolog.orchestrator.engine.cluster.run_metrics import RunMetrics
@@ -251,63 +243,13 @@ class _Beginning:
                 self.journal.on_change = RunMetrics(self.folder.root, self.journal.on_change).show
             yield workers
 
-    def measure(self, info: RunInfo) -> None:
-        """Measures how panoramas were captured, if Stage I is to learn that. Raises as `Measuring`."""
-        measured = Measuring(self.scene, info.config, self._does, self.warn).found()
-        self.journal.until_done(lambda: save_measured(self.folder, measured, self.scene))
-
-    def preflight(self, workers: Pool, info: RunInfo) -> RunConfig:
-        """The resolved settings of a run, once they are in run.json. Raises InputError if it does not fit."""
-        folder, root = self.folder, self.folder.root
-        self._does("calibrating")
-        prices, local = prices_of(self.journal.state), self.address is None
-        found = _examine(
-            workers, self.scene, info.config, root, self.warn, prices, self.journal.explain, local=local
-        )
-        found.require()
-        info = info.model_copy(update={"config": found.config})
-        self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
-        self.journal.until_done(lambda: run_info.write_info(folder, info))
-        seconds = {str(stage.name): stage.seconds for stage in found.estimate.stages}
-        settings = found.config.model_dump(mode="json")
-        done = PreflightSaved(folder.relative(folder.preflight), seconds, settings)
-        if budget := self.journal.state.money.budget:
-            require_enough(seconds, budget, workers.nodes())
-        lines = [_FAR.format(self.scene.offset)] if any(self.scene.offset) else []
-        lines += [*look_at_layers(self.scene).lines, *([] if self.scene.test else [NOTHING_HELD_OUT])]
-        layers = [Noticed(None, line) for line in lines]
-        self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *layers, done])
-        return found.config
-
-    def _does(self, what: str) -> None:
-        self.journal.record([Preparing(what)])
-
-    def warn(self, line: str) -> None:
-        """Something the user should read once."""
-        self.journal.record([Noticed(None, line)])
-
-    def drive(self, workers: Pool, config: RunConfig) -> RunState:
+    def drive(self, workers: "Pool", config: RunConfig) -> RunState:
         """Runs all tasks, and writes the report."""
-        folder = self.folder
-        self._does("starting workers")
-
-        def draw(plan: Plan, means: NDArray[np.float32]) -> None:
-            if not installed("matplotlib"):
-                self.warn(f"plan.png is not drawn: {MissingPackageError.of('matplotlib')}")
-                return
-            from panolog.orchestrator.watch.views.plan_picture import write_plan_picture
-
-            folder.make(folder.plan_picture.parent)
-            write_plan_picture(folder.plan_picture, plan, means)
-
-        with on_signals() as stop:
-            try:
-                with end_recorded(self.journal):
-                    job = Job(folder, measured_scene(folder, self.scene), config)
-                    Driver(job, self.journal, workers, Hooks(draw, deliver), stop).run()
-            finally:
-                _report(folder, self.journal)
-        return _retained(folder, self.journal, config)
+        try:
+            self.driving.drive(workers, config)
+        finally:
+            _report(self.folder, self.journal)
+        return _retained(self.folder, self.journal, config)
 
 
 def check(source: preparing.Given, root: Path, config: RunConfig, options: Options) -> None:
@@ -317,37 +259,26 @@ def check(source: preparing.Given, root: Path, config: RunConfig, options: Optio
 
 def estimate_run(
     scene: Scene, config: RunConfig, address: str | None, prices: PriceList | None = None
-) -> Preflight:
+) -> "Preflight":
     """What a run of a scene would need, on this machine or on a cluster, with its folder in the current one.
 
     Args: config, with a width. Raises InputError as `start`, except if the run does not fit: that is the
     problem of the preflight.
     """
     with _workers(address, scene.root, None, None, ignore) as pool:
-        return _examine(pool, scene, config, Path.cwd(), ignore, prices, local=address is None)
+        from panolog.orchestrator.cli.session.driving import examined
 
-
-def _examine(
-    pool: Pool,
-    scene: Scene,
-    config: RunConfig,
-    root: Path,
-    warn: Callable[[str], None],
-    prices: PriceList | None,
-    say: Callable[[str], None] = ignore,
-    *,
-    local: bool,
-) -> Preflight:
-    device = _device(config.device, pool, warn, local=local)
-    return examine(pool, scene, config.model_copy(update={"device": device}), root, prices, say)
+        return examined(pool, scene, config, Path.cwd(), prices, local=address is None)
 
 
 @contextmanager
 def _workers(
-    address: str | None, root: Path, pool: Pool | None, nice: int | None, meanwhile: Callable[[], None]
-) -> Iterator[Pool]:
+    address: str | None, root: Path, pool: "Pool | None", nice: int | None, meanwhile: Callable[[], None]
+) -> Iterator["Pool"]:
     """The pool that is given, else Ray's, or one without Ray; `meanwhile` is called while it starts."""
     if pool is not None or _works_without_ray(address, nice):
+        from panolog.orchestrator.engine.driver.local_pool import local_pool
+
         with local_pool() if pool is None else nullcontext(pool) as here:
             meanwhile()
             yield here
@@ -380,13 +311,3 @@ def _retained(folder: RunFolder, journal: Journal, config: RunConfig) -> RunStat
     ):
         journal.record([notice])
     return journal.state
-
-
-def _device(wanted: str, pool: Pool, warn: Callable[[str], None], *, local: bool) -> str:
-    """The device that "auto" means here. Raises InputError if CUDA is wanted and there is none."""
-    if local:
-        return choose_device(wanted, warn)
-    gpus = any(node.gpus for node in pool.nodes()) or any(group.gpus for group in pool.growth().groups)
-    if wanted == "cuda" and not gpus:
-        raise ClusterError("--device cuda: no node of the cluster has a GPU; see `ray status`")
-    return "cuda" if wanted != "cpu" and gpus else "cpu"

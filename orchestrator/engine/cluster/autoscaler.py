@@ -22,8 +22,8 @@ from ray.autoscaler.v2.sdk import get_cluster_status
 from ray.exceptions import RayError
 from ray.experimental.internal_kv import _internal_kv_get
 
-from panolog.orchestrator.engine.scheduling.pool import first_line
 from panolog.orchestrator.engine.scheduling.scaling import NO_GROWTH, Group, Growth
+from panolog.scene.errors import first_line
 
 _LOG = logging.getLogger(__name__)
 _INTERVAL_S = 2.0  # between two queries

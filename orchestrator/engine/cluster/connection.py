@@ -1,4 +1,7 @@
-"""Ray for as long as a run needs it: a cluster's, or one of its own on this machine."""
+"""Ray for as long as a run needs it: a cluster's, or one of its own on this machine.
+
+What needs torch is imported once Ray starts: both take seconds.
+"""
 
 import logging
 import os
@@ -11,18 +14,19 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import TYPE_CHECKING
 
 import psutil
 import ray
 
 from panolog.orchestrator.engine.cluster import cleaner as ray_cleaner
-from panolog.orchestrator.engine.cluster.files import FileSharing, key_of
-from panolog.orchestrator.engine.cluster.pool import RayPool, imported
-from panolog.orchestrator.engine.scheduling.pool import first_line
 from panolog.orchestrator.runs import log
 from panolog.orchestrator.runs.machines.machine import cores, memory
 from panolog.orchestrator.runs.state import ignore
-from panolog.scene.errors import ClusterError, ConfigError
+from panolog.scene.errors import ClusterError, ConfigError, first_line
+
+if TYPE_CHECKING:
+    from panolog.orchestrator.engine.cluster.pool import RayPool
 
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _TIMEOUT_S = 10.0  # in which a cluster must answer, and Ray's own processes must end
@@ -33,7 +37,7 @@ _STORE = 2**31  # bytes of shared memory for the object store, at most; beyond i
 @contextmanager
 def connect(
     address: str | None, root: Path, nice: int | None = None, meanwhile: Callable[[], None] = ignore
-) -> Iterator[RayPool]:
+) -> Iterator["RayPool"]:
     """Ray for as long as the context lasts: a cluster's at `address`, or one of its own on this machine.
 
     Args: root, the folder of the run; nice, by how much workers are nicer than this process (setpriority(2),
@@ -56,6 +60,9 @@ def connect(
         signal.signal(signal.SIGTERM, signal.default_int_handler if unset else before)
         if address:
             meanwhile()
+        from panolog.orchestrator.engine.cluster.files import FileSharing, key_of  # noqa: PLC0415
+        from panolog.orchestrator.engine.cluster.pool import RayPool  # noqa: PLC0415
+
         sharing = FileSharing(root) if address else None
         pool = RayPool(sharing, key_of(root))
         try:
@@ -130,6 +137,8 @@ def _start(folder: str, nice: int) -> None:
                     " repeat the command: nothing is lost"
                 ) from error
         else:
+            from panolog.orchestrator.engine.cluster.pool import imported  # noqa: PLC0415
+
             ray.remote(imported).remote()
             return
 

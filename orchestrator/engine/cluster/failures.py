@@ -15,10 +15,10 @@ from ray.exceptions import (
     WorkerCrashedError,
 )
 
-from panolog.orchestrator.engine.scheduling.pool import Failed, first_line
+from panolog.orchestrator.engine.scheduling.pool import Failed
 from panolog.orchestrator.runs.machines.history import MACHINE_DIED, MACHINE_GONE
 from panolog.orchestrator.runs.records import Failure
-from panolog.scene.errors import ClusterLostError
+from panolog.scene.errors import ClusterLostError, first_line
 
 P = ParamSpec("P")
 T = TypeVar("T")

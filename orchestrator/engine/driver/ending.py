@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 from panolog.orchestrator.engine.driver.journal import Journal
-from panolog.orchestrator.engine.scheduling.pool import first_line
 from panolog.orchestrator.runs.records import Outcome, RunEnded
-from panolog.scene.errors import ClusterError, ClusterLostError, PanologError, RunLockedError
+from panolog.scene.errors import ClusterError, ClusterLostError, PanologError, RunLockedError, first_line
 
 
 @contextmanager

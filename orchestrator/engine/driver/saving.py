@@ -10,7 +10,7 @@ from pathlib import Path
 
 from typing_extensions import assert_never
 
-from panolog.orchestrator.engine.stages.scenes import save_captured
+from panolog.orchestrator.engine.stages.captures import save_captured
 from panolog.orchestrator.runs import thinning
 from panolog.orchestrator.runs.clock import Clock
 from panolog.orchestrator.runs.folder import RunFolder

@@ -19,7 +19,7 @@ from panolog.orchestrator.engine.scheduling.scaling import NO_GROWTH, Growth
 from panolog.orchestrator.runs.machines.nodes import Node, Placement
 from panolog.orchestrator.runs.machines.usage import Usage
 from panolog.orchestrator.runs.records import Failure
-from panolog.scene.errors import DeviceError, InputError, PanologError, RunError
+from panolog.scene.errors import DeviceError, InputError, PanologError, RunError, first_line
 from panolog.scene.files import Locate, here
 from panolog.workers.device_memory import CONTEXT
 from panolog.workers.events import Calibration, Event
@@ -155,10 +155,6 @@ def on_its_card(spec: TaskSpec, where: Placement) -> TaskSpec:
         return spec
     _LOG.info("%s: others have taken %d MiB of its part of the GPU", spec.task, taken // 2**20)
     return replace(spec, taken=taken)
-
-
-def first_line(text: str) -> str:
-    return (text.strip().splitlines() or [""])[0]
 
 
 class InProcess:

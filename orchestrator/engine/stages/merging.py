@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from panolog.orchestrator.engine.stages.scenes import save_captured
+from panolog.orchestrator.engine.stages.captures import save_captured
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Merged, ModelSaved, Noticed, Record
 from panolog.orchestrator.runs.state import RunState, Status
