@@ -23,7 +23,7 @@ from panolog.orchestrator.runs.store import read_milestones
 from panolog.scene.errors import ConfigError, RunFolderError
 from panolog.scene.files import SUFFIX
 from panolog.scene.model import NO_OFFSET, Vector
-from panolog.scene.read import MASKS
+from panolog.workers.tasks import COARSE
 from panolog.workers.training.recipes import RECIPES
 
 _PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
@@ -105,24 +105,18 @@ def _unprepared(folder: RunFolder) -> bool:
 def clear(folder: RunFolder, *, keep_info: bool = False) -> None:
     """Removes what a driver makes before and during its preflight, but for the lock, which it holds."""
     journal = folder.database.with_name(f"{folder.database.name}-journal")
-    made = (folder.preflight, folder.adjusted, folder.measured, folder.poses, folder.database)
-    for path in (*made, folder.presence, journal):
+    files = folder.preflight, folder.adjusted, folder.measured, folder.poses, folder.database
+    for path in (*files, folder.presence, journal):
         path.unlink(missing_ok=True)
     for path in () if keep_info else (folder.info,):
         path.unlink(missing_ok=True)
-    for path in (folder.control, folder.sparse, folder.follower, folder.mirror.parent, folder.outline.parent):
+    folders = folder.control, folder.sparse, folder.follower, folder.mirror.parent, folder.outline.parent
+    for path in (*folders, folder.of(COARSE)):
         shutil.rmtree(path, ignore_errors=True)
 
 
 def discard(folder: RunFolder, made: Sequence[Path]) -> None:
-    """Leaves the folder of a run that has not started as it was, unless a next driver would use its scene.
-
-    Args: made, folders that were missing.
-    """
-    work = folder.scene.with_name(f"{folder.scene.name}.sfm")
-    if any(it.is_dir() and any(it.iterdir()) for it in (folder.scene, work, folder.preparation / MASKS)):
-        return
-    shutil.rmtree(folder.preparation, ignore_errors=True)
+    """Leaves the folder of a run that has not started as it was. Args: made, folders that were missing."""
     clear(folder)
     folder.lock.unlink(missing_ok=True)
     with suppress(OSError):  # something else is there by now

@@ -34,7 +34,8 @@ function tell(page) {
     page.shown < page.total
       ? `${number.format(page.shown)} of ${number.format(page.total)}`
       : number.format(page.total);
-  const iteration = page.iteration ? ` · iteration ${number.format(page.iteration)}` : ""; // not of older pages
+  let iteration = page.iteration ? ` · iteration ${number.format(page.iteration)}` : ""; // not of older pages
+  if (page.iteration === 0) iteration = " · before training";
   at("count").textContent = page.total ? `${part} Gaussians${iteration}` : "";
 }
 

@@ -17,6 +17,7 @@ from panolog.orchestrator.engine.driver.job import Job
 from panolog.orchestrator.engine.driver.journal import Journal
 from panolog.orchestrator.engine.driver.purse import require_enough
 from panolog.orchestrator.engine.driver.requests import on_signals
+from panolog.orchestrator.engine.driver.saving import save
 from panolog.orchestrator.engine.estimates.preflight import Preflight, examine, require_memory
 from panolog.orchestrator.engine.scheduling.pool import Pool
 from panolog.orchestrator.engine.stages.captures import save_measured
@@ -34,8 +35,10 @@ from panolog.orchestrator.runs.state import ignore
 from panolog.partition.plan import Plan
 from panolog.prepare.check.layers import look_at_layers
 from panolog.renderer.process import choose_device
-from panolog.scene.errors import ClusterError, MissingPackageError, installed
+from panolog.scene.errors import ClusterError, InputError, MissingPackageError, installed
+from panolog.scene.files import here
 from panolog.scene.model import Scene
+from panolog.workers.showing.first_look import first_look
 from panolog.workers.tasks import NOTHING_HELD_OUT
 
 _FAR = "the scene is far from its origin: add {} to the coordinates of the run for the scene's"
@@ -81,7 +84,11 @@ class Driving:
     local: bool  # whether its workers are on this machine
 
     def measure(self, info: RunInfo) -> None:
-        """Measures how panoramas were captured, if Stage I is to learn that. Raises as `Measuring`."""
+        """Measures how panoramas were captured, if Stage I is to learn that; shows the place before.
+
+        Raises SceneError as `Measuring`.
+        """
+        self._show_points(info.config)
         measured = Measuring(self.scene, info.config, self._does, self._warn).found()
         self.journal.until_done(lambda: save_measured(self.folder, measured, self.scene))
 
@@ -135,6 +142,16 @@ class Driving:
         with on_signals() as stop, end_recorded(self.journal):
             job = Job(folder, measured_scene(folder, self.scene), config)
             Driver(job, self.journal, workers, Hooks(draw, deliver), stop).run()
+
+    def _show_points(self, config: RunConfig) -> None:
+        """The first picture of Stage I, where it is one task: the points, before anything is trained."""
+        if config.districts != 1:
+            return
+        try:
+            look = first_look(self.scene, here)
+        except (InputError, OSError):
+            return  # training does without that panorama, or reports it
+        self.journal.record([self.journal.until_done(lambda: save(self.folder, look, self.scene))])
 
     def _does(self, what: str) -> None:
         self.journal.record([Preparing(what)])

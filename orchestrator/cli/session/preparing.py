@@ -1,5 +1,6 @@
 """What a run is given, looked at before it begins: a scene, or panoramas and videos that one is made of."""
 
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,6 +77,18 @@ def found(source: Given, config: RunConfig, options: Options) -> NewRun:
         return NewRun(with_width(settings.width, config), None, settings)
     scene = divided(read_scene(given[0]), config)
     return NewRun(with_width(scene.width, config), scene, None)
+
+
+def discard(folder: RunFolder, made: Sequence[Path]) -> None:
+    """Leaves the folder of a run as it was, unless something is in it that a next driver would use.
+
+    Args: made, folders that were missing.
+    """
+    work = folder.scene.with_name(f"{folder.scene.name}.sfm")
+    if any(it.is_dir() and any(it.iterdir()) for it in (folder.scene, work, folder.preparation / MASKS)):
+        return
+    shutil.rmtree(folder.preparation, ignore_errors=True)
+    run_info.discard(folder, made)
 
 
 def reference(scene: Scene) -> SceneRef:

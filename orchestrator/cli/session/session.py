@@ -83,7 +83,7 @@ def start(
     made = run_folder.make(root)
     with lock.hold(folder.lock), ExitStack() as undo:
         new.check_output(root)  # another driver may have been quicker
-        undo.callback(run_info.discard, folder, made)
+        undo.callback(preparing.discard, folder, made)
         info = run_info.make_info(new.reference(folder), new.config, config)
         if new.settings is not None:  # first, so that this can be resumed from now on
             write_settings(folder, new.settings)
@@ -186,12 +186,17 @@ class _Beginning:
     made: Scene | None = None  # None until it is prepared
 
     @property
+    def scene(self) -> Scene:
+        """The scene, once there is one."""
+        assert self.made is not None  # `prepare` comes first
+        return self.made
+
+    @property
     def driving(self) -> "Driving":
-        """What the run does once it has its scene."""
+        """What the run does with its scene."""
         from panolog.orchestrator.cli.session.driving import Driving
 
-        assert self.made is not None  # `prepare` comes first
-        return Driving(self.folder, self.journal, self.made, local=self.address is None)
+        return Driving(self.folder, self.journal, self.scene, local=self.address is None)
 
     def prepare(self, info: RunInfo, settings: Settings | None) -> RunInfo:
         """Makes the scene of a run that was given none, and returns run.json with it. Raises as `make`."""
@@ -202,8 +207,7 @@ class _Beginning:
             config = preparing.with_width(self.made.width, info.config)
             info = info.model_copy(update={"scene": preparing.reference(self.made), "config": config})
             self.journal.until_done(lambda: run_info.write_info(self.folder, info))
-        scene = self.made
-        self.journal.until_done(lambda: write_outline(self.folder, scene, info.config))
+        self.journal.until_done(lambda: write_outline(self.folder, self.scene, info.config))
         return info
 
     def take_over(

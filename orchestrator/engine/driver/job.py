@@ -33,6 +33,7 @@ from panolog.workers.evaluation import FACES, EvaluateSpec
 from panolog.workers.scoring import ScoreSpec, in_shards, shards_of
 from panolog.workers.seams.looks import Looks
 from panolog.workers.seams.measurement import Seams
+from panolog.workers.showing.first_look import shown_row
 from panolog.workers.specs import ModelFile, ScenePart, Source
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
@@ -352,7 +353,7 @@ class Specs:
     ) -> TrainSpec:
         job, path = self._job, self._job.folder.checkpoint(task)
         config = job.config.later(task.stage) if task.stage in job.config.passes.stages else job.config
-        saved, shown = path if path.exists() else None, self._shown(cell or district)
+        saved, shown = path if path.exists() else None, shown_row(self._job.scene, cell or district)
         locate = self._locate((*views, *compared), *filter(None, (initial, saved)), shown=shown)
         return TrainSpec(
             task=task,
@@ -371,16 +372,6 @@ class Specs:
             checkpoint=CheckpointFile(saved, locate) if saved else None,
             locate=locate,
         )
-
-    def _shown(self, part: Volume | None) -> int | None:
-        """The row of the most central held-out panorama in a part of the place; None if it has none."""
-        scene, rows = self._job.scene, np.array(self._job.scene.test, np.int64)
-        rows = rows if part is None else rows[part.contains(scene.centers[rows])]
-        if not len(rows):
-            return None
-        centers = scene.centers[rows]
-        row = int(rows[np.linalg.norm(centers - np.median(centers, axis=0), axis=1).argmin()])
-        return row if scene.panoramas[row].image.is_file() else None  # training does without it
 
     def _locate(self, views: Iterable[int], *made: Path, shown: int | None = None) -> Locate:
         panoramas = self._job.scene.panoramas

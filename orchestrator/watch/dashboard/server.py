@@ -102,7 +102,7 @@ def _plotly(request: Request) -> Response:
 
 @cache
 def _plotly_gzip() -> bytes:
-    return gzip.compress(plotly(), 6)
+    return gzip.compress(plotly(), 1)  # a tenth of a second: the first page of a run waits for it
 
 
 def _error(_: Request, error: Exception) -> Response:

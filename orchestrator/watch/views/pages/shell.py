@@ -37,9 +37,16 @@ class Page:
     title: str  # until its script knows better
     script: str
     styles: tuple[str, ...]
+    charts: bool = True  # whether plotly is needed at once
+
+    @property
+    def scripts(self) -> list[str]:
+        """What its script imports, by path in static/."""
+        found = sorted(STATIC.glob(f"{_SHARED}/*.js")) + sorted(STATIC.glob(f"{self.folder}/*.js"))
+        return [path.relative_to(STATIC).as_posix() for path in found]
 
 
-RUNS = Page("runs", "Runs", "runs/runs.js", ("shared/base.css", "runs/runs.css"))
+RUNS = Page("runs", "Runs", "runs/runs.js", ("shared/base.css", "runs/runs.css"), charts=False)
 RUN = Page("run", "Run", "run/run.js", ("shared/base.css", "shared/compare.css", "run/run.css"))
 COMPARISON = Page(
     "compare",
@@ -67,16 +74,15 @@ def write_snapshot(
     own_paths, those of this machine, the longest first, of which only the last part is shown.
     Raises OSError if it cannot be written.
     """
-    scripts = sorted(STATIC.glob(f"{_SHARED}/*.js")) + sorted(STATIC.glob(f"{page.folder}/*.js"))
-    names = [script.relative_to(STATIC).as_posix() for script in scripts]
     snapshot = encode({"answers": answers, "stream": stream}).decode()
     for own in own_paths:
         snapshot = snapshot.replace(encode(own).decode()[1:-1], encode(Path(own).name).decode()[1:-1])
+    imports = {f"panolog/{name}": _data_url_of(name) for name in page.scripts}
     text = _render(
         page,
         url=_data_url_of,
         text=_text_of,
-        imports=Markup(json.dumps({"imports": {f"panolog/{name}": _data_url_of(name) for name in names}})),
+        imports=Markup(json.dumps({"imports": imports})),
         snapshot=Markup(snapshot.replace("<", r"\u003c")),  # no text ends the element that it is in
         plotly=Markup(plotly().decode()),
         made=time.strftime(
@@ -98,7 +104,8 @@ def data_url(kind: str, content: bytes) -> str:
 
 
 def _render(page: Page, **values: Any) -> str:
-    return _template().render(page=page, content=_text_of(f"{page.folder}/content.html"), **values)
+    content = _text_of(f"{page.folder}/content.html")
+    return _template().render(page=page, content=content, **values)
 
 
 @cache

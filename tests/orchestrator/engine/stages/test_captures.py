@@ -9,14 +9,10 @@ import numpy as np
 import pycolmap
 import pytest
 
+from panolog.orchestrator.engine.stages.captures import save_captured, save_measured
 from panolog.orchestrator.engine.stages.measuring import Measured, Measuring
 from panolog.orchestrator.engine.stages.movers import PICTURES, moving_share
-from panolog.orchestrator.engine.stages.scenes import (
-    learnt_scene,
-    measured_scene,
-    save_captured,
-    save_measured,
-)
+from panolog.orchestrator.engine.stages.scenes import learnt_scene, measured_scene
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.renderer.motion import moved
