@@ -32,7 +32,7 @@ def purpose(package: str) -> str:
 
 
 def rows(names: Iterable[str]) -> list[list[str]]:
-    """Packages in rows such that each imports only packages of rows below its own."""
+    """Packages in rows such that each imports only packages of rows below its own. ValueError for circles."""
     graph, depth = imports(), dict.fromkeys(names, 0)
     inside = {name: {f"panolog.{name}"} | graph.find_descendants(f"panolog.{name}") for name in depth}
     owner = {module: name for name, modules in inside.items() for module in modules}
@@ -46,6 +46,8 @@ def rows(names: Iterable[str]) -> list[list[str]]:
     for _ in depth:  # as often as the longest way down can have steps
         for above, below in pairs:
             depth[below] = max(depth[below], depth[above] + 1)
+    if circle := sorted(pair for pair in pairs if depth[pair[0]] >= depth[pair[1]]):
+        raise ValueError(f"packages import each other: {circle}")
     return [sorted(name for name in depth if depth[name] == row) for row in range(max(depth.values()) + 1)]
 
 

@@ -21,6 +21,7 @@ from panolog.orchestrator.engine.driver.saving import save
 from panolog.orchestrator.engine.estimates.preflight import Preflight, examine, require_memory
 from panolog.orchestrator.engine.scheduling.pool import Pool
 from panolog.orchestrator.engine.stages.captures import save_measured
+from panolog.orchestrator.engine.stages.first_look import first_look
 from panolog.orchestrator.engine.stages.measuring import Measuring
 from panolog.orchestrator.engine.stages.scenes import measured_scene
 from panolog.orchestrator.runs import folder as run_folder
@@ -38,7 +39,6 @@ from panolog.renderer.process import choose_device
 from panolog.scene.errors import ClusterError, InputError, MissingPackageError, installed
 from panolog.scene.files import here
 from panolog.scene.model import Scene
-from panolog.workers.showing.first_look import first_look
 from panolog.workers.tasks import NOTHING_HELD_OUT
 
 _FAR = "the scene is far from its origin: add {} to the coordinates of the run for the scene's"

@@ -14,6 +14,7 @@ from panolog.orchestrator.engine.driver import policy
 from panolog.orchestrator.engine.estimates.parts import districts_of
 from panolog.orchestrator.engine.scheduling.pool import Sharing
 from panolog.orchestrator.engine.stages.evaluation import Evaluation
+from panolog.orchestrator.engine.stages.first_look import shown_row
 from panolog.orchestrator.engine.stages.partitioning import block_labels
 from panolog.orchestrator.engine.stages.scenes import learnt_scene
 from panolog.orchestrator.engine.stages.surroundings import Surroundings
@@ -33,7 +34,6 @@ from panolog.workers.evaluation import FACES, EvaluateSpec
 from panolog.workers.scoring import ScoreSpec, in_shards, shards_of
 from panolog.workers.seams.looks import Looks
 from panolog.workers.seams.measurement import Seams
-from panolog.workers.showing.first_look import shown_row
 from panolog.workers.specs import ModelFile, ScenePart, Source
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile

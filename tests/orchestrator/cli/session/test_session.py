@@ -20,7 +20,14 @@ from panolog.orchestrator.runs import folder as run_folder
 from panolog.orchestrator.runs.config import RunConfig, load_config
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import own_code, read_info
-from panolog.orchestrator.runs.records import Noticed, Preparing, RunContinued, RunEnded, RunWaiting
+from panolog.orchestrator.runs.records import (
+    Noticed,
+    Preparing,
+    PreviewSaved,
+    RunContinued,
+    RunEnded,
+    RunWaiting,
+)
 from panolog.orchestrator.runs.state import ignore
 from panolog.orchestrator.runs.store import read_records
 from panolog.scene.errors import ClusterLostError, InputError, RunError, SceneError
@@ -28,6 +35,7 @@ from panolog.scene.read import read_scene
 from panolog.workers.calibration import CalibrateSpec
 from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import COARSE
 from tests.orchestrator.calibrated import says
 from tests.orchestrator.cli.program import call, shown
 from tests.orchestrator.fakes import DIED, MACHINE, CrashError, FakePool, well
@@ -84,8 +92,12 @@ def test_status_shows_a_run_before_its_preflight_is_over(scene: Path, tmp_path: 
     done = status(root)
     assert (done["status"], done["stage"], done["step"], done["resume"]) == ("done", "done", None, None)
     assert read_info(RunFolder(root)).config.device == "cpu"
-    steps = [i.record.step for i in read_records(RunFolder(root).database) if isinstance(i.record, Preparing)]
+    records = [stored.record for stored in read_records(RunFolder(root).database)]
+    steps = [record.step for record in records if isinstance(record, Preparing)]
     assert steps == ["checking panoramas", "measuring exposures", "calibrating", "starting workers"]
+    first = next(record for record in records if isinstance(record, Preparing | PreviewSaved))
+    assert isinstance(first, PreviewSaved) and (first.task, first.iteration) == (COARSE, 0)
+    assert (root / first.path).is_file()
 
 
 def test_a_run_killed_in_its_preflight_resumes_to_the_same_bytes(killed: Path, calm: Path) -> None:
