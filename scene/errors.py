@@ -14,7 +14,6 @@ PACKAGES = {  # a module: its name for people, and the extra of pyproject.toml
     "requests": ("requests", "cluster"),
     "fastapi": ("FastAPI", "dashboard"),
     "matplotlib": ("matplotlib", "dashboard"),  # which `prepare` brings as well
-    "plotly": ("plotly", "dashboard"),
     "starlette": ("Starlette", "dashboard"),
     "uvicorn": ("uvicorn", "dashboard"),
     "OpenEXR": ("OpenEXR", "export"),

@@ -90,7 +90,7 @@ def test_a_missing_package_is_one_line_with_its_extra(monkeypatch: pytest.Monkey
     assert str(said) == "this needs Ray: pip install 'panolog[cluster]'"
     assert explained(ModuleNotFoundError("No module named 'numpy'", name="numpy")) is None
     assert explained(ModuleNotFoundError()) is None
-    require("plotly")
+    require("matplotlib")
     monkeypatch.setitem(PACKAGES, "no_such_module", ("Nothing", "export"))
     with pytest.raises(MissingPackageError, match=r"^this needs Nothing: pip install 'panolog\[export\]'$"):
         require("no_such_module")

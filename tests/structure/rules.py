@@ -37,13 +37,12 @@ ALLOWED_WORDS: dict[str, tuple[dict[str, int], str]] = {
 
 @cache
 def tracked() -> tuple[Path, ...]:
-    """Files under version control, and those that git would add, as paths below the root."""
+    """Our files under version control, and those that git would add, as paths below the root."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     names = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
     files = (Path(name) for name in sorted(set(names)))
-    return tuple(
-        file for file in files if (ROOT / file).is_file()
-    )  # neither links to folders nor deleted ones
+    own = (file for file in files if "vendor" not in file.parts)
+    return tuple(file for file in own if (ROOT / file).is_file())  # neither links to folders nor deleted ones
 
 
 @cache

@@ -4,7 +4,7 @@ All JSON, typed in `messages`; times in seconds since the epoch, sizes in bytes,
 named by an id of 16 hex digits: no path ever comes from a client. An error is {"error": one line} with 403
 (see `guard`), 404, 409 (not possible now), 422 (a bad parameter) or 503 (the run cannot be read at present).
 
-GET /, /runs/{id}, /compare, /static/… pages, scripts and styles; plotly.min.js is that of its package
+GET /, /runs/{id}, /compare, /static/…, /vendor/… pages, scripts and styles
 GET /api/runs                         RunList
 GET /api/runs/{id}                    RunPage
 GET /api/runs/{id}/map                a plotly figure: see `figures.map_figure`; all its blocks are waiting

@@ -1,13 +1,10 @@
 """The server: one process, one event loop, threads for all that reads files."""
 
 import asyncio
-import gzip
 import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from functools import cache
 from http import HTTPStatus
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +25,12 @@ from panolog.orchestrator.watch.dashboard.registry import RunRegistry
 from panolog.orchestrator.watch.views.pages.encoding import encode
 from panolog.orchestrator.watch.views.pages.shell import (
     COMPARISON,
+    PLOTLY,
     RUN,
     RUNS,
     STATIC,
     Page,
     live_page,
-    plotly,
 )
 
 _REQUEST_TIMEOUT_S = 15.0  # in which a connection must have sent a request
@@ -47,9 +44,7 @@ def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        compression = asyncio.create_task(registry.call(_plotly_gzip))  # before the first page needs it
         yield
-        await compression
         registry.close()
         await pages.close()
         await downloads.close()
@@ -62,8 +57,8 @@ def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
     app.add_api_route("/", _index)
     app.add_api_route("/runs/{id}", _run)
     app.add_api_route("/compare", _compare)
-    app.add_api_route("/static/plotly.min.js", _plotly)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    app.mount("/vendor", StaticFiles(directory=PLOTLY.parent), name="vendor")
     app.add_exception_handler(HTTPException, _error)
     app.add_exception_handler(RequestValidationError, _error)
     app.add_middleware(Guard, access=access, granted=pages.grants)
@@ -87,22 +82,6 @@ async def _run(request: Request, id: str) -> HTMLResponse:
 
 def _compare() -> HTMLResponse:
     return _page(COMPARISON)
-
-
-def _plotly(request: Request) -> Response:
-    """plotly.min.js of its Python package."""
-    tag = f'"plotly-{version("plotly")}"'
-    headers = {"Cache-Control": "private, max-age=86400", "ETag": tag, "Vary": "Accept-Encoding"}
-    if request.headers.get("if-none-match") == tag:
-        return Response(status_code=304, headers=headers)
-    if "gzip" not in request.headers.get("accept-encoding", ""):
-        return Response(plotly(), 200, headers, "text/javascript")
-    return Response(_plotly_gzip(), 200, headers | {"Content-Encoding": "gzip"}, "text/javascript")
-
-
-@cache
-def _plotly_gzip() -> bytes:
-    return gzip.compress(plotly(), 1)  # a tenth of a second: the first page of a run waits for it
 
 
 def _error(_: Request, error: Exception) -> Response:

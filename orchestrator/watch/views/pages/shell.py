@@ -12,7 +12,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,10 @@ import jinja2
 from markupsafe import Markup
 
 from panolog.orchestrator.watch.views.pages.encoding import encode
-from panolog.scene.errors import require
 from panolog.scene.files import write_bytes
 
 STATIC = Path(__file__).parents[2] / "dashboard" / "static"
+PLOTLY = STATIC.with_name("vendor") / "plotly.min.js"  # npm's plotly.js-cartesian-dist-min, 4.1.1
 LIVE_IMPORTS = '{"imports": {"panolog/": "/static/"}}'
 _KINDS = {".js": "text/javascript", ".svg": "image/svg+xml"}  # media types of what a file has as URLs
 _SHARED = "shared"  # the folder of what all pages have
@@ -84,18 +83,12 @@ def write_snapshot(
         text=_text_of,
         imports=Markup(json.dumps({"imports": imports})),
         snapshot=Markup(snapshot.replace("<", r"\u003c")),  # no text ends the element that it is in
-        plotly=Markup(plotly().decode()),
+        plotly=Markup(PLOTLY.read_text(encoding="utf-8")),
         made=time.strftime(
             "%Y-%m-%d %H:%M UTC", time.gmtime(time.time())
         ),  # readers may be in another time zone
     )
     write_bytes(path, text.encode())
-
-
-def plotly() -> bytes:
-    """plotly.min.js of its Python package. Raises MissingPackageError without it."""
-    require("plotly")
-    return (files("plotly") / "package_data" / "plotly.min.js").read_bytes()
 
 
 def data_url(kind: str, content: bytes) -> str:

@@ -51,7 +51,7 @@ UP = [
     "'; DROP TABLE events; --",
     "A" * 5000,
 ]
-MORE = ("/runs/{}", "/compare?run={}", "/static/{}", "/static/plotly.min.js/{}")  # besides those of the API
+MORE = ("/runs/{}", "/compare?run={}", "/static/{}", "/vendor/{}")  # besides those of the API
 
 
 @pytest.fixture(scope="module")

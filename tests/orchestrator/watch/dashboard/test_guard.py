@@ -121,7 +121,7 @@ def test_the_token_opens_the_door_and_without_it_nothing_is_answered(tmp_path: P
     write_whole_run(tmp_path / "run")
     id = RunEntry(tmp_path, "run").id
     with serving(tmp_path, token=TOKEN) as served:
-        targets = ["/", f"/runs/{id}", "/static/runs/runs.js", "/static/plotly.min.js"]
+        targets = ["/", f"/runs/{id}", "/static/runs/runs.js", "/vendor/plotly.min.js"]
         targets += ["/api/runs", "/api/stream", "/compare", "/api/compare", "/api/compare/curves"]
         targets += [f"/api/runs/{id}{rest}" for rest in ("", "/map", "/point_cloud.ply", "/nothing")]
         wrong: list[dict[str, Any]] = [

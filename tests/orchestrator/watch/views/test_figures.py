@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import plotly.graph_objects as go  # type: ignore[import-untyped]
 import pytest
 from numpy.typing import NDArray
 
@@ -49,10 +48,8 @@ def trace(figure: figures.Figure, name: str) -> dict[str, Any]:
     return next(item for item in figure["data"] if item["name"] == name)
 
 
-def test_plotly_takes_the_figure_and_json_too(plan: Plan) -> None:
-    figure = figures.map_figure(plan, POINTS)
-    go.Figure({"data": figure["data"], "layout": figure["layout"]})  # checks every name and value
-    json.dumps(figure, allow_nan=False)
+def test_the_figure_is_json(plan: Plan) -> None:
+    json.dumps(figures.map_figure(plan, POINTS), allow_nan=False)
 
 
 def test_fixes_of_gps_are_seen_from_above_and_stand_for_cameras_without_a_pose(plan: Plan) -> None:
@@ -64,7 +61,6 @@ def test_fixes_of_gps_are_seen_from_above_and_stand_for_cameras_without_a_pose(p
     before = figures.map_figure(nameless, POINTS[:0], planned=False, fixes=plan.centers)
     assert trace(before, "cameras")["x"] == before["blocks"]["names"] == []
     assert len(trace(before, "fixes")["x"]) == len(plan.rows)
-    go.Figure({"data": before["data"], "layout": before["layout"]})
     assert trace(figures.map_figure(plan, POINTS), "fixes")["x"] == []
 
 
@@ -112,7 +108,6 @@ def test_faces_have_the_colour_of_their_seam_the_worst_above(plan: Plan) -> None
         ["seam below 1.5", SEAM_GRADES["hardly"][1]],
         ["seam 3 and more", SEAM_GRADES["clear"][1]],
     ]
-    go.Figure({"data": figure["data"], "layout": figure["layout"]})
     x, y = (np.array(lines[-1][axis]) for axis in "xy")
     inside = np.abs(y - plan.aabb.center[1]) < 0.9 * plan.aabb.half[1]
     places = np.column_stack([x, y, np.full(len(x), plan.aabb.center[2] - 0.1)])[inside]

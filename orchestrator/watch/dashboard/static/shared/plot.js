@@ -12,7 +12,7 @@ export function plotly() {
     ? Promise.resolve(window.Plotly)
     : new Promise((resolve, reject) => {
         const script = document.createElement("script");
-        script.src = "/static/plotly.min.js";
+        script.src = "/vendor/plotly.min.js";
         script.onload = () => resolve(window.Plotly);
         script.onerror = () => {
           loading = null;
