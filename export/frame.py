@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from panolog.scene.projection import fibonacci_sphere
 
@@ -34,7 +34,7 @@ class Frame:
         axis, cosine = np.cross(y, wanted), float(y @ wanted)
         sine = float(np.linalg.norm(axis))
         vector = axis / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])
-        rotation = Rotation.from_rotvec(vector * np.arctan2(sine, cosine)).as_matrix()
+        rotation = scipy.spatial.transform.Rotation.from_rotvec(vector * np.arctan2(sine, cosine)).as_matrix()
         exact = np.round(rotation) + 0.0  # without negative zeros
         rotation = exact if np.abs(rotation - exact).max() < 1e-9 else rotation
         return Frame(rotation, np.zeros(3) if origin is None else np.asarray(origin, np.float64))
@@ -55,9 +55,10 @@ class Frame:
         moved = self.points(means.astype(np.float64)).astype(np.float32)
         if np.array_equal(self.rotation, np.eye(3)):
             return moved, quats, rest
-        turned = (Rotation.from_matrix(self.rotation) * Rotation.from_quat(quats, scalar_first=True)).as_quat(
-            canonical=True, scalar_first=True
-        )
+        turned = (
+            scipy.spatial.transform.Rotation.from_matrix(self.rotation)
+            * scipy.spatial.transform.Rotation.from_quat(quats, scalar_first=True)
+        ).as_quat(canonical=True, scalar_first=True)
         matrices = sh_rotations(self.rotation)
         bands = [
             matrix @ rest[:, d * d - 1 : (d + 1) ** 2 - 1]

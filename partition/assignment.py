@@ -6,8 +6,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csc_array, csr_array
 
 OVERLAP = 1.5  # blocks a camera trains on average: estimates assume it, proposed thresholds reach it
 
@@ -17,7 +17,7 @@ class Assignment:
     """Why each of K cameras trains each of B blocks."""
 
     camera_blocks: NDArray[np.int64]  # (K,) the block that each camera is in, which it trains
-    gradient: csr_array  # (K, B) bool: its gradient score there is close to its best
+    gradient: "scipy.sparse.csr_array"  # (K, B) bool: its gradient score there is close to its best
 
     def __post_init__(self) -> None:
         blocks, (count, most) = self.camera_blocks, self.gradient.shape
@@ -28,11 +28,13 @@ class Assignment:
         self.gradient.sort_indices()
 
     @cached_property
-    def assigned(self) -> csr_array:
+    def assigned(self) -> "scipy.sparse.csr_array":
         """(K, B) bool, sparse: by position or by gradient."""
         count = len(self.camera_blocks)
         own = (np.ones(count, np.bool_), (np.arange(count), self.camera_blocks))
-        assigned: csr_array = csr_array(own, shape=self.gradient.shape) + self.gradient
+        assigned: scipy.sparse.csr_array = (
+            scipy.sparse.csr_array(own, shape=self.gradient.shape) + self.gradient
+        )
         assigned.sort_indices()
         return assigned
 
@@ -42,7 +44,7 @@ class Assignment:
         return np.bincount(self.assigned.indices, minlength=self.assigned.shape[1])
 
     @cached_property
-    def _by_block(self) -> csc_array:
+    def _by_block(self) -> "scipy.sparse.csc_array":
         return self.assigned.tocsc()  # which sorts
 
     def cameras_of(self, block: int) -> NDArray[np.integer[Any]]:
@@ -68,7 +70,9 @@ class Assignment:
         return int(self.assigned.nnz - len(self.camera_blocks))
 
 
-def assign(camera_blocks: ArrayLike, scores: ArrayLike | csr_array, tau_grad: float) -> Assignment:
+def assign(
+    camera_blocks: ArrayLike, scores: "ArrayLike | scipy.sparse.csr_array", tau_grad: float
+) -> Assignment:
     """Camera-block assignment by position or by gradient ratio (eq. 11).
 
     A ratio equal to tau_grad does not count. A camera with only zero scores gets its geometric block alone.
@@ -77,7 +81,7 @@ def assign(camera_blocks: ArrayLike, scores: ArrayLike | csr_array, tau_grad: fl
     sparse; tau_grad the threshold τ_grad.
     Raises ValueError on shapes that disagree, scores negative or not finite.
     """
-    values = csr_array(scores, dtype=np.float64)
+    values = scipy.sparse.csr_array(scores, dtype=np.float64)
     if not (np.isfinite(values.data) & (values.data >= 0.0)).all():
         raise ValueError("gradient scores must be finite and not negative")
     cameras = np.repeat(np.arange(values.shape[0]), np.diff(values.indptr))
@@ -86,12 +90,12 @@ def assign(camera_blocks: ArrayLike, scores: ArrayLike | csr_array, tau_grad: fl
     of_best = best[cameras]
     chosen = np.divide(values.data, of_best, out=np.zeros_like(of_best), where=of_best > 0.0) > tau_grad
     pairs = (cameras[chosen], values.indices[chosen])
-    gradient = csr_array((np.ones(len(pairs[0]), np.bool_), pairs), shape=values.shape)
+    gradient = scipy.sparse.csr_array((np.ones(len(pairs[0]), np.bool_), pairs), shape=values.shape)
     return Assignment(np.asarray(camera_blocks, np.int64), gradient)
 
 
 def overlap(
-    camera_blocks: ArrayLike, scores: ArrayLike | csr_array, taus: Iterable[float]
+    camera_blocks: ArrayLike, scores: "ArrayLike | scipy.sparse.csr_array", taus: Iterable[float]
 ) -> NDArray[np.float64]:
     """(T,) how many blocks a camera trains on average at each of T thresholds τ_grad.
 
@@ -100,7 +104,9 @@ def overlap(
     return np.array([assign(camera_blocks, scores, tau).overlap for tau in taus])
 
 
-def _places(pairs: csr_array | csc_array, number: int) -> NDArray[np.integer[Any]]:
+def _places(
+    pairs: "scipy.sparse.csr_array | scipy.sparse.csc_array", number: int
+) -> NDArray[np.integer[Any]]:
     """Where a row of sparse rows, or a column of sparse columns, has values."""
     start, stop = pairs.indptr[number : number + 2]
     places: NDArray[np.integer[Any]] = pairs.indices[start:stop]

@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from panolog.scene.errors import InputError
 
@@ -73,12 +71,12 @@ def strays(centers: ArrayLike) -> NDArray[np.bool_]:
     if len(points) < _FEWEST:
         return np.zeros(len(points), np.bool_)
     reach = np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.75)
-    alone: NDArray[np.bool_] = cKDTree(points).query(points, k=2)[0][:, 1] > _STRAY * reach
+    alone: NDArray[np.bool_] = scipy.spatial.cKDTree(points).query(points, k=2)[0][:, 1] > _STRAY * reach
     return alone if reach > 0 and alone.mean() <= _STRAYS else np.zeros_like(alone)
 
 
 def _nearest(points: NDArray[np.float64]) -> float:
-    nearest, _ = cKDTree(points).query(points, k=2)
+    nearest, _ = scipy.spatial.cKDTree(points).query(points, k=2)
     return float(np.median(nearest[:, 1]))  # the first is the camera itself, or another at its place
 
 
@@ -87,10 +85,10 @@ def _spots(points: NDArray[np.float64], nearest: float) -> NDArray[np.float64] |
     count = len(points)
     if count < _FEWEST:
         return None
-    distances, others = cKDTree(points).query(points, k=min(_AT_SPOT, count))
+    distances, others = scipy.spatial.cKDTree(points).query(points, k=min(_AT_SPOT, count))
     row, column = np.nonzero(distances <= _SPOT * nearest)
-    linked = coo_array((np.ones(len(row)), (row, others[row, column])), (count, count))
-    spots, spot = connected_components(linked, directed=False)
+    linked = scipy.sparse.coo_array((np.ones(len(row)), (row, others[row, column])), (count, count))
+    spots, spot = scipy.sparse.csgraph.connected_components(linked, directed=False)
     _, first, sizes = np.unique(spot, return_index=True, return_counts=True)
     return points[first] if spots >= 3 and count <= 4 * spots and 2 * sizes.max() <= count else None
 

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
-from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 
 from panolog.partition import plan_json
 from panolog.partition.assignment import Assignment, assign
@@ -116,9 +115,9 @@ class Plan:
         return enough
 
     @cached_property
-    def tree(self) -> cKDTree:
+    def tree(self) -> "scipy.spatial.cKDTree":
         """The camera centers as a tree, which finds those that are near a place."""
-        return cKDTree(self.centers)
+        return scipy.spatial.cKDTree(self.centers)
 
     def cameras(self, block: int) -> tuple[int, ...]:
         """The rows of Scene.panoramas that train a block, in the order of `rows`."""
@@ -206,7 +205,9 @@ class Plan:
             if why != "geometry"
         ]
         places = np.array(pairs, np.int64).reshape(-1, 2).T
-        gradient = csr_array((np.ones(len(pairs), np.bool_), tuple(places)), shape=(len(centers), grid.count))
+        gradient = scipy.sparse.csr_array(
+            (np.ones(len(pairs), np.bool_), tuple(places)), shape=(len(centers), grid.count)
+        )
         return Plan(
             config=PartitionConfig(**{name: getattr(file, name) for name in PartitionConfig.model_fields}),
             grid=grid,
@@ -232,7 +233,7 @@ def read_plan(path: Path) -> Plan:
 def make_plan(
     centers: ArrayLike,
     means: ArrayLike,
-    scores: ArrayLike | csr_array,
+    scores: "ArrayLike | scipy.sparse.csr_array",
     grid: Cells,
     config: PartitionConfig,
     *,

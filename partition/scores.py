@@ -9,16 +9,16 @@ from typing import BinaryIO
 from zipfile import BadZipFile
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.sparse import csr_array
 
 from panolog.scene.errors import InputError
 from panolog.scene.files import atomic
 
 
-def write_scores(path: Path, cameras: Sequence[int], scores: ArrayLike | csr_array) -> None:
+def write_scores(path: Path, cameras: Sequence[int], scores: "ArrayLike | scipy.sparse.csr_array") -> None:
     """Writes the scores (K, B) of cameras, which are K rows of Scene.panoramas."""
-    values = csr_array(scores, dtype=np.float64)
+    values = scipy.sparse.csr_array(scores, dtype=np.float64)
     with atomic(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
@@ -32,7 +32,7 @@ def write_scores(path: Path, cameras: Sequence[int], scores: ArrayLike | csr_arr
         )
 
 
-def read_scores(file: Path | BinaryIO, cameras: Sequence[int], blocks: int) -> csr_array:
+def read_scores(file: Path | BinaryIO, cameras: Sequence[int], blocks: int) -> "scipy.sparse.csr_array":
     """The scores (K, blocks) of these K rows of Scene.panoramas, also as earlier versions wrote them: dense.
 
     Raises InputError if they are of others or the file is damaged, OSError if it cannot be read.
@@ -42,10 +42,10 @@ def read_scores(file: Path | BinaryIO, cameras: Sequence[int], blocks: int) -> c
             if not np.array_equal(arrays["cameras"], np.array(cameras, np.int64)):
                 raise InputError(f"{_name(file)}: is of other cameras than the run")
             if "scores" in arrays:
-                found = csr_array(arrays["scores"], dtype=np.float64)
+                found = scipy.sparse.csr_array(arrays["scores"], dtype=np.float64)
             else:
                 parts = arrays["data"].astype(np.float64), arrays["indices"], arrays["indptr"]
-                found = csr_array(parts, shape=(len(cameras), blocks))
+                found = scipy.sparse.csr_array(parts, shape=(len(cameras), blocks))
                 found.check_format(full_check=True)  # an index outside would be followed
     except (BadZipFile, EOFError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{_name(file)}: holds no gradient scores: {error}") from error

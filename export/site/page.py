@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from panolog.export.frame import Frame
 from panolog.scene.errors import InputError
@@ -138,7 +138,11 @@ class Page:
 
 def photograph_rotation(frame: Frame, rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
     """`PageCamera.rotation` of a panorama. Args: rotation (3, 3), from the world to the panorama's axes."""
-    x, y, z, w = Rotation.from_matrix(frame.rotation @ rotation.T).as_quat(canonical=True).round(_PLACES + 1)
+    x, y, z, w = (
+        scipy.spatial.transform.Rotation.from_matrix(frame.rotation @ rotation.T)
+        .as_quat(canonical=True)
+        .round(_PLACES + 1)
+    )
     return float(x), float(y), float(z), float(w)
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from panolog.orchestrator.runs.folder import RunFolder, by_handle, opened
 from panolog.orchestrator.watch.views.figures import Figure, map_figure
@@ -77,7 +77,7 @@ def _points(folder: RunFolder, *files: Path) -> NDArray[np.floating[Any]]:
     return np.empty((0, 3), np.float32)
 
 
-def scores_of(folder: RunFolder, plan: Plan) -> csr_array | None:
+def scores_of(folder: RunFolder, plan: Plan) -> "scipy.sparse.csr_array | None":
     """(K, B) gradient scores of a plan; None of an outline. Raises InputError if they are damaged."""
     if not folder.plan.exists():
         return None
@@ -85,7 +85,9 @@ def scores_of(folder: RunFolder, plan: Plan) -> csr_array | None:
         return read_scores(file, plan.rows, plan.grid.count)
 
 
-def view_camera(plan: Plan, k: int, scores: csr_array | None, no_picture: str | None) -> CameraView:
+def view_camera(
+    plan: Plan, k: int, scores: "scipy.sparse.csr_array | None", no_picture: str | None
+) -> CameraView:
     """The k-th camera of a plan. Args: scores, `scores_of`; no_picture, why its panorama cannot be shown."""
     found = plan.camera_json(k).model_dump(exclude={"center"})
     if scores is None:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import BinaryIO, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from panolog.scene.colmap_files import read_image_records
 from panolog.scene.errors import InputError
@@ -88,7 +88,9 @@ def panorama_rotations(scene: Path, names: Sequence[str]) -> dict[str, NDArray[n
         for record in read_image_records(model_folder(scene), observations=False):
             quaternion = np.array(record.pose[:4])
             if record.name in wanted and np.isfinite(quaternion).all() and quaternion.any():
-                found[record.name] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+                found[record.name] = scipy.spatial.transform.Rotation.from_quat(
+                    quaternion, scalar_first=True
+                ).as_matrix()
     except OSError as error:
         raise InputError(f"{error.filename or scene}: cannot be read ({error.strerror})") from error
     return found
