@@ -3,7 +3,17 @@
 /** @import { EventList, RunEvent, RunPage } from "../shared/messages.js" */
 import { get, messageOf, snapshot } from "panolog/shared/api.js";
 import { byId, el, replaceIfChanged, setText, throttled } from "panolog/shared/dom.js";
-import { bytes, clock, count, decibel, duration, fixed, significant, taskLabel } from "panolog/shared/format.js";
+import {
+  bytes,
+  clock,
+  count,
+  decibel,
+  duration,
+  fixed,
+  moment,
+  significant,
+  taskLabel,
+} from "panolog/shared/format.js";
 
 const PAGE = 100;
 const KEPT = 2000; // events in the page at most
@@ -26,7 +36,7 @@ const TYPES = {
     (e) =>
       `${count(e.iteration)} of ${count(e.iterations)}, ${fixed(e.rate, 1)} it/s${e.loss === null ? "" : `, loss ${significant(e.loss)}`}`,
   ],
-  PreviewSaved: ["Picture", (e) => `${e.view} at iteration ${count(e.iteration)}`],
+  PreviewSaved: ["Picture", (e) => `${e.view}, ${moment(e.iteration)}`],
   Noticed: ["Notice", (e) => e.message],
   CheckpointSaved: ["Checkpoint", (e) => `iteration ${count(e.iteration)}, ${bytes(e.size)}`],
   ModelSaved: ["Model", (e) => `${count(e.gaussians)} Gaussians, ${bytes(e.size)}, after ${duration(e.seconds)}`],

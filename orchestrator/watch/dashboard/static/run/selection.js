@@ -8,7 +8,17 @@ import { lastError } from "panolog/run/rows.js";
 /** @import { Choose } from "./run.js" */
 import { get, messageOf, snapshot, urlOf } from "panolog/shared/api.js";
 import { bar, byId, el, pill, replaceIfChanged } from "panolog/shared/dom.js";
-import { bytes, count, duration, fixed, percent, short, significant, taskLabel } from "panolog/shared/format.js";
+import {
+  bytes,
+  count,
+  duration,
+  fixed,
+  moment,
+  percent,
+  short,
+  significant,
+  taskLabel,
+} from "panolog/shared/format.js";
 
 const SCORES = 24; // bars drawn for one camera; of the rest only the number is shown
 const REASONS = {
@@ -44,7 +54,7 @@ function cameraPictures(path, camera, previews, choose) {
   const renders = previews
     .filter(({ view }) => view === camera.name)
     .map(({ event, task, iteration }) => {
-      const label = `${taskLabel(task)}, iteration ${count(iteration)}`;
+      const label = `${taskLabel(task)}, ${moment(iteration)}`;
       const image = el("img", { alt: "", src: urlOf(`${path}/previews/${event}`), loading: "lazy" });
       return el(
         "figure",

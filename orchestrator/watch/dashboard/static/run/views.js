@@ -4,7 +4,7 @@
 import { get, snapshot, urlOf } from "panolog/shared/api.js";
 import { comparison, projections } from "panolog/shared/compare.js";
 import { byId, el, replaceIfChanged, setText } from "panolog/shared/dom.js";
-import { count, decibel, fixed, taskLabel } from "panolog/shared/format.js";
+import { decibel, fixed, moment, taskLabel } from "panolog/shared/format.js";
 
 /** @param {HeldOutView} view */
 const heldOutText = ({ name, metrics }) =>
@@ -88,7 +88,7 @@ export function views(path) {
         .sort((a, b) => a.event - b.event)
         .map((preview) => ({
           url: urlOf(`${path}/previews/${preview.event}`) ?? "",
-          text: `${preview.view}${preview.held_out ? ", held out" : ""}, iteration ${count(preview.iteration)}${hatched}`,
+          text: `${preview.view}${preview.held_out ? ", held out" : ""}, ${moment(preview.iteration)}${hatched}`,
         }));
     }
     const last = state.frames.length - 1;

@@ -11,6 +11,8 @@ const orDash = (format) => (value) =>
 /** @param {Maybe} value */
 export const fixed = (value, digits = 2) => orDash((known) => known.toFixed(digits))(value);
 export const count = orDash((value) => Math.round(value).toLocaleString("en-US"));
+/** @param {number} iteration  Of a picture: when it was rendered. */
+export const moment = (iteration) => (iteration ? `iteration ${count(iteration)}` : "before training");
 export const percent = orDash((share) => `${Math.floor(share * 100)}%`);
 export const decibel = orDash((value) => `${value.toFixed(2)} dB`);
 export const significant = orDash((value) => String(Number(value.toPrecision(4))));
