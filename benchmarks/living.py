@@ -195,6 +195,7 @@ def cost(path: Path, root: Path, options: argparse.Namespace) -> None:
     threads = list[Thread]()
     for number, shows in enumerate((True, False)):
         folder = RunFolder(root / str(number))
+        folder.root.mkdir(parents=True)
         spec = spec_of(scene, folder, config, shows=shows)
         threads.append(Thread(target=turns.run, args=(number, spec, scene, folder)))
     with patch.object(trainer, "PreviewClock", clock_of):
