@@ -203,9 +203,9 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
 
     from panolog.orchestrator.runs import lock, presence
     from panolog.orchestrator.runs.folder import RunFolder, head_of, read_json
+    from panolog.orchestrator.runs.info import read_history
     from panolog.orchestrator.runs.state import replay
     from panolog.orchestrator.runs.storage.state import read_state
-    from panolog.orchestrator.runs.store import read_milestones
     from panolog.orchestrator.watch.views.preparation import view_preparation, with_step
     from panolog.orchestrator.watch.views.summary import summarize
 
@@ -214,7 +214,7 @@ def _status(root: Path, run: str, *, live: bool, as_json: bool) -> None:
     scene, width = head_of(folder, info)
     running = live or lock.held(folder.lock)
     mirror = read_state(folder.mirror, running=running)
-    state = replay(read_milestones(folder.database) if folder.database.exists() else ())
+    state = replay(read_history(folder))
     if running and not state.waiting:  # a full disk takes no record of it
         state = replace(state, waiting=presence.waiting(folder.presence))
     prepared = view_preparation(folder, state, running=running)

@@ -17,8 +17,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from panolog.orchestrator.runs.config import RESOLVED, RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, command_line, flat, read_json, write_json
+from panolog.orchestrator.runs.reading import WAYS_OUT
 from panolog.orchestrator.runs.records import PreflightSaved, RunBegan, Stored
-from panolog.orchestrator.runs.state import replay
+from panolog.orchestrator.runs.state import RunState, replay
 from panolog.orchestrator.runs.store import read_milestones
 from panolog.scene.errors import ConfigError, RunFolderError
 from panolog.scene.files import SUFFIX
@@ -96,9 +97,33 @@ def check_unprepared(folder: RunFolder) -> None:
         raise RunFolderError(f"{folder.root}: holds this run; use `{command_line('resume', folder.root)}`")
 
 
+def read_history(folder: RunFolder) -> list[Stored]:
+    """The records of a run that `state.replay` needs; none before its first driver has begun.
+
+    Raises InputError as `read_milestones` and `require_history`.
+    """
+    records = read_milestones(folder.database) if folder.database.exists() else []
+    require_history(folder, replay(records))
+    return records
+
+
+def require_history(folder: RunFolder, state: RunState) -> None:
+    """Raises RunFolderError if run.db is lost, or empty, of a run that has begun to train.
+
+    A driver that took it for a new one would train again, over the files of what is finished.
+    """
+    made = (folder.point_cloud, folder.of(COARSE), folder.preflight)
+    there = [path for path in made if path.exists()] if state.driver is None else []
+    if there:
+        raise RunFolderError(
+            f"{folder.database}: is missing or holds nothing, but the run has made"
+            f" {folder.relative(there[0])}: {WAYS_OUT}"
+        )
+
+
 def _unprepared(folder: RunFolder) -> bool:
     """Whether a driver was killed, or has failed, before the end of the preflight."""
-    state = replay(read_milestones(folder.database) if folder.database.exists() else ())
+    state = replay(read_history(folder))
     return state.driver is not None and not state.prepared
 
 

@@ -22,6 +22,8 @@ _STARTING_S = 2.0  # in which a driver that starts has rolled a journal back
 _POLL_S = 0.05
 _TABLES = "SELECT COUNT(*) FROM sqlite_master"  # none if a driver was killed before its first commit
 _MAGIC = bytes.fromhex("d9d505f920a163d7")  # ends a journal that names another: sqlite.org/fileformat2.html
+# What helps a run whose database is lost or damaged.
+WAYS_OUT = "put back a copy of it, or start a new run in another folder; `panolog export` works without it"
 # Whatever is committed raises one of these ids, or sets a later time.
 _VERSION = {
     "events": "SELECT MAX(id) FROM events",
@@ -76,7 +78,13 @@ def reading(path: Path, *, timeout_s: float = TIMEOUT_S) -> Iterator[sqlite3.Con
         with closing(connection):
             yield connection
     except sqlite3.DatabaseError as error:
-        raise RunFolderError(f"{path} cannot be read as the database of a run: {error}") from error
+        raise unusable(path, error) from error
+
+
+def unusable(path: Path, error: sqlite3.Error) -> RunFolderError:
+    """What to raise for a database that SQLite cannot use. Its line says what helps where it is damaged."""
+    ways = "" if isinstance(error, sqlite3.OperationalError) else f": {WAYS_OUT}"
+    return RunFolderError(f"{path}: cannot be used as the database of a run ({error}){ways}")
 
 
 def require_own_journal(path: Path) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from panolog.orchestrator.runs import thinning
 from panolog.orchestrator.runs.clock import CLOCK, Clock
-from panolog.orchestrator.runs.reading import TIMEOUT_S, has_table, query, require_own_journal
+from panolog.orchestrator.runs.reading import TIMEOUT_S, has_table, query, require_own_journal, unusable
 from panolog.orchestrator.runs.records import (
     BlockPlan,
     CheckpointSaved,
@@ -112,7 +112,7 @@ class Database:
             self._connection = sqlite3.connect(path.resolve(), timeout=TIMEOUT_S, isolation_level=None)
             self._connection.executescript(_SCHEMA)
         except sqlite3.Error as error:
-            raise RunFolderError(f"{path} cannot be opened as the database of a run: {error}") from error
+            raise unusable(path, error) from error
 
     def append(self, records: Sequence[Record]) -> list[Stored]:
         """Adds records of now. Returns and raises as `store`."""
@@ -214,8 +214,13 @@ class Database:
                 raise
 
     def milestones(self) -> list[Stored]:
-        """The records that `state.replay` needs, in order."""
-        return _stored(self._connection.execute(f"{_STATE} UNION ALL {_PROGRESS} ORDER BY id"))
+        """The records that `state.replay` needs, in order. Raises InputError if the file is damaged."""
+        try:
+            return _stored(self._connection.execute(f"{_STATE} UNION ALL {_PROGRESS} ORDER BY id"))
+        except sqlite3.OperationalError:  # a lock, or the disk
+            raise
+        except sqlite3.DatabaseError as error:
+            raise unusable(self.path, error) from error
 
     def close(self) -> None:
         self._connection.close()

@@ -126,6 +126,7 @@ def resume(
     info = run_info.read_info(folder)
     with lock.hold(folder.lock), closing(_opened(folder, info.config)) as database:
         journal = Journal(database, on_change)
+        run_info.require_history(folder, journal.state)
         budget = (wanted or Wanted()).budget(journal.state)
         if _is_over(journal.state, budget):
             done = journal.state.outcome == Outcome.DONE

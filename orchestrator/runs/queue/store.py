@@ -276,7 +276,8 @@ def opened(folder: Path, *, make: bool = True) -> Iterator[Queue]:
 
 
 def _unusable(path: Path, error: sqlite3.Error) -> QueueError:
-    return QueueError(f"{path}: cannot be used as a queue: {error}")
+    way = "" if isinstance(error, sqlite3.OperationalError) else "; move it away for a new queue"
+    return QueueError(f"{path}: cannot be used as a queue: {error}{way}")
 
 
 def _entry(row: Sequence[Any]) -> Entry:

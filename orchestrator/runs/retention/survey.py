@@ -14,9 +14,9 @@ from pathlib import Path, PurePosixPath
 
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder, read_json
+from panolog.orchestrator.runs.info import read_history
 from panolog.orchestrator.runs.records import Outcome
 from panolog.orchestrator.runs.state import RunState, Status, TaskState, replay
-from panolog.orchestrator.runs.store import read_milestones
 from panolog.scene.files import SUFFIX
 from panolog.scene.stores.url import StoreUrl
 from panolog.workers.tasks import Stage, StrEnum, TaskId
@@ -81,7 +81,7 @@ def survey(root: Path, wanted: Wanted, now: float, *, ours: bool = False) -> Sur
     if not ours and lock.held(folder.lock):
         return Survey(root, skipped="a driver is at work on it")
     keep = _kept(info) if wanted.checkpoints is None else wanted.checkpoints
-    state = replay(read_milestones(folder.database)) if folder.database.exists() else RunState()
+    state = replay(read_history(folder))
     latest = state.latest if state.latest is not None else folder.info.stat().st_mtime
     if wanted.older is not None and now - latest < wanted.older:
         return Survey(folder.root, skipped=f"its last record is {(now - latest) / 86_400:.1f} days old")

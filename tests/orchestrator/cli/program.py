@@ -11,7 +11,7 @@ from panolog.scene.ply import write_ply
 from panolog.scene.read import read_scene
 from panolog.workers.tasks import COARSE
 from panolog.workers.training.initialise import scene_gaussians
-from tests.orchestrator.history import begun
+from tests.orchestrator.history import BEGAN, begun
 from tests.orchestrator.messages import without_progress
 
 STEPS = (  # of a preflight
@@ -48,7 +48,7 @@ def shown(*arguments: object) -> Any:
 def finished(root: Path, scene: Path, fingerprint: str | None = None) -> Path:
     """A run folder with both models. Args: fingerprint, another than that of the scene."""
     read = read_scene(scene)
-    folder = begun(root, scene=scene, fingerprint=fingerprint or read.fingerprint)
+    folder = begun(root, BEGAN, scene=scene, fingerprint=fingerprint or read.fingerprint)
     folder.of(COARSE).mkdir(parents=True)
     for path in (folder.model(COARSE), folder.point_cloud):
         write_ply(path, scene_gaussians(read))

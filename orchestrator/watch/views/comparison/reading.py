@@ -6,8 +6,8 @@ from pathlib import Path
 
 from panolog.orchestrator.runs import lock, presence
 from panolog.orchestrator.runs.folder import RunFolder, head_of, read_json, require_plain
+from panolog.orchestrator.runs.info import read_history
 from panolog.orchestrator.runs.state import RunState
-from panolog.orchestrator.runs.store import read_milestones
 from panolog.orchestrator.watch.views.comparison.measured import Measured, read_measured
 from panolog.orchestrator.watch.views.comparison.schema import MOST
 from panolog.orchestrator.watch.views.history import History
@@ -76,7 +76,7 @@ def read_run(root: Path, name: str) -> ReadRun:
         info = read_json(folder)
         head_of(folder, info)
         running = lock.held(folder.lock)  # before the records, so that all that an ended driver wrote is read
-        history = History.of(read_milestones(folder.database) if folder.database.exists() else ())
+        history = History.of(read_history(folder))
         waiting = presence.waiting(folder.presence) if running else ""
         made = view_preparation(folder, history.state, running=running)
         view = view_run(history, info, running=running, root=root, waiting=waiting, preparation=made)

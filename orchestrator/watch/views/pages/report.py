@@ -10,9 +10,8 @@ from urllib.parse import quote
 
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder, command_line
-from panolog.orchestrator.runs.info import read_info
+from panolog.orchestrator.runs.info import read_history, read_info
 from panolog.orchestrator.runs.records import Noticed, Part, Progressed, Record
-from panolog.orchestrator.runs.store import read_milestones
 from panolog.orchestrator.watch.views.exposures import exposure_curve
 from panolog.orchestrator.watch.views.history import History
 from panolog.orchestrator.watch.views.pages.findings import (
@@ -54,7 +53,7 @@ def write_report(folder: RunFolder, output: Path | None = None, *, running: bool
     """
     path = output or folder.report
     running = lock.held(folder.lock) if running is None else running
-    history = History.of(read_milestones(folder.database) if folder.database.exists() else ())
+    history = History.of(read_history(folder))
     info = read_info(folder).model_dump(mode="json")
     prepared = view_preparation(folder, history.state, running=running)
     view = view_run(history, info, running=running, root=folder.root, preparation=prepared)

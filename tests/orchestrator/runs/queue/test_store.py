@@ -184,7 +184,7 @@ def test_what_is_no_queue_is_one_clear_line(tmp_path: Path) -> None:
     ):
         raise AssertionError
     (tmp_path / DATABASE).write_bytes(b"no database, but longer than the header of one: " * 9)
-    with pytest.raises(QueueError, match="cannot be used as a queue: file is not a database"):
+    with pytest.raises(QueueError, match="cannot be used as a queue: file is not a database; move it away"):
         Queue(tmp_path)
     other = tmp_path / "newer"
     with closing(Queue(other)), closing(sqlite3.connect(other / DATABASE)) as database:
