@@ -225,9 +225,12 @@ def read_plan(path: Path) -> Plan:
     """The plan in a plan.json. Raises InputError as `Plan.from_json`, OSError if the file cannot be read."""
     try:
         data = json.loads(path.read_bytes())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON: {error}") from error
-    return Plan.from_json(data)
+    try:
+        return Plan.from_json(data)
+    except InputError as error:
+        raise InputError(f"{path.parent}/{error}") from error
 
 
 def make_plan(

@@ -152,7 +152,9 @@ def _lines(step: str) -> Iterator[Callable[[str, int, int], None]]:
 def say_results(root: Path, state: Any) -> None:
     """Says what a run has made and where."""
     from panolog.orchestrator.runs.folder import RunFolder
+    from panolog.orchestrator.watch.views.comparison.measured import read_measured
     from panolog.orchestrator.watch.views.terminal import metrics_line
+    from panolog.scene.errors import InputError
     from panolog.workers.tasks import NOTHING_HELD_OUT
 
     folder = RunFolder(root)
@@ -163,10 +165,15 @@ def say_results(root: Path, state: Any) -> None:
         say("there is no model: the limit has ended the run before its first checkpoint")
         return
     say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")
-    if folder.metrics.exists():
-        say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {}) or NOTHING_HELD_OUT})")
+    try:
+        measured = read_measured(folder)
+    except InputError as error:
+        say(f"metrics   {error}")
     else:
-        say(f"metrics   are missing; {command('eval', root)} measures them again")
+        if measured is None:
+            say(f"metrics   are missing; {command('eval', root)} measures them again")
+        else:
+            say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {}) or NOTHING_HELD_OUT})")
     if folder.images.is_dir():
         say(f"pictures  {folder.images}")
     if folder.web.is_dir():

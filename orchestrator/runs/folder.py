@@ -7,17 +7,18 @@ import json
 import os
 import shlex
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 from panolog.orchestrator.runs import lock
 from panolog.scene.errors import InputError, RunFolderError
 from panolog.scene.files import stem_of, write_bytes
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
+T = TypeVar("T")
 INFO_BYTES = 1_000_000  # of run.json at most
 _RETENTION = 10_000_000  # bytes of retention.json at most: names of 100,000 tasks have two
 
@@ -178,6 +179,19 @@ class RunFolder:
     def read(self, path: Path, most: int) -> bytes:
         """The bytes of one of its files, whatever the folder holds. Raises InputError as `read_below`."""
         return read_below(path, self.root, most)
+
+    def parsed(self, path: Path, most: int, parse: Callable[[bytes], T], way: str) -> T:
+        """What `parse` makes of one of its files. Args: way, what helps where the file is damaged.
+
+        Raises InputError that names the file, and its folder, if it is damaged or `read` refuses it.
+        """
+        try:
+            return parse(self.read(path, most))
+        except InputError as error:
+            raise RunFolderError(f"{path.parent}/{error}") from error
+        except (ValueError, RecursionError) as error:
+            json_error = f" (not JSON: {error})" if isinstance(error, json.JSONDecodeError) else ""
+            raise RunFolderError(f"{path}: is damaged{json_error}; {way}") from error
 
     def relative(self, path: Path) -> str:
         """How records name a path."""

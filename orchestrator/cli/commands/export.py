@@ -1,6 +1,5 @@
 """`panolog export`: a run's model, or any model, as files that others open."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,7 +9,7 @@ import torch
 
 from panolog.export.formats import ChosenModel, write_format
 from panolog.export.frame import Frame
-from panolog.export.georeference import Georeference, georeference_from, georeference_of
+from panolog.export.georeference import Georeference, georeference_of
 from panolog.export.gltf.tiles import TILESET
 from panolog.export.site.write import DESCRIPTION
 from panolog.export.splats import Selection
@@ -20,7 +19,13 @@ from panolog.orchestrator.cli.session.delivery import provenance
 from panolog.orchestrator.engine.stages.scenes import scene_of
 from panolog.orchestrator.runs.folder import RunFolder, model_of, write_json
 from panolog.orchestrator.runs.info import read_info
-from panolog.orchestrator.watch.views.site.build import Wanted, site_of_file, site_of_run, write_folder
+from panolog.orchestrator.watch.views.site.build import (
+    Wanted,
+    site_of_file,
+    site_of_run,
+    write_folder,
+    written_place,
+)
 from panolog.scene.errors import ConfigError, InputError
 from panolog.scene.ply import describe_faults
 from panolog.scene.write import StageProgress
@@ -146,17 +151,14 @@ def _doubts(place: Georeference, formats: tuple[str, ...]) -> list[str]:
 
 
 def _place_of(folder: RunFolder) -> Georeference:
-    """By its scene, or where that is not here by the run's georef.json."""
+    """By its scene, or where that is not here by the run's georef.json. Raises InputError without both."""
+    written = written_place(folder)
     try:
         return georeference_of(scene_of(read_info(folder), folder))
     except InputError as error:
-        if not folder.georeference.is_file():
+        if written is None:
             raise InputError(f"{error}; without it nothing says where the model is") from error
-    try:
-        content = json.loads(folder.georeference.read_bytes())
-    except ValueError as error:
-        raise InputError(f"{folder.georeference}: is not JSON; remove it") from error
-    return georeference_from(content, folder.georeference)
+    return written
 
 
 def _frame(place: Georeference) -> Frame:

@@ -4,10 +4,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.scene.errors import InputError, RunFolderError
 from panolog.workers.tasks import StrEnum
 
 NADIR = (
@@ -112,12 +111,7 @@ def read_settings(folder: RunFolder) -> Settings | None:
     path = settings_path(folder)
     if not path.exists():
         return None
-    try:
-        return Settings.model_validate_json(folder.read(path, MOST_BYTES))
-    except InputError as error:
-        raise RunFolderError(f"{path.parent}/{error}") from error
-    except ValidationError as error:
-        raise RunFolderError(f"{path}: is not of this PanoLOG's format; start a new run") from error
+    return folder.parsed(path, MOST_BYTES, Settings.model_validate_json, "start a new run")
 
 
 def as_arguments(options: Options) -> Iterator[str]:

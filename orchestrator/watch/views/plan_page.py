@@ -10,6 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from panolog.orchestrator.runs.folder import RunFolder, by_handle, opened
+from panolog.orchestrator.watch.views.comparison.measured import read_seams
 from panolog.orchestrator.watch.views.figures import Figure, map_figure
 from panolog.orchestrator.watch.views.plan_map import read_points
 from panolog.orchestrator.watch.views.summary import Text, ViewModel
@@ -17,10 +18,11 @@ from panolog.partition.plan import Plan
 from panolog.partition.plan_json import Reason
 from panolog.partition.scores import read_scores
 from panolog.scene.errors import InputError
-from panolog.workers.seams.schema import by_blocks, parse_seams
+from panolog.workers.seams.schema import by_blocks
 from panolog.workers.tasks import COARSE
 
 _MOST = 200_000_000  # bytes of a file at most
+_WAY = "put back a copy of it, or remove it to see the run without its plan"
 
 
 class CameraView(ViewModel):
@@ -54,16 +56,12 @@ class BlockCameras(ViewModel):
 
 def plan_of(folder: RunFolder) -> Plan:
     """The plan of a run, or its outline. Raises InputError if there is none or it contradicts itself."""
-    try:
-        data = json.loads(folder.read(folder.known_plan, _MOST))
-    except ValueError as error:
-        raise InputError(f"plan.json: is not JSON: {error}") from error
-    return Plan.from_json(data)
+    return folder.parsed(folder.known_plan, _MOST, lambda raw: Plan.from_json(json.loads(raw)), _WAY)
 
 
 def map_of(folder: RunFolder) -> Figure:
     """The map of a run from above. Raises InputError as `plan_of`, and if the seams are damaged."""
-    seams = parse_seams(folder.read(folder.seams, _MOST)) if folder.seams.exists() else ()
+    seams = read_seams(folder)
     points = _points(folder, folder.model(COARSE), folder.outline_points)
     fixes, planned = _points(folder, folder.outline_fixes), folder.plan.exists()
     return map_figure(plan_of(folder), points, by_blocks(seams), planned=planned, fixes=fixes)

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from typer.testing import Result
 
+from panolog.export.georeference import Georeference
 from panolog.export.reading import read_model
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.scene.gaussians import Gaussians, concatenate
@@ -170,7 +171,7 @@ def test_choices_of_a_plain_ply(run: RunFolder, tmp_path: Path) -> None:
 )
 def test_what_a_run_has_made_stays(run: RunFolder, tmp_path: Path, output: str, kind: str | None) -> None:
     copy = RunFolder(shutil.copytree(run.root, tmp_path / "copy"))
-    copy.georeference.write_text("{}")
+    copy.georeference.write_text(json.dumps(Georeference().as_json({})))
     before = {path: path.read_bytes() for path in copy.root.iterdir() if path.is_file()}
     done = panolog("export", copy.root, "-o", copy.root / output, *([f"--{kind}"] if kind else []))
     assert done.exit_code == (2 if kind else 0)

@@ -1,4 +1,4 @@
-"""What metrics.json says of a run, whatever it holds: the file may come from elsewhere."""
+"""What metrics.json and seams.json say of a run, whatever they hold: the files may come from elsewhere."""
 
 import json
 import math
@@ -9,10 +9,12 @@ from typing import Any
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.units import means
 from panolog.orchestrator.watch.views.comparison.schema import METRICS, MeasuredView
-from panolog.scene.errors import InputError, RunFolderError
+from panolog.workers.seams.schema import Seam, parse_seams
 
 _MOST = 16_000_000  # of metrics.json: of 70,000 panoramas; hostile JSON may need 20 times the memory
+_MOST_SEAMS = 200_000_000  # of seams.json
 _VIEWS = 70_000
+MEASURED_ANEW = "`panolog eval` measures it anew"
 
 Values = Mapping[str, float | None]  # metrics by name
 
@@ -39,14 +41,7 @@ def read_measured(folder: RunFolder) -> Measured | None:
     path = folder.metrics
     if not path.exists():
         return None
-    try:
-        content = json.loads(folder.read(path, _MOST))
-    except InputError as error:
-        raise RunFolderError(f"{path.parent}/{error}") from error
-    except (ValueError, RecursionError) as error:
-        raise RunFolderError(f"{path}: is not JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise RunFolderError(f"{path}: is not of this PanoLOG's format: it holds no object")
+    content = folder.parsed(path, _MOST, _object, MEASURED_ANEW)
     given, left_out = content.get("views"), content.get("left_out")
     items = list(given.items())[:_VIEWS] if isinstance(given, dict) else []
     views = {name: _values(values) for name, values in items}
@@ -60,6 +55,20 @@ def read_measured(folder: RunFolder) -> Measured | None:
     )
     mean = means(views.values()) if views else _values(content.get("mean"))
     return Measured(head, views, mean)
+
+
+def read_seams(folder: RunFolder) -> tuple[Seam, ...]:
+    """The faces in seams.json, the worst first; none if there is no such file. Raises as `read_measured`."""
+    path = folder.seams
+    return folder.parsed(path, _MOST_SEAMS, parse_seams, MEASURED_ANEW) if path.exists() else ()
+
+
+def _object(content: bytes) -> dict[str, Any]:
+    """A JSON object. Raises ValueError if the content is none."""
+    found = json.loads(content)
+    if not isinstance(found, dict):
+        raise ValueError("no object")
+    return found
 
 
 def finite(value: float | None) -> float | None:

@@ -3,16 +3,17 @@
 from pathlib import Path
 from typing import Annotated, TypeVar
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.watch.views.comparison.measured import MEASURED_ANEW, read_seams
 from panolog.orchestrator.watch.views.palette import SEAM_GRADES, seam_grade
 from panolog.orchestrator.watch.views.preparation import version_of
 from panolog.orchestrator.watch.views.summary import Text, ViewModel
-from panolog.scene.errors import InputError
-from panolog.workers.seams.schema import Seam, parse_seams
+from panolog.workers.seams.schema import Seam
 
 _MOST = 200_000_000  # bytes of a file at most
+_WITHOUT = "put back a copy of it, or remove it to see the run without it"
 _FACES = 3  # between blocks with pictures: the worst
 _MOVERS = 6  # panoramas with pictures: those with the largest movers
 _SEAM_PICTURES = ("truth.jpg", "merged.jpg", "below.jpg", "above.jpg", "face.png")
@@ -89,17 +90,14 @@ def read_findings(folder: RunFolder) -> Findings:
     Raises InputError if a file is damaged, or not below the run.
     """
 
-    def parsed(kind: type[_File], path: Path) -> _File | None:
-        try:
-            return kind.model_validate_json(folder.read(path, _MOST)) if path.exists() else None
-        except ValidationError as error:
-            raise InputError(f"{path.name}: is damaged: {error.error_count()} values are wrong") from error
+    def parsed(kind: type[_File], path: Path, way: str) -> _File | None:
+        return folder.parsed(path, _MOST, kind.model_validate_json, way) if path.exists() else None
 
-    poses = parsed(_PosesFile, folder.poses) or _PosesFile()
-    shares = parsed(_MoversFile, folder.mover_shares) or _MoversFile()
-    seams = parse_seams(folder.read(folder.seams, _MOST)) if folder.seams.exists() else ()
+    poses = parsed(_PosesFile, folder.poses, _WITHOUT) or _PosesFile()
+    shares = parsed(_MoversFile, folder.mover_shares, _WITHOUT) or _MoversFile()
+    seams = read_seams(folder)
     found = Findings(
-        metrics=parsed(HeldOutMetrics, folder.metrics),
+        metrics=parsed(HeldOutMetrics, folder.metrics, MEASURED_ANEW),
         seams=seams,
         colors=tuple(None if face.seam is None else SEAM_GRADES[seam_grade(face.seam)][1] for face in seams),
         moves=tuple(sorted(poses.panoramas, key=lambda camera: -camera.pixels)),

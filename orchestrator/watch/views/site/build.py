@@ -204,19 +204,28 @@ def _copied(path: Path, folder: Path) -> str:
     return MODEL
 
 
+def written_place(folder: RunFolder, locate: Locate = here) -> Georeference | None:
+    """What georef.json says of a run's place; None if there is none. Args: locate as `place_of`.
+
+    Raises InputError if it is damaged.
+    """
+    file = folder.georeference
+    if not file.is_file():
+        return None
+    try:
+        return georeference_from(json.loads(locate(file).read_bytes()), file)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{file}: is not JSON: {error}; remove it") from error
+
+
 def place_of(folder: RunFolder, viewpoints: Viewpoints | None, locate: Locate = here) -> Georeference:
     """What the run has written of its place, or what its cameras say.
 
     Args: locate says where the run's files are to be read.
     Raises InputError if what it has written is damaged.
     """
-    file = folder.georeference
-    if file.is_file():
-        path = locate(file)
-        try:
-            return georeference_from(json.loads(path.read_bytes()), file)
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{file}: is not JSON: {error}; remove it") from error
+    if (known := written_place(folder, locate)) is not None:
+        return known
     if viewpoints is None:
         return Georeference()
     centers = np.stack([camera.position for camera in viewpoints.cameras.values()])

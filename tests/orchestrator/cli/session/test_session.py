@@ -203,31 +203,6 @@ def test_a_resumed_run_that_is_refused_says_why(killed: Path) -> None:
     assert status(killed)["status"] == "done"
 
 
-def damage(database: Path, how: str) -> None:
-    if how == "missing":
-        database.unlink()
-    else:
-        size = {"empty": 0, "truncated": 20_000}.get(how, database.stat().st_size)
-        database.write_bytes(database.read_bytes()[:size] if how != "other" else b"no database" * 1000)
-
-
-@pytest.mark.parametrize("how", ["missing", "empty", "truncated", "other"])
-@pytest.mark.parametrize("words", [["resume"], ["status"], ["report"], ["clean"]], ids=" ".join)
-def test_a_run_without_its_database_is_left_as_it_is(
-    how: str, words: list[str], calm: Path, tmp_path: Path
-) -> None:
-    """A finished run was trained again, over its files."""
-    root = copytree(calm, tmp_path / "run")
-    damage(root / "run.db", how)
-    before = {path: path.stat().st_mtime_ns for path in root.rglob("*.*") if path.name != "run.db"}
-    done = call(*words, root)
-    line = " ".join((done.stdout + done.stderr).split())
-    assert done.exit_code == 2
-    assert f"{root / 'run.db'}: " in line
-    assert "put back a copy of it, or start a new run in another folder; `panolog export` works" in line
-    assert {path: path.stat().st_mtime_ns for path in root.rglob("*.*") if path.name != "run.db"} == before
-
-
 def test_a_scene_far_from_its_origin_and_a_gpu_that_torch_cannot_use_are_noticed(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
