@@ -3,6 +3,7 @@
 It imports torch, which takes seconds: a run that begins shows its place before.
 """
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from panolog.orchestrator.engine.driver.driver import Driver, Hooks
 from panolog.orchestrator.engine.driver.ending import end_recorded
 from panolog.orchestrator.engine.driver.job import Job
 from panolog.orchestrator.engine.driver.journal import Journal
-from panolog.orchestrator.engine.driver.purse import require_enough
+from panolog.orchestrator.engine.driver.purse import require_enough, reserve_own
 from panolog.orchestrator.engine.driver.requests import on_signals
 from panolog.orchestrator.engine.driver.saving import save
 from panolog.orchestrator.engine.estimates.preflight import Preflight, examine, require_memory
@@ -88,6 +89,7 @@ class Driving:
 
         Raises SceneError as `Measuring`.
         """
+        reserve_own(self.journal)
         self._show_points(info.config)
         measured = Measuring(self.scene, info.config, self._does, self._warn).found()
         self.journal.until_done(lambda: save_measured(self.folder, measured, self.scene))
@@ -114,7 +116,8 @@ class Driving:
         settings = found.config.model_dump(mode="json")
         done = PreflightSaved(folder.relative(folder.preflight), seconds, settings)
         if budget := journal.state.money.budget:
-            require_enough(seconds, budget, workers.nodes())
+            used = journal.state.money.until(time.time()).used.cost
+            require_enough(seconds, budget, workers.nodes(), used=used)
         lines = [_FAR.format(self.scene.offset)] if any(self.scene.offset) else []
         lines += [*look_at_layers(self.scene).lines, *([] if self.scene.test else [NOTHING_HELD_OUT])]
         layers = [Noticed(None, line) for line in lines]

@@ -17,6 +17,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from panolog.orchestrator.engine.driver.journal import Journal
+from panolog.orchestrator.engine.driver.purse import require_left
 from panolog.orchestrator.engine.driver.requests import interrupt
 from panolog.orchestrator.engine.stages.outline import write_outline, write_sketch
 from panolog.orchestrator.engine.stages.scenes import divided
@@ -76,8 +77,8 @@ class Preparation:
     def make(self) -> Scene:
         """Does the steps that are not done, and returns the scene.
 
-        Raises InputError if a step cannot be done or the check finds that the scene is wrong; RunError if a
-        network fails or a process is killed; KeyboardInterrupt at a request to stop.
+        Raises InputError if a step cannot be done, the check finds that the scene is wrong, or a limit is
+        reached; RunError if a network fails or a process is killed; KeyboardInterrupt at a request to stop.
         """
         write_settings(self.folder, self.settings)
         with stoppable(self.folder):
@@ -243,6 +244,7 @@ class Preparation:
             if what == self._what and now - self._shown < _SHOWN_S and done != total:
                 return
             self._shown, self._what = now, what
+            require_left(self.journal.state, time.time())
             if what == "features":
                 self._panoramas = total
             self._note(step, what, max(0, done), max(0, total))

@@ -203,7 +203,9 @@ class _Beginning:
         """Makes the scene of a run that was given none, and returns run.json with it. Raises as `make`."""
         if settings is not None:
             from panolog.orchestrator.cli.session.making import Preparation
+            from panolog.orchestrator.engine.driver.purse import reserve_own
 
+            reserve_own(self.journal)
             self.made = Preparation(self.folder, settings, info.config, self.journal).make()
             config = preparing.with_width(self.made.width, info.config)
             info = info.model_copy(update={"scene": preparing.reference(self.made), "config": config})

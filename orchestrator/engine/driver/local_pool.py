@@ -36,7 +36,7 @@ from panolog.orchestrator.engine.scheduling.watch import Watch
 from panolog.orchestrator.runs import log
 from panolog.orchestrator.runs.machines.gpus import describe_gpus
 from panolog.orchestrator.runs.machines.machine import cores, instance_type, memory, oom_kills, share
-from panolog.orchestrator.runs.machines.nodes import Node, Placement
+from panolog.orchestrator.runs.machines.nodes import OWN, Node, Placement
 from panolog.orchestrator.runs.machines.usage import with_usage
 from panolog.orchestrator.runs.records import Failure
 from panolog.renderer.process import prepare
@@ -63,9 +63,7 @@ class LocalPool(InProcess):
     """The tasks that run now. Made by `local_pool`."""
 
     def __init__(self) -> None:
-        gpus = describe_gpus(torch.cuda.device_count())
-        host = socket.gethostname()
-        self._node = Node("local", host, cores(), memory(), gpus, instance_type(), share=share())
+        self._node = own_node()
         self._watch = Watch()
         self._running: dict[TaskId, _Task] = {}
         forkserver.ensure_running()  # imports torch while the driver reads the scene
@@ -128,6 +126,12 @@ class LocalPool(InProcess):
             running.process.join(_EXIT_S)
             self.cancel(task)
         return message
+
+
+def own_node() -> Node:
+    """The machine of this process. Raises ConfigError if a variable that limits its memory is wrong."""
+    gpus = describe_gpus(torch.cuda.device_count())
+    return Node(OWN, socket.gethostname(), cores(), memory(), gpus, instance_type(), share=share())
 
 
 @contextmanager

@@ -5,16 +5,18 @@ evaluation and delivery.
 """
 
 import math
+import socket
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 
 from panolog.orchestrator.engine.driver.journal import Journal
+from panolog.orchestrator.engine.driver.local_pool import own_node
 from panolog.orchestrator.engine.estimates.costs import slowness
 from panolog.orchestrator.engine.scheduling.scaling import STARTUP_S
 from panolog.orchestrator.runs.clock import Clock
-from panolog.orchestrator.runs.machines.nodes import Node
+from panolog.orchestrator.runs.machines.nodes import OWN, Node
 from panolog.orchestrator.runs.money import prices
 from panolog.orchestrator.runs.money.losses import lost_at
 from panolog.orchestrator.runs.money.records import (
@@ -103,22 +105,49 @@ def _limits(
     return found
 
 
+def require_left(state: RunState, now: float) -> None:
+    """Raises ConfigError at a limit that is used up before anything has been trained.
+
+    Args: now, seconds since the epoch.
+    """
+    budget = state.money.budget
+    for limit in _limits(state, budget, now, 0.0, None) if budget else ():
+        if limit.used >= limit.allowed:
+            raise ConfigError(
+                f"{limit.name} is reached before there is a scene to train: `panolog resume` with more"
+                " completes it"
+            )
+
+
 def require_enough(
-    estimate: Mapping[str, float | None], budget: BudgetSet, nodes: Sequence[Node], now: float | None = None
+    estimate: Mapping[str, float | None],
+    budget: BudgetSet,
+    nodes: Sequence[Node],
+    now: float | None = None,
+    used: float = 0.0,
 ) -> None:
     """Raises ConfigError if a new run could not train at all within a budget.
 
-    Args: estimate, as `after_training`; now, seconds since the epoch.
+    Args: estimate, as `after_training`; now, seconds since the epoch; used, what scene and preflight have
+    cost, in currency units.
     """
     rate = sum(prices.reserved(node, prices.of_record(budget.prices)).price or 0.0 for node in nodes) / 3600
     needed = _UNSURE * after_training(estimate) + _TURN_S
     what = f"merge, evaluation and delivery alone need about {duration(needed)}"
-    if budget.max_cost is not None and rate * needed >= budget.max_cost:
+    if budget.max_cost is not None and used + rate * needed >= budget.max_cost:
         cost = f"{rate * needed:.2g} {budget.prices.get('currency', '')}"
-        raise ConfigError(f"--max-cost {budget.max_cost:g}: {what}, which cost {cost}; give more")
+        spent = f", and {used:.2g} are used" if used else ""
+        raise ConfigError(f"--max-cost {budget.max_cost:g}: {what}, which cost {cost}{spent}; give more")
     left = math.inf if budget.deadline is None else budget.deadline - (time.time() if now is None else now)
     if left <= needed:
         raise ConfigError(f"--deadline: {duration(max(0.0, left))} are left, and {what}; give more")
+
+
+def reserve_own(journal: Journal) -> None:
+    """Records that the driver's machine costs from now on, before there is a pool, unless it does already."""
+    own, budget = journal.state.money.machines.get(OWN), journal.state.money.budget
+    if own is None or not own.open:
+        journal.record([prices.reserved(own_node(), prices.of_record(budget.prices) if budget else None)])
 
 
 class Purse:
@@ -129,17 +158,26 @@ class Purse:
         self._journal = journal
         self._clock = clock
         self._seen: tuple[Node, ...] = ()
+        own = journal.state.money.machines.get(OWN)
+        self._own = own is not None and own.open  # the driver's machine is counted since before the pool
         self._stranded: float | None = None  # Clock.monotonic(): no machine since then, after a limit
         budget = journal.state.money.budget
         self._prices = prices.of_record(budget.prices) if budget else None
 
     def see(self, nodes: tuple[Node, ...]) -> None:
         """Records which machines have come and gone, and of which another share is the run's."""
-        if nodes == self._seen:
+        if nodes == self._seen and not self._own:
             return
         before = {node.id: node.share for node in self._seen}
         new = [prices.reserved(n, self._prices) for n in nodes if before.get(n.id) != n.share]
         gone = before.keys() - {node.id for node in nodes}
+        if self._own:
+            self._own, host = False, socket.gethostname()
+            here = next((number for number, node in enumerate(nodes) if node.host == host), None)
+            if here is None:  # a head without cores
+                gone |= {OWN}
+            else:
+                new[here] = replace(new[here], before=OWN)
         records: list[OfMoney] = [*new, *map(NodeReturned, sorted(gone))]
         self._seen = nodes
         self._journal.record(records)

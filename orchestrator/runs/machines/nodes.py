@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+OWN = "local"  # `Node.id` of the driver's machine, until a pool of others has given it one
+
 
 @dataclass(frozen=True)
 class Gpu:
@@ -16,7 +18,7 @@ class Gpu:
 class Node:
     """One machine, as it was when it was first seen."""
 
-    id: str  # Ray's
+    id: str  # Ray's, or OWN
     host: str
     cpus: int
     memory: int  # bytes that were free, or held by workers of the run

@@ -17,6 +17,7 @@ class NodeReserved:
     host: str
     kind: str  # name of its entry in the price list, else its instance type, its GPUs or its cores
     price: float | None  # currency units per hour; None = not known
+    before: str = ""  # the id under which it was counted so far, if that was another
     task: None = None
 
 

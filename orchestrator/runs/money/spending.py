@@ -1,6 +1,7 @@
 """What a run has cost so far, and what of that was wasted: a pure function of its records.
 
-A machine costs its price from when the driver first sees it until it is gone or the driver has ended. Several
+A machine costs its price from when the driver first sees it, its own from when it begins, until it is gone or
+the driver has ended. Several
 tasks on it bear equal parts; while none runs, it is idle. What an attempt has done since its last checkpoint
 is lost when it ends without another. Nothing else is counted.
 """
@@ -75,6 +76,11 @@ class PaidMachine:
             idle=self.idle if self.tasks else self.idle + more,
             shared=self.shared + (seconds / self.tasks if self.tasks else 0.0),
         )
+
+    def with_used(self, other: "PaidMachine") -> "PaidMachine":
+        """The same with what it has cost under another id."""
+        used, idle, lost = self.used + other.used, self.idle + other.idle, self.lost + other.lost
+        return replace(self, used=used, idle=idle, lost=lost)
 
     def priced(self, seconds: float) -> Used:
         """So many seconds of it."""
@@ -160,7 +166,9 @@ def spend(spending: Spending, stored: Stored) -> Spending:
     machines, running = spending.machines, spending.running
     match record:
         case NodeReserved():
+            own = machines.pop(record.before, None)
             known = machines.get(record.node) or PaidMachine(record, time)
+            known = known if own is None else known.with_used(own.until(time))
             at = max(time, known.at)
             machines[record.node] = replace(known.until(time), reserved_as=record, at=at, open=True)
         case NodeReturned() if record.node in machines:

@@ -1,9 +1,11 @@
 """The account of a run at times that the test sets, and its limits. A machine costs one unit per second."""
 
+from dataclasses import replace
 from datetime import datetime
 
 import pytest
 
+from panolog.orchestrator.runs.machines.nodes import OWN
 from panolog.orchestrator.runs.money.account import view_money
 from panolog.orchestrator.runs.money.limits import Wanted, parse_deadline
 from panolog.orchestrator.runs.money.losses import settled
@@ -42,6 +44,16 @@ def test_a_machine_costs_from_when_it_comes_until_it_goes() -> None:
     assert parts(state.money) == pytest.approx((24, 24, 0))
     assert parts(state.money.until(100)) == pytest.approx((24, 24, 0))
     assert state.money.ahead(10) == 0
+
+
+def test_the_machine_of_the_driver_costs_from_the_start_under_one_id() -> None:
+    own, again = NodeReserved(OWN, "host", "kind", 3600.0), replace(A, before=OWN)
+    state = after(
+        *[(0, BEGAN), (0, own), (10, again), (15, RunEnded(Outcome.FAILED))],  # it has an id of Ray's by then
+        *[(100, RunBegan("host", 1, True, 15)), (100, own), (107, again)],
+    )
+    assert set(state.money.machines) == {"node"}
+    assert parts(state.money.until(110)) == pytest.approx((25, 25, 0))
 
 
 def test_what_follows_costs_all_machines_or_one_of_them_once_the_others_are_gone() -> None:

@@ -12,10 +12,15 @@ import cv2
 import numpy as np
 import pytest
 
+from panolog.orchestrator.cli.session import making, session
 from panolog.orchestrator.cli.session.preparing import settings_of
+from panolog.orchestrator.engine.driver import purse
 from panolog.orchestrator.runs import control
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import PENDING, read_info
+from panolog.orchestrator.runs.money.limits import Wanted
+from panolog.orchestrator.runs.money.prices import MachinePrice, PriceList
+from panolog.orchestrator.runs.money.records import BudgetSet
 from panolog.orchestrator.runs.preparation import notes
 from panolog.orchestrator.runs.preparation.settings import Options, Step, read_settings
 from panolog.orchestrator.runs.records import Noticed, Preparing
@@ -24,10 +29,11 @@ from panolog.orchestrator.runs.store import read_records
 from panolog.orchestrator.watch.dashboard.api import encoded_map
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.prepare.sfm.pipeline import workspace_folder
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError, InputError
 from panolog.scene.read import read_scene
 from tests.orchestrator.cli.program import call, shown
-from tests.orchestrator.runs.preparation.fake_sfm import FakeSfm, Killed, resume, start
+from tests.orchestrator.cli.session.test_session import calibrating
+from tests.orchestrator.runs.preparation.fake_sfm import CONFIG, FakeSfm, Killed, resume, start
 from tests.prepare.networks.networks import given, red_depth
 
 pytestmark = pytest.mark.system
@@ -120,6 +126,25 @@ def test_a_stop_in_the_preparation_is_resumed(
     resume(folder.root)
     assert sfm.done == ["features", "poses"]
     assert folder.point_cloud.read_bytes() == calm.point_cloud.read_bytes()
+
+
+def test_a_limit_of_cost_counts_the_making_of_the_scene(
+    raw: Path, sfm: FakeSfm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    look = purse.require_left  # once something is made: else nothing would be left of the run
+    monkeypatch.setattr(making, "require_left", lambda *known: sfm.done and look(*known))
+    prices = PriceList(currency="USD", machine=(MachinePrice(name="any", price=1e9, host="*"),))
+    folder, work = RunFolder(tmp_path / "run"), (ignore, calibrating(), None)
+    with pytest.raises(ConfigError, match=r"the limit of 1e-06 USD is reached before there is a scene"):
+        session.start(raw, folder.root, CONFIG, None, *work, Options(), Wanted(1e-6, None, prices))
+    made = shown("status", folder.root)
+    assert (made["status"], made["stage"]) == ("failed", "prepare")
+    assert made["money"]["used"]["cost"] > 1e-6
+    with pytest.raises(ConfigError, match=r"--max-cost 1e-06: .*are used; give more"):
+        purse.require_enough({}, BudgetSet(max_cost=1e-6, prices={"currency": "USD"}), [], used=1e-6)
+    session.resume(folder.root, None, *work, wanted=Wanted(removed=frozenset({"max_cost"})))
+    assert folder.point_cloud.exists()
+    assert shown("status", folder.root)["money"]["used"]["cost"] > made["money"]["used"]["cost"]
 
 
 def test_status_shows_how_far_the_preparation_is_and_no_other_process_joins(
