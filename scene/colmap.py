@@ -21,12 +21,14 @@ from panolog.scene.colmap_files import (
     POINT,
     POINT2D,
     SIMPLE_PINHOLE,
+    SPHERE,
     ColmapCamera,
     ImageRecord,
     read_cameras,
     read_frame_poses,
     read_image_records,
     read_point_records,
+    unknown_camera,
 )
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, natural_key
@@ -202,6 +204,8 @@ def _check_panorama(folder: Path, camera: ColmapCamera) -> None:
     """Refuses what is no full 2:1 panorama."""
     W, H = camera.width, camera.height
     where = f"{folder}: camera {camera.id} ({camera.model}, {W} x {H})"
+    if camera.model not in (EQUIRECTANGULAR, SPHERE, PINHOLE, SIMPLE_PINHOLE):
+        raise unknown_camera(where, camera.model)
     if camera.model == SIMPLE_PINHOLE:
         raise SceneError(f"{where} is not a panorama; only full equirectangular panoramas can be used")
     if W != 2 * H:

@@ -24,6 +24,13 @@ EQUIRECTANGULAR_ID = 17  # COLMAP's
 # COLMAP's id: (name, parameters). SphereSfM gave SPHERE the id of COLMAP's RAD_TAN_THIN_PRISM_FISHEYE.
 _MODELS = {0: (SIMPLE_PINHOLE, 3), 1: (PINHOLE, 4), 11: (SPHERE, 3), EQUIRECTANGULAR_ID: (EQUIRECTANGULAR, 2)}
 _PARAMETERS = dict(_MODELS.values())
+# COLMAP's id: name and parameters of what is no panorama, and may be in a model if no image has it.
+_OTHERS = {
+    **{2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8), 5: ("OPENCV_FISHEYE", 8)},
+    **{6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4), 9: ("RADIAL_FISHEYE", 5)},
+    **{10: ("THIN_PRISM_FISHEYE", 12), 12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5)},
+    **{14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4), 16: ("EUCM", 6)},
+}
 _SPHERICAL = (EQUIRECTANGULAR, "SPHERICAL")  # what others write into text models, also without its size again
 NO_POINT = 2**64 - 1  # the id of an observation that belongs to no point
 CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
@@ -83,7 +90,7 @@ class PointRecords:
 def read_cameras(folder: Path) -> dict[int, ColmapCamera]:
     """The cameras of the model in `folder` by id.
 
-    Raises SceneError: the file is missing or damaged, or a camera is neither a panorama nor a pinhole.
+    Raises SceneError: the file is missing or damaged, or has a camera of a model that COLMAP did not know.
     """
     path = _file(folder, "cameras")
     cameras = _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
@@ -125,12 +132,12 @@ def _file(folder: Path, stem: str) -> Path:
 def _camera(
     where: str, number: int, model: str, size: tuple[int, int], params: tuple[float, ...]
 ) -> ColmapCamera:
-    """A camera, checked: a finite one of a known model, and a panorama 2:1 and centred."""
+    """A camera, checked: a finite one, and a SPHERE 2:1 and centred, as others have its id."""
     width, height = size
     where = f"{where}: camera {number} ({model}, {width} x {height})"
     if not (0 < width < _LARGEST_SIZE and 0 < height < _LARGEST_SIZE and all(map(math.isfinite, params))):
         raise SceneError(f"{where} has an impossible size or parameter; export the model again")
-    if model in (SPHERE, EQUIRECTANGULAR) and width != 2 * height:
+    if model == SPHERE and width != 2 * height:
         raise SceneError(f"{where} is not 2:1, so it is not a full panorama")
     if model == SPHERE and params[1:] != (width / 2, height / 2):
         raise SceneError(
@@ -197,9 +204,9 @@ def _binary_cameras(path: Path) -> Iterator[ColmapCamera]:
     cursor = _Cursor(path)
     for _ in range(cursor.count(CAMERA.size)):
         number, model, width, height = cursor.take(CAMERA)
-        if model not in _MODELS:
-            raise _unknown_camera(f"{path}: camera {number}", f"id {model}")
-        name, parameters = _MODELS[model]
+        if model not in _MODELS | _OTHERS:
+            raise unknown_camera(f"{path}: camera {number}", f"id {model}")
+        name, parameters = (_MODELS | _OTHERS)[model]
         params = cursor.take(struct.Struct(f"<{parameters}d"))
         yield _camera(str(path), number, name, (width, height), params)
     cursor.end()
@@ -237,11 +244,9 @@ def _text_cameras(path: Path) -> Iterator[ColmapCamera]:
         number, width, height, *params = _numbers(where, [words[0], *words[2:]])
         if words[1] in _SPHERICAL and params in ([], [width, height]):
             words[1], params = EQUIRECTANGULAR, [width, height]
-        if words[1] not in _PARAMETERS:
-            raise _unknown_camera(f"{where}: `{line[:60]}`", words[1][:40])
-        if len(params) != _PARAMETERS[words[1]]:
+        if len(params) != _PARAMETERS.get(words[1], len(params)):
             raise SceneError(f"{where}: {words[1]} has {_PARAMETERS[words[1]]} parameters, not {len(params)}")
-        yield _camera(where, int(number), words[1], (int(width), int(height)), tuple(params))
+        yield _camera(where, int(number), words[1][:40], (int(width), int(height)), tuple(params))
 
 
 def _text_images(path: Path, observations: bool) -> Iterator[ImageRecord]:
@@ -349,7 +354,8 @@ def _numbers(where: str, words: Sequence[str]) -> list[float]:
     return numbers
 
 
-def _unknown_camera(where: str, model: str) -> SceneError:
+def unknown_camera(where: str, model: str) -> SceneError:
+    """What to raise for a camera that is needed and of another model."""
     return SceneError(
         f"{where} is neither a panorama nor a pinhole: camera model {model} is not supported; panoramas need "
         "EQUIRECTANGULAR (or SPHERE of SphereSfM, or the dummy PINHOLE W H W H W/2 H/2)"

@@ -25,7 +25,7 @@ from panolog.prepare.importers.interface import ImportedScene, ImportSource
 from panolog.prepare.importers.masks import find_masks
 from panolog.prepare.importers.spheresfm import find_model
 from panolog.prepare.sfm.triangulate import triangulate
-from panolog.scene.colmap_files import read_cameras
+from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import natural_key, some_of, stem_of
 from panolog.scene.image_files import check_images
@@ -130,7 +130,7 @@ def choose_format(source: ImportSource, name: str | None) -> str:
         return name
     found = [key for key, format in FORMATS.items() if format.detect(source)]
     if not found and (folder := find_model(source.path)) is not None:
-        read_cameras(folder)  # reports what is wrong with a COLMAP model that no importer can read
+        read_panoramas(folder)  # reports what is wrong with a COLMAP model that no importer can read
     if len(found) != 1:
         what = f"could be {' or '.join(found)}" if found else "is of no format that can be imported"
         raise SceneError(f"{source.path}: {what}; say which with --format ({', '.join(FORMATS)})")

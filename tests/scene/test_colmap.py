@@ -62,6 +62,21 @@ def set_image(text: str) -> Callable[[Path], None]:
     return set_lines("images.txt", text)
 
 
+def unused_cameras(folder: Path) -> None:
+    """Adds a camera of each model that COLMAP has to the binary file."""
+    cameras = [
+        pycolmap.Camera.create_from_model_id(10 + number, model, 100.0, 64, 32)
+        for number, model in enumerate(pycolmap.CameraModelId.__members__.values())
+        if int(model) not in (-1, 11)  # SphereSfM uses 11 for its own
+    ]
+    records = [
+        struct.pack(f"<IiQQ{len(it.params)}d", it.camera_id, int(it.model), it.width, it.height, *it.params)
+        for it in cameras
+    ]
+    count, kept = struct.unpack_from("<Q", (folder / "cameras.bin").read_bytes())[0], folder / "cameras.bin"
+    kept.write_bytes(struct.pack("<Q", count + len(cameras)) + kept.read_bytes()[8:] + b"".join(records))
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -71,7 +86,16 @@ def set_image(text: str) -> Callable[[Path], None]:
         as_sphere,
         set_camera("# SphereSfM\n1 SPHERE 64 32 1 32 16"),
         set_camera("1 PINHOLE 64 32 64 32 32 16"),
-        set_camera("1 EQUIRECTANGULAR 64 32 64 32\n2 PINHOLE 64 48 50 50 32 24"),  # of no image
+        *[  # cameras of no image
+            set_camera(f"1 EQUIRECTANGULAR 64 32 64 32\n2 {camera}")
+            for camera in (
+                "PINHOLE 64 48 50 50 32 24",
+                "OPENCV 64 48 50 50 32 24 0 0 0 0",
+                "EQUIRECTANGULAR 64 48 64 48",
+                "NEW_MODEL 64 48 1 2 3",
+            )
+        ],
+        unused_cameras,
         *map(set_camera, ["1 SPHERICAL 64 32 64 32", "1 SPHERICAL 64 32", "1 EQUIRECTANGULAR 64 32"]),
     ],
 )
@@ -223,7 +247,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         "frame .* not finite",
     ),
     "not unit": (lambda f: patch(f, "images.bin", 12, struct.pack("<d", 3.0)), "norm .* not 1"),
-    "OpenCV camera": (lambda f: patch(f, "cameras.bin", 12, struct.pack("<i", 4)), "camera model id 4"),
+    "unknown camera": (lambda f: patch(f, "cameras.bin", 12, struct.pack("<i", 99)), "camera model id 99"),
     "real id 11": (
         lambda f: (f / "cameras.bin").write_bytes(struct.pack("<QIiQQ16d", 1, 1, 11, 64, 32, *range(16))),
         "RAD_TAN_THIN_PRISM_FISHEYE",
@@ -231,6 +255,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "huge count": (lambda f: patch(f, "points3D.bin", 51, b"\xff" * 8), "truncated"),
     "empty": (lambda f: (f / "points3D.bin").write_bytes(b""), "empty"),
     "trailing bytes": (lambda f: (f / "points3D.bin").open("ab").write(b"1234"), "4 bytes more"),
+    "text OpenCV": (set_camera("1 OPENCV 64 32 50 50 32 16 0 0 0 0"), "camera model OPENCV is not supported"),
     "text SPHERICAL": (set_camera("1 SPHERICAL 64 32 7"), "camera model SPHERICAL"),
     "text nonsense": (set_camera("1 PINHOLE wide 32 1"), "number was expected"),
     "text NaN": (set_camera("1 EQUIRECTANGULAR nan 32 64 32"), "not finite"),

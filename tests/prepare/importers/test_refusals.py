@@ -108,10 +108,8 @@ def test_wrong_sources(tmp_path: Path) -> None:
 def test_a_colmap_model_of_other_cameras(tmp_path: Path) -> None:
     """Alone it is refused by its camera; next to another format it is ignored."""
     _, source = WRITERS["spheresfm"][1](tmp_path / "colmap")
-    (source.path / "sparse" / "0" / "cameras.txt").write_text("1 OPENCV 64 32 1 1 1 1 0 0 0 0\n")
-    with pytest.raises(
-        InputError, match=r"cameras\.txt: line 1: `1 OPENCV .* is neither a panorama nor a pinhole"
-    ):
+    (source.path / "sparse" / "0" / "cameras.txt").write_text("0 OPENCV 64 32 1 1 1 1 0 0 0 0\n")
+    with pytest.raises(InputError, match=r"camera 0 \(OPENCV, 64 x 32\) is neither a panorama nor a pinhole"):
         import_scene(source, tmp_path / "scene")
     _, source = nerfstudio(tmp_path / "colmap")
     assert import_scene(source, tmp_path / "scene").format == "nerfstudio"
