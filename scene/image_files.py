@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from panolog.scene.errors import ImageError, SceneError
 from panolog.scene.pictures.headers import ImageInfo, read_header, without_orientation
+from panolog.scene.pictures.jpeg import is_cut
 from panolog.scene.pictures.kinds import describe_picture, kind_of
 from panolog.scene.pictures.profiles import jpeg_segments, to_srgb
 from panolog.scene.stores.outline import whole
@@ -24,8 +25,6 @@ _HEAD = 262_144  # bytes in which the pixels of a PNG must begin, if not all of 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _IEND = b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _JPEG_END, _JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", 0xDA
-_BLOCK = 2  # pixels of a row that a JPEG loses at once, at least, reduced eight times
-_GREY, _MORE = 128, b"\x55\x2a" * 32  # what a JPEG's missing pixels are; bytes that any code decodes
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame, all codings
 _REDUCED = {
     1: cv2.IMREAD_COLOR,
@@ -108,7 +107,7 @@ def _decoded(path: Path, data: bytes, flags: int) -> NDArray[Any]:
     if data.startswith(_TIFF):
         data = without_orientation(data)
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _chunks_fit(data) else None
-    if pixels is not None and data.startswith(_JPEG) and _is_cut(data, pixels, flags):
+    if pixels is not None and data.startswith(_JPEG) and is_cut(data, pixels, flags):
         raise _truncated(path)
     if pixels is None:
         kind = kind_of(data)
@@ -367,25 +366,6 @@ def _jpeg(path: Path, file: BinaryIO) -> ImageInfo:
             return info
         file.seek(length, os.SEEK_CUR)
     raise _truncated(path)
-
-
-def _is_cut(data: bytes, pixels: NDArray[Any], flags: int) -> bool:
-    """Whether a JPEG has lost its last pixels, but not its end marker: programs put it there again.
-
-    OpenCV makes them grey without a word. In a whole file what is put in front of the marker changes nothing.
-    """
-    if (pixels[-1, -_BLOCK:] != _GREY).any():
-        return False
-    file = BytesIO(data)
-    for marker, length in jpeg_segments(file):
-        if marker == _JPEG_SCAN:
-            break
-        file.seek(length, os.SEEK_CUR)
-    if (end := data.find(_JPEG_END, file.tell())) < 0:
-        return True
-    longer = np.frombuffer(data[:end] + _MORE + data[end:], np.uint8)
-    again = cv2.imdecode(longer, flags)
-    return again is None or not np.array_equal(again, pixels)
 
 
 def _has_end(file: BinaryIO) -> bool:

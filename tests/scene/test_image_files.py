@@ -96,6 +96,23 @@ def test_a_jpeg_that_was_cut_and_closed_again_is_truncated(
             decode_panorama(path, reduction=reduction)
 
 
+@pytest.mark.parametrize("quality", [80, 100])
+def test_a_progressive_jpeg_that_lacks_scans_is_truncated(tmp_path: Path, quality: int) -> None:
+    """It is decoded, blurred; also where only the last bits of the last scan are missing."""
+    path, large = tmp_path / "a.jpg", cv2.resize(PIXELS, (256, 128))
+    form = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_QUALITY, quality]
+    for pixels in (large, np.full_like(large, 128), large[..., 0]):
+        cv2.imwrite(str(path), pixels, form)
+        assert decode_panorama(path, reduction=1).shape == (128, 256, 3)
+    Image.fromarray(large).save(path, progressive=True, quality=quality, subsampling=0)  # of another program
+    assert decode_panorama(path, reduction=8).shape == (16, 32, 3)
+    data = path.read_bytes()
+    for length in (len(data) // 4, len(data) // 2, len(data) - 200):
+        path.write_bytes(data[:length] + b"\xff\xd9")
+        with pytest.raises(ImageError, match="truncated"):
+            decode_panorama(path, reduction=1)
+
+
 def test_the_end_of_a_thumbnail_is_not_the_end_of_the_image(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     cv2.imwrite(str(path), PIXELS)
