@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from panolog.prepare.check.blank import find_blank
 from panolog.prepare.check.conventions import FIT, GAIN, best_convention, residuals
 from panolog.prepare.check.evidence import Array, Evidence, gather_evidence
 from panolog.prepare.check.exposure import describe, measure_exposures
@@ -11,6 +12,7 @@ from panolog.prepare.check.layers import look_at_layers
 from panolog.prepare.check.misplaced import find_misplaced, misplaced_lines
 from panolog.prepare.check.photometry import PixelShift, common_shift, fits_of_poses, patch_agreement
 from panolog.prepare.networks.nadir import black_nadir
+from panolog.scene.files import some_of
 from panolog.scene.model import Scene
 
 _RESIDUAL = 3.0  # pixels: a reconstruction with a larger median is not one
@@ -40,6 +42,7 @@ class SceneCheck:
     exposure: str  # the same as text
     misplaced: dict[str, str]  # panoramas that are not where their poses say, and why
     black_nadir_degrees: float | None  # from straight down, within which the panoramas are black and unmasked
+    blank: tuple[str, ...]  # panoramas that are black, or of one other colour
     layers: tuple[str, ...]  # what masks leave out, and files of layers that match nothing
     problems: tuple[str, ...]
 
@@ -100,7 +103,7 @@ def check_scene(scene: Scene) -> SceneCheck:
     reprojection = float(np.median(np.linalg.norm(apart, axis=1))) if len(apart) else None
     problems = _conventions(evidence, reprojection)
     colors, exposures = None, measure_exposures(scene, range(len(scene.panoramas)))
-    layers = look_at_layers(scene)
+    layers, blank = look_at_layers(scene), find_blank(scene)
     names = [panorama.name for panorama in scene.panoramas]
     if not evidence.colorless:
         fits = fits_of_poses(evidence)
@@ -130,8 +133,18 @@ def check_scene(scene: Scene) -> SceneCheck:
         misplaced=misplaced,
         black_nadir_degrees=_black_nadir(evidence),
         layers=layers.lines,
-        problems=(*problems, *layers.problems),
+        blank=tuple(blank),
+        problems=(*_blanks(blank), *problems, *layers.problems),
     )
+
+
+def _blanks(names: list[str]) -> list[str]:
+    if not names:
+        return []
+    return [
+        f"pictures: {some_of(names, 'panorama')}: black, or of one other colour; leave them out, or training"
+        " learns that colour"
+    ]
 
 
 def _black_nadir(evidence: Evidence) -> float | None:

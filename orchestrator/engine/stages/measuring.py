@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import command_line
+from panolog.prepare.check.blank import find_blank
 from panolog.prepare.check.bundle import MENDS, adjust
 from panolog.prepare.check.exposure import describe, differing_exposures, measure_exposures
 from panolog.prepare.check.misplaced import find_misplaced
@@ -47,6 +48,8 @@ class Measuring:
                 f"{some_of(names, 'panorama')} not where the poses say; training on that blurs the model: "
                 f"`{command_line('scene', 'check', url_of(self._scene.root) or self._scene.root)}` names each"
             )
+        if blank := find_blank(self._scene):
+            self._warn(f"{some_of(blank, 'panorama')}: black, or of one other colour, which is trained on")
         exposure = self._exposures()
         rows = np.array(self._scene.train, np.int64)
         known = exposure is not None or residuals is not None

@@ -12,6 +12,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from panolog.orchestrator.engine.stages.measuring import Measuring
+from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.state import ignore
+from panolog.prepare.check.blank import find_blank
 from panolog.prepare.check.misplaced import find_misplaced, misplaced_lines
 from panolog.prepare.check.scene_check import check_scene
 from panolog.scene.colmap import read_colmap, write_colmap
@@ -148,6 +152,25 @@ def test_a_panorama_that_shows_nothing_or_is_damaged_is_not_misplaced(town: Scen
     damaged.write_bytes(b"no picture")
     images = [panorama.image for panorama in town.panoramas]
     assert find_misplaced(pictured(without_tracks(town), [blank, damaged, *images[2:]])) == {}
+
+
+@pytest.mark.parametrize("color", [0, 200])
+def test_a_panorama_of_one_color_is_named(color: int, town: Scene, tmp_path: Path) -> None:
+    """Training learnt its colour. One that is masked altogether is not trained on."""
+    blank = tmp_path / "blank.jpg"
+    cv2.imwrite(str(blank), np.full((town.height, town.width, 3), color, np.uint8))
+    images = [panorama.image for panorama in town.panoramas]
+    scene = pictured(town, [images[0], blank, *images[2:]])
+    found = check_scene(scene)
+    assert list(found.blank) == [town.panoramas[1].name]
+    assert town.panoramas[1].name in found.problems[0]
+    warned = list[str]()
+    Measuring(scene, RunConfig(width=64), ignore, warned.append).found()
+    assert any(town.panoramas[1].name in line and "of one other colour" in line for line in warned)
+    mask = tmp_path / "mask.png"
+    cv2.imwrite(str(mask), np.zeros((town.height, town.width), np.uint8))
+    others = [replace(it, mask=mask if it.image == blank else None) for it in scene.panoramas]
+    assert find_blank(replace(scene, panoramas=tuple(others))) == []
 
 
 def test_many_misplaced_panoramas_are_all_named() -> None:
