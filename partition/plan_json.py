@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from panolog.partition.cells import Cut, Layout
-from panolog.scene.errors import InputError
+from panolog.scene.errors import InputError, wrong_value
 
 Triple = tuple[float, float, float]
 Reason = Literal["geometry", "gradient", "both"]
@@ -77,7 +77,7 @@ def parse(data: object) -> PlanFile:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the top level"
         raise InputError(
-            f"plan.json is not a plan of version 2: {place}: {first['msg']}; make the plan again"
+            f"plan.json is not a plan of version 2: {place}: {wrong_value(first)}; make the plan again"
         ) from None
 
 

@@ -5,7 +5,9 @@ Each error takes that line as its only argument, so it survives pickling across 
 Modules import the packages of an extra as any other; where one is missing, `explained` says what to install.
 """
 
+from collections.abc import Mapping
 from importlib.util import find_spec
+from typing import Any
 
 PACKAGES = {  # a module: its name for people, and the extra of pyproject.toml
     "av": ("PyAV", "prepare"),
@@ -102,6 +104,32 @@ class ClusterLostError(RunError):
 
 class StoreLostError(RunError):
     """An object store has failed for too long."""
+
+
+# What a value must be, by pydantic's type of the error and by the values that it compares with.
+_MUST_BE = {
+    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "keys with values are needed"),
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "a whole number is needed"),
+    **dict.fromkeys(("float_type", "float_parsing"), "a number is needed"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false is needed"),
+    **dict.fromkeys(("tuple_type", "list_type"), "a list is needed"),
+    "string_type": "text is needed",
+    "finite_number": "a finite number is needed",
+    "greater_than_equal": "it must be at least {ge}",
+    "greater_than": "it must be above {gt}",
+    "less_than_equal": "it must be at most {le}",
+    "less_than": "it must be below {lt}",
+    "literal_error": "it must be {expected}",
+    "missing": "it is missing",
+}
+
+
+def wrong_value(error: Mapping[str, Any]) -> str:
+    """What is wrong with a value, in a few words. Args: error, of `ValidationError.errors` of pydantic."""
+    words = _MUST_BE.get(error["type"])
+    if words is None:
+        return str(error["msg"]).removeprefix("Value error, ")  # of a check of our own
+    return words.format_map(error.get("ctx", {}))
 
 
 def command_for(module: str) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from panolog.scene.colmap import write_colmap
-from panolog.scene.errors import InputError, SceneError
+from panolog.scene.errors import InputError, SceneError, wrong_value
 from panolog.scene.files import SUFFIX, stem_of, write_bytes
 from panolog.scene.image_files import decode_with_alpha
 from panolog.scene.read import read_scene
@@ -180,7 +180,7 @@ def read_offset(scene: Path) -> Offset | None:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise SceneError(f"{path}: {where + ': ' if where else ''}{first['msg']}") from error
+        raise SceneError(f"{path}: {where + ': ' if where else ''}{wrong_value(first)}") from error
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from error
 

@@ -16,7 +16,7 @@ from panolog.orchestrator.runs.folder import flat
 from panolog.orchestrator.runs.machines.config import DeadlinesConfig, QuarantineConfig, ScalingConfig
 from panolog.partition.cells import MOST_BLOCKS, Cells, Cuts, Grid
 from panolog.partition.plan import PartitionConfig
-from panolog.scene.errors import ConfigError, in_one_line
+from panolog.scene.errors import ConfigError, in_one_line, wrong_value
 from panolog.workers.settings import Group
 from panolog.workers.tasks import Stage
 from panolog.workers.training.config import TrainConfig
@@ -321,9 +321,9 @@ def validate(tree: Mapping[str, Any]) -> RunConfig:
         key = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
             raise ConfigError(f"unknown setting {key}{_nearest(key)}") from error
-        message = first["msg"].removeprefix("Value error, ")
         given = json.dumps(first["input"], default=str, ensure_ascii=False)
-        raise ConfigError(f"setting {key} = {given}: {message}") from error
+        group = next((f", such as {name}" for name, _ in known_settings() if name.startswith(f"{key}.")), "")
+        raise ConfigError(f"setting {key} = {given}: {wrong_value(first)}{group}") from error
 
 
 def known_settings(model: type[BaseModel] = RunConfig, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:

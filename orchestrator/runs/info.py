@@ -21,7 +21,7 @@ from panolog.orchestrator.runs.reading import WAYS_OUT
 from panolog.orchestrator.runs.records import PreflightSaved, RunBegan, Stored
 from panolog.orchestrator.runs.state import RunState, replay
 from panolog.orchestrator.runs.store import read_milestones
-from panolog.scene.errors import ConfigError, RunFolderError
+from panolog.scene.errors import ConfigError, RunFolderError, wrong_value
 from panolog.scene.files import SUFFIX
 from panolog.scene.model import NO_OFFSET, Vector
 from panolog.workers.tasks import COARSE
@@ -188,7 +188,7 @@ def read_info(folder: RunFolder) -> RunInfo:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
         raise RunFolderError(
-            f"{folder.info}: is not of this PanoLOG's format: {key}: {first['msg']}"
+            f"{folder.info}: is not of this PanoLOG's format: {key}: {wrong_value(first)}"
         ) from error
 
 

@@ -12,7 +12,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
 from panolog.prepare.networks.tiles import Tiles
-from panolog.scene.errors import ConfigError, in_one_line
+from panolog.scene.errors import ConfigError, in_one_line, wrong_value
 
 MAX_BYTES = 65_536  # of a manifest
 MAX_DEPTH = 8  # of its nesting
@@ -199,8 +199,7 @@ def read_manifest(path: Path, kind: type[Kind]) -> Kind:
         field = ".".join(map(str, first["loc"])) or "manifest"
         if first["type"] == "extra_forbidden":
             raise ConfigError(f"{path}: there is no field {field}") from error
-        message = first["msg"].removeprefix("Value error, ")
-        raise ConfigError(f"{path}: {field}: {message}") from error
+        raise ConfigError(f"{path}: {field}: {wrong_value(first)}") from error
 
 
 def manifest_task(path: Path) -> Literal["mask", "depth"]:

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from panolog.orchestrator.runs.machines.nodes import Node
 from panolog.orchestrator.runs.money.records import NodeReserved
 from panolog.orchestrator.runs.units import gib
-from panolog.scene.errors import ConfigError, in_one_line
+from panolog.scene.errors import ConfigError, in_one_line, wrong_value
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -167,7 +167,7 @@ def _checked(tree: Mapping[str, Any], where: str, text: str) -> PriceList:
             raise ConfigError(f"{place}: {key} is no key of a price list; see docs/money.md") from error
         if first["type"] == "missing":
             raise ConfigError(f"{place}: {key} is missing; see docs/money.md") from error
-        raise ConfigError(f"{place}: {key} = {first['input']!r:.80}: {first['msg']}") from error
+        raise ConfigError(f"{place}: {key} = {first['input']!r:.80}: {wrong_value(first)}") from error
 
 
 def _line_of(text: str, place: tuple[int | str, ...]) -> int:

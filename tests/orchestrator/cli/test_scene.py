@@ -109,7 +109,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(scene: Path, model: Path, tm
     assert "--device tpu: choose auto" in one_line(call("depth", scene, "--model", model, "--device", "tpu"))
     assert "no COLMAP model" in one_line(call("depth", model.parent, "--model", model))
     model.with_suffix(".yaml").write_text("task: depth")
-    assert "net.yaml: input: Field required" in one_line(call("depth", scene, "--model", model))
+    assert "net.yaml: input: it is missing" in one_line(call("depth", scene, "--model", model))
     assert "nothing to mask" in one_line(call("mask", scene))
     assert "--nadir 91: " in one_line(call("mask", scene, "--nadir", 91))
     assert "--nadir nan: " in one_line(call("mask", scene, "--nadir", "nan"))

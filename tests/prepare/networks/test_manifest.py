@@ -61,14 +61,14 @@ def changed(path: str, value: object) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "path, value, message",
     [
-        ("task", "mask", "task: Input should be 'depth'"),
-        ("input", None, "input: Field required"),
+        ("task", "mask", "task: it must be 'depth'"),
+        ("input", None, "input: it is missing"),
         ("input.width", 65, r"input: width must be 2 \* height \+ 2 \* wrap = 72, not 65"),
-        ("input.height", 10**9, "input.height: Input should be less"),
+        ("input.height", 10**9, "input.height: it must be at most"),
         ("input.seam", "turn", "input: wrap is the number of repeated columns"),
-        ("input.divisor", 0, "input.divisor: Input should be greater than 0"),
-        ("input.std", [1, 0, 1], "input.std.1: Input should be greater than 0"),
-        ("depth.factor", float("inf"), "depth.factor: Input should be a finite number"),
+        ("input.divisor", 0, "input.divisor: it must be above 0"),
+        ("input.std", [1, 0, 1], "input.std.1: it must be above 0"),
+        ("depth.factor", float("inf"), "depth.factor: a finite number is needed"),
         ("depth.scale", 3, "there is no field depth.scale"),
         ("skies", {}, "there is no field skies"),
     ],
@@ -98,7 +98,7 @@ def test_a_mask_manifest_has_one_head(tmp_path: Path) -> None:
         ({"seam": "tiles", "width": 32}, "input: fov is the angle of a view in degrees"),
         ({"fov": 90}, "input: fov is the angle of a view in degrees"),
         ({"seam": "tiles", "fov": 90}, "input: with seam: tiles, width must be height = 32, not 64"),
-        ({"seam": "tiles", "fov": 20, "width": 32}, "input.fov: Input should be greater than or equal to 40"),
+        ({"seam": "tiles", "fov": 20, "width": 32}, "input.fov: it must be at least 40"),
         (
             {"seam": "tiles", "fov": 90, "width": 4096, "height": 4096},
             "12868 columns, more than 8192; raise",
@@ -137,7 +137,7 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x]\n" + "".join(
 @pytest.mark.parametrize(
     "data, message",
     [
-        (b"", "manifest: Input should be a valid dictionary"),
+        (b"", "manifest: keys with values are needed"),
         (b"\xff\xfe\x00", "cannot be read"),
         (b"a: [", "cannot be read"),
         (BOMB.encode(), "neither YAML aliases"),
