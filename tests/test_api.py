@@ -101,6 +101,14 @@ def test_write_read_render_and_evaluate(scene: Path, tmp_path: Path) -> None:
     assert report["mean"]["psnr"] > 0
 
 
+@pytest.mark.parametrize(("views", "says"), [([], "views: are none"), ([0, 99], "there is no row 99")])
+def test_views_that_cannot_be_evaluated(views: list[int], says: str, scene: Path) -> None:
+    """The mean of none was empty, and a row of no panorama an IndexError."""
+    read = panolog.read_scene(scene)
+    with pytest.raises(panolog.ConfigError, match=f"{says}.* to {len(read.panoramas) - 1}"):
+        panolog.evaluate(panolog.initial_gaussians(read), read, views=views, device="cpu")
+
+
 def test_run_and_resume_take_strings_and_the_defaults(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

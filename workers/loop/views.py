@@ -58,6 +58,19 @@ def initial_gaussians(scene: Scene, *, sky: int = 0, width: int | None = None) -
     return first_model(*begin, lambda row: load_view(scene.panoramas[row], row, width))
 
 
+def known_rows(scene: Scene, rows: Sequence[int], name: str) -> tuple[int, ...]:
+    """Rows of `scene.panoramas` that a caller has given, checked. Args: name, of the argument.
+
+    Raises ConfigError if they are none, or one is of no panorama.
+    """
+    count, chosen = len(scene.panoramas), tuple(rows)
+    if not chosen:
+        raise ConfigError(f"{name}: are none; name rows of scene.panoramas, 0 to {count - 1}")
+    if wrong := [row for row in chosen if not 0 <= row < count]:
+        raise ConfigError(f"{name}: there is no row {wrong[0]} of scene.panoramas, only 0 to {count - 1}")
+    return chosen
+
+
 def load_views(
     scene: Scene,
     width: int,
@@ -82,7 +95,7 @@ def load_views(
         device: of the tensors, "cpu" or "cuda".
 
     Raises:
-        ConfigError: the width is not possible, or there are no rows.
+        ConfigError: the width is not possible, or there are no rows, or not these.
         DeviceError: there is no such device.
         SceneError: a panorama cannot be decoded.
 
@@ -93,9 +106,7 @@ def load_views(
     torch.Size([16, 32, 3]) 32 None
     torch.Size([16, 32, 3]) 32 None
     """
-    chosen = tuple(scene.train if rows is None else rows)
-    if not chosen:
-        raise ConfigError("rows: are none; name at least one row of scene.panoramas, or leave them out")
+    chosen = known_rows(scene, scene.train if rows is None else rows, "rows")
     targets = DepthTargets(scene, DepthConfig(), seed)
     with PanoramaCache(scene, chosen, width, _MEMORY, device=choose_device(device)) as cache:
         for iteration in range(iterations):

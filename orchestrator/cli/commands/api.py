@@ -22,6 +22,7 @@ from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 from panolog.workers import evaluation
 from panolog.workers.events import Checkpoint, Evaluated, Event, LeftOut, LpipsMissing
+from panolog.workers.loop.views import known_rows
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE
 from panolog.workers.training import trainer
@@ -97,6 +98,9 @@ def evaluate(
         "left_out": {name: why it could not be measured}}, with the metrics psnr and ws_psnr (dB), ssim,
         ws_ssim, lpips, and lpips_3dgs of images in [0, 1].
 
+    Raises:
+        ConfigError: there are no views, or not these.
+
     >>> import panolog
     >>> sorted(panolog.evaluate(MODEL, SCENE, device="cpu")["mean"])[:2]
     ['cc_lpips', 'cc_psnr']
@@ -104,7 +108,7 @@ def evaluate(
     scene = _scene(scene)
     spec = evaluation.EvaluateSpec(
         scene=Value(scene),
-        views=scene.test if views is None else tuple(views),
+        views=known_rows(scene, scene.test if views is None else views, "views"),
         width=width or scene.width,
         model=Value(model if isinstance(model, Gaussians) else read_ply(model)),
         near=near_distance(scene, TrainConfig()) if near is None else near,

@@ -51,6 +51,9 @@ def test_a_width_or_device_that_there_is_not_is_an_error(scene: Scene) -> None:
         next(load_views(scene, 64, 1, device="tpu"))
     with pytest.raises(ConfigError, match="rows: are none"):
         next(load_views(scene, 64, 1, rows=[]))
+    for row in (-1, len(scene.panoramas)):
+        with pytest.raises(ConfigError, match=f"rows: there is no row {row} of scene.panoramas, only 0 to"):
+            next(load_views(scene, 64, 1, rows=[0, row]))
 
 
 def test_the_first_model_has_points_then_a_sky(scene: Scene) -> None:
