@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from panolog.orchestrator.cli.console import progress_bar, say
+from panolog.scene.errors import InputError
 from panolog.scene.stores.url import is_url, parse_url
 
 
@@ -35,7 +36,8 @@ def mirrored(
 def opened(run: str, reader: Literal["status", "events", "report", "export"]) -> Iterator[tuple[Path, bool]]:
     """A run, or as much of it as a command reads, in a folder; and whether a driver elsewhere has it.
 
-    Args: run, a folder or a URL. Raises StoreError if there is no such run or no access, StoreLostError.
+    Args: run, a folder or a URL. Raises StoreError if there is no such run or no access, StoreLostError; an
+    InputError that is raised in the context names the URL in place of the folder.
     """
     if not is_url(run):
         yield Path(run), False
@@ -45,4 +47,7 @@ def opened(run: str, reader: Literal["status", "events", "report", "export"]) ->
 
     wanted = {"report": fetch.for_report, "export": fetch.for_export}.get(reader, fetch.for_status)
     with progress_bar(f"reading {url}") as _, fetch.viewed(url, wanted) as found:
-        yield found.root, bool(found.driver)
+        try:
+            yield found.root, bool(found.driver)
+        except InputError as error:  # about a file of the copy, which is gone when this is read
+            raise type(error)(str(error).replace(str(found.root), str(url))) from error

@@ -40,7 +40,7 @@ def say_missing_sky(path: Path) -> None:
 def say_unmerged(run: RunFolder, model: Path) -> None:
     """Says so if a model is shown in place of the merged one, which is to come or was removed."""
     if model != run.point_cloud:
-        say(f"{run.root}: has no merged model; this is its model of Stage I")
+        say(f"{run.place.name}: has no merged model; this is its model of Stage I")
 
 
 @contextmanager

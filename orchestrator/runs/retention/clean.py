@@ -57,7 +57,8 @@ class Cleaned:
             yield f"{run.root}: " + (
                 f"left as it is: {run.skipped}" if run.skipped else kinds or "nothing to remove"
             )
-        yield f"{'would remove' if self.dry else 'removed'} {gib(self._total)} ({self._total:,} bytes)"
+        if any(run.removals for run in self.runs):
+            yield f"{'would remove' if self.dry else 'removed'} {gib(self._total)} ({self._total:,} bytes)"
 
     @property
     def _total(self) -> int:

@@ -3,6 +3,8 @@
 import json
 import math
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -15,6 +17,7 @@ from typer.testing import Result
 from panolog.export.georeference import Georeference
 from panolog.export.reading import read_model
 from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.storage import fetch
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import read_ply, write_ply
 from panolog.scene.read import read_scene
@@ -23,7 +26,7 @@ from panolog.workers.tasks import COARSE
 from panolog.workers.training.initialise import scene_gaussians
 from tests.orchestrator.cli.program import call as panolog
 from tests.orchestrator.cli.program import one_line, shown
-from tests.orchestrator.history import begun
+from tests.orchestrator.history import BEGAN, begun
 from tests.scenes import write_scene
 
 MODELS = ("sog", "spz", "compressed-ply", "ply")
@@ -179,6 +182,20 @@ def test_what_a_run_has_made_stays(run: RunFolder, tmp_path: Path, output: str, 
     made = [copy.root / output] * (kind is None)
     assert {path for path in copy.root.iterdir() if path.is_file()} == {*before, *made}
     assert all(path.read_bytes() == content for path, content in before.items())
+
+
+def test_an_error_of_a_run_in_a_store_names_its_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The folder in which the run is for a while is of no use to who reads it."""
+    begun(tmp_path / "run", BEGAN)
+
+    @contextmanager
+    def viewed(*_: object) -> Iterator[fetch.Viewed]:
+        yield fetch.Viewed(tmp_path / "run", "")
+
+    monkeypatch.setattr(fetch, "viewed", viewed)
+    url = f"file://{tmp_path}/store/run"
+    line = one_line(panolog("export", url, "--sog", "-o", tmp_path / "made"))
+    assert line == f"panolog: {url}: the run has no model yet; its first checkpoint makes one"
 
 
 def test_up(run: RunFolder, tmp_path: Path) -> None:

@@ -120,7 +120,7 @@ def test_the_command_writes_one_file_or_a_folder(folder: RunFolder, browsed: lis
     done = view(folder.root, "-o", folder.root / "site")
     assert (done.exit_code, done.stdout, browsed) == (0, f"{folder.root / 'site'}\n", [])
     assert done.stderr.endswith(
-        f"{folder.root}: has no merged model; this is its model of Stage I\n20 Gaussians\n"
+        f"{folder.root.name}: has no merged model; this is its model of Stage I\n20 Gaussians\n"
     )
     assert len(list((folder.root / "site" / "photos").iterdir())) == 6
     done = view(folder.root / "site" / "model.sog", "-o", folder.root / "again")

@@ -73,6 +73,7 @@ def test_a_run_at_work_is_left_as_it_is(store: Store, tmp_path: Path) -> None:
     lease = take(store, tmp_path / "run", force=False)
     result = call("clean", store.url, "--yes")
     assert "left as it is: a driver on " in result.stdout and names(store) == before
+    assert "remove" not in result.stdout + call("clean", store.url).stdout
     lease.release()
     young = call("clean", store.url, "--yes", "--older-than", "1d")
     assert "left as it is: it was written 0.0 days ago" in young.stdout and names(store) == before
