@@ -76,6 +76,8 @@ export class Walk {
     at("photo").hidden = !this.cameras.some((camera) => camera.photograph);
     input("along").max = String(this.cameras.length - 1);
     button("play").addEventListener("click", () => this.toggle());
+    button("play").disabled = this.cameras.length < 2;
+    if (button("play").disabled) button("play").title = "A walk needs two cameras, and there is one";
     button("back").addEventListener("click", () => this.step(-1));
     button("on").addEventListener("click", () => this.step(1));
     input("along").addEventListener("input", () => {

@@ -1,5 +1,6 @@
 """The pages in a real browser: what they show, also of machines and the store, on a phone and on a desk."""
 
+import re
 import socket
 import time
 from collections.abc import Iterator
@@ -9,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import APIResponse, Browser, Page, Route, expect
 from scipy.sparse import csr_array
 
 from panolog.orchestrator.engine.stages.partitioning import plan_records, write_plan
@@ -30,7 +31,7 @@ from panolog.orchestrator.runs.storage.state import MirrorState, write_state
 from panolog.orchestrator.runs.store import Database
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
-from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.tasks import COARSE, Stage, TaskId
 from tests.orchestrator.history import append
 from tests.orchestrator.watch.dashboard.browser import DESK, PATIENCE_MS, PHONE, SMALL, opened, unreachable
 from tests.orchestrator.watch.dashboard.served import (
@@ -237,6 +238,36 @@ def test_pictures_are_compared_and_looked_around_in(town: Page) -> None:
     yaw, pitch, _ = map(float, str(canvas.get_attribute("data-angles")).split())
     assert yaw > 0.785
     assert pitch > 0
+
+
+def test_what_happens_while_the_log_loads_is_in_it(browser: Browser, tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", [RunBegan("host", 1, resumed=False)])
+    held: list[tuple[Route, APIResponse]] = []
+    with serving(tmp_path) as served, opened(browser, f"{served.url}/runs/{served.id('run')}") as page:
+        expect(page.locator("#events li").first).to_be_visible()
+        page.route(re.compile(r"/events\?"), lambda route: held.append((route, route.fetch())))
+        page.locator("#log-text").fill("late")
+        while not held:
+            page.wait_for_timeout(20)
+        append(folder, Noticed(COARSE, "it is late"))
+        expect(page.locator("main")).to_contain_text("it is late")
+        for route, answer in held:
+            route.fulfill(response=answer)
+        expect(page.locator("#log-empty")).to_have_text("")
+        expect(page.locator("#events li")).to_have_count(1)
+
+
+def test_a_repair_has_another_colour_than_stage_one(browser: Browser, tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", [RunBegan("host", 1, resumed=False)])
+    for task in (COARSE, TaskId(Stage.REPAIR, 0)):
+        append(folder, started(task), progressed(task, 10), progressed(task, 20))
+    with serving(tmp_path) as served, opened(browser, f"{served.url}/runs/{served.id('run')}") as page:
+        chips = page.locator("#shown .chip")
+        expect(chips).to_have_count(2)
+        first, second = (chips.nth(number).evaluate("it => it.style.background") for number in (0, 1))
+        assert first != second
+        marks = page.locator(".chip").evaluate_all("every => every.map(it => it.style.background)")
+        assert {first, second} <= set(marks)
 
 
 def test_the_log_is_filtered(town: Page) -> None:

@@ -1,5 +1,7 @@
 """The 3D page in a real browser: what it draws, and each way to move in it."""
 
+import json
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -206,6 +208,17 @@ def test_the_walk_plays_pauses_and_follows_its_slider(page: Page) -> None:
     page.evaluate("panolog.walk.toggle()")
     pass_by(page, 30)
     assert page.evaluate("[panolog.walk.place, panolog.walk.plays]") == [11, False]  # at the last camera
+
+
+def test_a_walk_of_one_camera_cannot_be_played(browser: Browser, tmp_path: Path) -> None:
+    """Play did nothing."""
+    write_folder(site_of_run(run_with(tmp_path), Wanted()), tmp_path / "web")
+    description = tmp_path / "web" / "scene.json"
+    content = json.loads(description.read_text())
+    description.write_text(json.dumps(content | {"cameras": content["cameras"][:1]}))
+    with serving(tmp_path / "web") as url, opened(browser, url, width=800, height=500) as page:
+        expect(page.locator("#play")).to_be_disabled()
+        expect(page.locator("#play")).to_have_attribute("title", re.compile("two cameras"))
 
 
 def test_who_wants_no_movement_gets_none(page: Page) -> None:

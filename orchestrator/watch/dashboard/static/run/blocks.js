@@ -61,7 +61,7 @@ const COLUMNS = [
 export function blockTable(choose) {
   const body = first("#block-table tbody");
   const [scroll, search] = [byId("block-scroll"), byId("block-search", HTMLInputElement)];
-  /** @type {{rows: Row[], shown: Row[], key: string, down: boolean, marked: number | null, color: (block: number) => string}} */
+  /** @type {{rows: Row[], shown: Row[], key: string, down: boolean, marked: number | null, color: (row: Row) => string}} */
   const view = { rows: [], shown: [], key: "block", down: false, marked: null, color: () => "transparent" };
   const spacers = [
     el("tr", { class: "spacer", "aria-hidden": "true" }),
@@ -107,7 +107,7 @@ export function blockTable(choose) {
     node.setAttribute("aria-rowindex", String(index + 2));
     node.setAttribute("aria-current", String(row.block === view.marked));
     const [chip, name] = childrenOf(cells[0]);
-    chip.style.background = view.color(row.block);
+    chip.style.background = view.color(row);
     setText(name, taskLabel(row.name));
     setPill(childrenOf(cells[1])[0], row.status, STATES[row.status]);
     const [iterations, progress] = childrenOf(cells[2]);
@@ -173,7 +173,7 @@ export function blockTable(choose) {
       }
       paint();
     },
-    /** Sets the colours of blocks. @param {(block: number) => string} color */
+    /** Sets the colours of blocks. @param {(row: Row) => string} color */
     colored(color) {
       view.color = color;
       paint();

@@ -13,6 +13,13 @@ import { draw, themed } from "panolog/shared/plot.js";
 const POINTS = 600; // of a curve, as the server sends it
 const FIRST = 4; // curves that are shown by default
 const MOST = 8;
+const OTHERS = ["--accent", "--paused", "--failed", "--done"];
+
+/** The colour of what is no block: of Stage I, or of a repair by the number of its seam. @param {string} task */
+function other(task) {
+  const number = task.split("/")[1];
+  return number === undefined ? "--ink" : OTHERS[Number(number) % OTHERS.length];
+}
 
 /** @param {string} path of the run below /api @param {BlockTable} table */
 export function curves(path, table) {
@@ -27,10 +34,12 @@ export function curves(path, table) {
   let blockColors = [];
   const nodes = CHARTS.map((kind) => el("div", { class: "plot chart", role: "img", "aria-label": chartTitle(kind) }));
   byId("charts").append(...CHARTS.map((kind, i) => el("figure", {}, el("figcaption", {}, chartTitle(kind)), nodes[i])));
-  table.colored((block) => (block < 0 ? "var(--ink)" : (blockColors[block] ?? "transparent")));
+  const paint = () =>
+    table.colored((row) => (row.block < 0 ? `var(${other(row.name)})` : (blockColors[row.block] ?? "transparent")));
+  paint();
 
-  /** @param {number} block -1 for Stage I */
-  const color = (block) => (block < 0 ? token("--ink") : (blockColors[block] ?? token("--accent")));
+  /** @param {string} name @param {number} block -1 for what is no block */
+  const color = (name, block) => (block < 0 ? token(other(name)) : (blockColors[block] ?? token("--accent")));
 
   /** @param {string} task */
   async function load(task) {
@@ -46,7 +55,7 @@ export function curves(path, table) {
     if (!shown.size && !settled) return;
     const drawn = [...shown].map((task) => {
       const block = begun.find((row) => row.name === task)?.block ?? -1;
-      return { label: taskLabel(task), color: color(block), series: data.get(task) ?? {} };
+      return { label: taskLabel(task), color: color(task, block), series: data.get(task) ?? {} };
     });
     await Promise.all(CHARTS.map((kind, i) => draw(nodes[i], chartTraces(kind, drawn), themed(chartLayout(kind)))));
   }
@@ -58,7 +67,7 @@ export function curves(path, table) {
     replaceIfChanged(byId("shown"), key, () =>
       offered.map(({ name, block }) => {
         const mark = el("span", { class: "chip" });
-        mark.style.background = color(block);
+        mark.style.background = color(name, block);
         const on = shown.has(name);
         return el(
           "button",
@@ -133,7 +142,7 @@ export function curves(path, table) {
     /** @param {string[]} colors */
     colors(colors) {
       blockColors = colors;
-      table.colored((block) => (block < 0 ? "var(--ink)" : (colors[block] ?? "transparent")));
+      paint();
       chips();
       render();
     },

@@ -141,6 +141,8 @@ export function log(path) {
   /** The id before which older events start. @type {number | null} */
   let oldest = null;
   let requests = 0; // so that a slow answer does not replace a later one
+  /** What has come since the events were requested, which the answer may lack; null otherwise. @type {RunEvent[] | null} */
+  let late = null;
 
   /** @param {string} value @param {string} label */
   const option = (value, label) => el("option", { value }, label);
@@ -165,6 +167,7 @@ export function log(path) {
   /** @param {number | null} before */
   async function load(before = null) {
     const request = ++requests;
+    if (!before) late = [];
     try {
       /** @type {EventList} */
       const answer = await get(snapshot ? `${path}/events` : query(before));
@@ -174,6 +177,8 @@ export function log(path) {
       oldest = answer.next ?? answer.events.at(-1)?.id ?? oldest;
       older.hidden = !answer.more;
       setText(empty, list.children.length || answer.more ? "" : "No events.");
+      add(late ?? []);
+      late = null;
     } catch (error) {
       if (request === requests) setText(empty, messageOf(error));
     }
@@ -191,6 +196,16 @@ export function log(path) {
     );
   }
 
+  /** @param {RunEvent[]} events */
+  function add(events) {
+    const newest = list.firstElementChild instanceof HTMLElement ? Number(list.firstElementChild.dataset.key) : 0;
+    const found = events.filter((event) => event.id > newest && passes(event)).sort((a, b) => b.id - a.id);
+    if (!found.length) return;
+    list.prepend(...found.map(line));
+    setText(empty, "");
+    while (list.children.length > KEPT) list.lastElementChild?.remove();
+  }
+
   const reload = throttled(() => load(), 300);
   for (const filter of Object.values(filters)) filter.addEventListener("input", reload);
   older.addEventListener("click", () => load(oldest));
@@ -199,12 +214,8 @@ export function log(path) {
     refresh: () => load(),
     /** @param {RunEvent[]} events */
     add(events) {
-      const newest = list.firstElementChild instanceof HTMLElement ? Number(list.firstElementChild.dataset.key) : 0;
-      const found = events.filter((event) => event.id > newest && passes(event)).sort((a, b) => b.id - a.id);
-      if (!found.length) return;
-      list.prepend(...found.map(line));
-      setText(empty, "");
-      while (list.children.length > KEPT) list.lastElementChild?.remove();
+      late?.push(...events);
+      add(events);
     },
     /** @param {RunPage} run */
     update(run) {
