@@ -75,7 +75,7 @@ def export(
         raise InputError(f"{source}: there is neither a run nor a PLY")
     wanted = {"sog": sog, "web": web, "spz": spz, "compressed-ply": compressed_ply, "ply": ply}
     wanted |= {"glb": glb, "3dtiles": tiles, "sky-image": sky_image}
-    box, direction = crop and _box(crop), up and _direction(up)
+    box, direction = crop and _box(crop), up and direction_of(up)
     with opened(source, "export") as (root, _), progress_bar("reading the model") as show:
         from panolog.export.splats import Selection
         from panolog.orchestrator.cli.commands.export import ExportSpec, export_model
@@ -115,7 +115,8 @@ def _box(text: str) -> tuple[tuple[float, float, float], tuple[float, float, flo
     return (a, b, c), (x, y, z)
 
 
-def _direction(text: str) -> tuple[float, float, float]:
+def direction_of(text: str) -> tuple[float, float, float]:
+    """The value of `--up`: an axis with its sign, or three numbers. Raises InputError for anything else."""
     axis = text.lstrip("+-").lower()
     if axis in _AXES:
         sign = -1.0 if text.startswith("-") else 1.0

@@ -162,6 +162,7 @@ def view(
         ),
     ] = None,
     most: Annotated[int | None, typer.Option("--most", min=1, hidden=True)] = None,  # its former name
+    up: Annotated[str | None, option("z|-y|X,Y,Z", "The direction up of a PLY. Default: -y.")] = None,
     port: Annotated[int, option("PORT", "Port to serve on; 0 = any free port.", min=0, max=65535)] = 0,
 ) -> None:
     """Show the model of a run, a block or a file in 3D, in the browser, until Ctrl-C."""
@@ -172,17 +173,22 @@ def view(
         read_head(RunFolder(source))
     elif task is not None or camera is not None:
         raise InputError("--task and --camera need the folder of a run, not a file")
+    if up is not None and source.suffix.lower() != ".ply":
+        raise InputError("--up is of a PLY: what else is shown says itself where up is; leave it out")
     if output is not None and not output.absolute().parent.is_dir():
         raise InputError(f"{output.parent}: there is no such folder for the page")
     with ExitStack() as open_until_the_end:
         with progress_bar("reading the model") as show:
+            from panolog.export.georeference import Georeference
             from panolog.orchestrator.cli.commands.models import say_missing_sky
             from panolog.orchestrator.cli.commands.view import SiteServer, serve, site_of, write_view
+            from panolog.orchestrator.cli.export import direction_of
             from panolog.orchestrator.watch.views.site.build import Wanted
             from panolog.workers.tasks import TaskId
 
             say_missing_sky(source)
-            wanted = Wanted(TaskId.parse(task) if task else None, camera, max_gaussians or most)
+            place = None if up is None else Georeference(direction_of(up))
+            wanted = Wanted(TaskId.parse(task) if task else None, camera, max_gaussians or most, place=place)
             if output is not None:
                 page = write_view(source, wanted, output, show).page
                 one = output.is_file()

@@ -10,13 +10,16 @@ from functools import partial
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 
+from panolog.export.reading import read_model
 from panolog.orchestrator.cli.commands.view import SiteServer, site_of
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
+from panolog.scene.ply import read_ply
 from panolog.workers.tasks import COARSE, TaskId
-from tests.orchestrator.cli.program import call
+from tests.orchestrator.cli.program import call, one_line
 from tests.orchestrator.history import begun
 from tests.orchestrator.watch.dashboard.served import raw
 from tests.orchestrator.watch.views.models import save_model, save_plan
@@ -108,6 +111,23 @@ def browsed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 view = partial(call, "view")
+
+
+@pytest.mark.parametrize(("up", "axis", "sign"), [(None, 1, 1), ("z", 2, -1), ("-z", 2, 1), ("x", 0, -1)])
+def test_a_ply_with_another_up_stands_upright(
+    up: str | None, axis: int, sign: int, folder: RunFolder, tmp_path: Path
+) -> None:
+    """Models of other programs lay on their side. In a SOG y is down."""
+    given = [] if up is None else ["--up", up]
+    assert view(folder.model(COARSE), *given, "-o", tmp_path / "page").exit_code == 0
+    shown = np.sort(np.asarray(read_model(tmp_path / "page" / "model.sog").means)[:, 1])
+    wanted = np.sort(sign * read_ply(folder.model(COARSE)).means[:, axis].numpy())
+    np.testing.assert_allclose(shown, wanted, atol=0.02)
+
+
+def test_up_is_of_a_ply(folder: RunFolder) -> None:
+    assert "--up is of a PLY" in one_line(view(folder.root, "--up", "z"))
+    assert "--up w: write 3 numbers" in one_line(view(folder.model(COARSE), "--up", "w"))
 
 
 def test_the_command_writes_one_file_or_a_folder(folder: RunFolder, browsed: list[str]) -> None:
