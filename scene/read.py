@@ -93,7 +93,7 @@ def model_folder(root: Path) -> Path:
 
 def refuse_run(folder: Path) -> None:
     """Raises SceneError for the folder of a run, in which a scene or panoramas are looked for."""
-    if (folder / "run.db").is_file():
+    if (folder / "run.json").is_file():  # which makes a folder a run
         raise SceneError(
             f"{folder}: is the folder of a run; give the scene that it was made of, named in its run.json, "
             "or continue it by `panolog resume`"

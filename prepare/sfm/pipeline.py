@@ -27,7 +27,7 @@ from panolog.prepare.sources.gather import Gathered, gather
 from panolog.prepare.stitching.lenses import Up
 from panolog.prepare.video.frames import PARALLAX, frame_times
 from panolog.prepare.world.exif import read_exif
-from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
+from panolog.prepare.world.georeference import Georeference, check_metres, georeference, scale_from_distance
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import natural_key, some_of, stem_of
 from panolog.scene.write import NewScene, Offset, PosedImage, StageProgress, require_new, write_scene
@@ -173,8 +173,9 @@ def _between(
         if not it:
             some = some_of(sorted(names.values(), key=natural_key), "panorama")
             raise ConfigError(f"--distance: {name} is not there; name two of the {some}")
-    if first == second or not 0 < metres < np.inf:
-        raise ConfigError(f"--distance {first} {second} {metres:g}: give two panoramas and metres above 0")
+    if first == second:
+        raise ConfigError(f"--distance {first} {second}: give two panoramas")
+    check_metres(metres)
     return first, second, metres
 
 

@@ -23,6 +23,7 @@ _TIMES = ("t", "time", "timestamp")
 _NAMES = ("name", "image", "file", "filename")
 _FEWEST = 3  # panoramas with a place
 _LONGER = 500.0  # times as long as a video, in seconds: a trajectory in milliseconds
+_ALIKE = 0.01  # metres: places of one panorama differ by no more
 _FLAT = 0.02  # of the length of a walk: if it is straighter, its turn about itself is unknown
 
 
@@ -174,8 +175,21 @@ def _read_csv(path: Path, rows: Sequence[tuple[int, str]]) -> Trajectory:
     table = [_numbers(path, number, [row[it] for it in columns], len(columns)) for number, row in cells]
     values = np.array(table).reshape(-1, len(columns))
     if named:
-        return Trajectory(path, values, None, tuple(row[key].strip() for _, row in cells))
+        names = tuple(row[key].strip() for _, row in cells)
+        _require_one_place(path, names, values, [number for number, _ in cells])
+        return Trajectory(path, values, None, names)
     return _timed(path, values)
+
+
+def _require_one_place(path: Path, names: Sequence[str], places: Array, numbers: Sequence[int]) -> None:
+    """Raises SceneError if two lines have one name and different places. Args: numbers, of the lines."""
+    first = dict[str, int]()
+    for row, name in enumerate(names):
+        before = first.setdefault(name, row)
+        if not np.allclose(places[before], places[row], rtol=0, atol=_ALIKE):
+            raise SceneError(
+                f"{path}: lines {numbers[before]} and {numbers[row]}: two places for {name}; remove one of them"
+            )
 
 
 def _timed(path: Path, table: Array) -> Trajectory:

@@ -81,6 +81,12 @@ def georeference(
     )
 
 
+def check_metres(metres: float) -> None:
+    """Raises ConfigError if a distance is not positive and finite."""
+    if not 0 < metres < np.inf:
+        raise ConfigError(f"--distance: {metres:g} m is not a distance; give metres above 0")
+
+
 def scale_from_distance(
     names: Sequence[str], centers: Array, first: str, second: str, metres: float
 ) -> float:
@@ -96,8 +102,7 @@ def scale_from_distance(
         if name not in names:
             raise ConfigError(f"--distance: {name} has no pose, as {len(names)} have; name two of those")
     apart = float(np.linalg.norm(centers[names.index(first)] - centers[names.index(second)]))
-    if not 0 < metres < np.inf:
-        raise ConfigError(f"--distance: {metres:g} m is not a distance; give metres above 0")
+    check_metres(metres)
     if apart <= 1e-9 * float(np.linalg.norm(np.ptp(centers, axis=0))) or apart == 0:
         raise ConfigError(
             f"--distance: {first} and {second} are at the same place; name two that are far apart"

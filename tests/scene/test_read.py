@@ -209,7 +209,7 @@ def resized(size: tuple[int, int]) -> Callable[[Path], None]:
 
 def as_run(root: Path, without: str) -> None:
     shutil.rmtree(root / without)
-    (root / "run.db").touch()
+    (root / "run.json").touch()
 
 
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {

@@ -63,8 +63,8 @@ def test_each_part_becomes_a_scene_if_that_is_wanted(parts: bool, folder: Path, 
     ("distance", "problem"),
     [
         (("0.png", "11.png", 5.0), "11.png is not there; name two of the 7 panoramas"),
-        (("0.png", "0.png", 5.0), "give two panoramas and metres above 0"),
-        (("0.png", "2.png", -5.0), "give two panoramas and metres above 0"),
+        (("0.png", "0.png", 5.0), "give two panoramas"),
+        (("0.png", "2.png", -5.0), "-5 m is not a distance; give metres above 0"),
     ],
 )
 def test_a_distance_of_nothing_is_refused_before_there_are_poses(

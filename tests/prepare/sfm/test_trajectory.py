@@ -42,7 +42,7 @@ def test_frames_of_a_video_count_from_its_beginning(tmp_path: Path) -> None:
     "names", [["a.jpg", "b.jpg", "c.jpg", "d.jpg"], ["x/a.png", "b.tif", "c.png", "d.jpg"]]
 )
 def test_csv_with_names(names: list[str], tmp_path: Path) -> None:
-    places = places_of(read_trajectory(_file(tmp_path, NAMED)), names, None)
+    places = places_of(read_trajectory(_file(tmp_path, NAMED + "a.jpg,0,0,1\n")), names, None)
     assert places[[0, 1, 3]].tolist() == [[0, 0, 1], [2, 0, 1], [4, 2, 1]]
     assert np.isnan(places[2]).all()
 
@@ -57,6 +57,7 @@ def test_csv_with_names(names: list[str], tmp_path: Path) -> None:
         (b"1 2 3\n", "line 1: is not 8 numbers"),
         (TUM.encode() + b"13 0 0 nan 0 0 0 1\n", "line 5: is not 8 numbers"),
         (b"name,x,y\na,1,2\n", "has no x, y and z"),
+        (NAMED.encode() + b"# again\na.jpg,9,0,1\n", "lines 2 and 6: two places for a.jpg; remove one"),
         (b"x,y,z\n1,2,3\n", "neither name nor t"),
         (b"t,x,y,z\n1,2,3\n", "line 2: has 3 cells"),
         (b"t,x,y,z\n1,2,three,4\n", "line 2: is not 4 numbers"),

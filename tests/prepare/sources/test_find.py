@@ -137,7 +137,7 @@ def test_a_missing_source_is_named(tmp_path: Path) -> None:
 
 def test_a_run_is_no_folder_of_panoramas(tmp_path: Path) -> None:
     """The previews in the folder of a run would be taken for panoramas."""
-    run = file(tmp_path / "run" / "run.db").parent
+    run = file(tmp_path / "run" / "run.json").parent
     file(run / "coarse" / "previews" / "000001.jpg")
     with pytest.raises(InputError, match=r"run: is the folder of a run; give the scene"):
         find_sources([run])
