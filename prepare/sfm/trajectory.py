@@ -187,9 +187,8 @@ def _require_one_place(path: Path, names: Sequence[str], places: Array, numbers:
     for row, name in enumerate(names):
         before = first.setdefault(name, row)
         if not np.allclose(places[before], places[row], rtol=0, atol=_ALIKE):
-            raise SceneError(
-                f"{path}: lines {numbers[before]} and {numbers[row]}: two places for {name}; remove one of them"
-            )
+            lines = f"lines {numbers[before]} and {numbers[row]}"
+            raise SceneError(f"{path}: {lines}: two places for {name}; remove one of them")
 
 
 def _timed(path: Path, table: Array) -> Trajectory:

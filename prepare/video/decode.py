@@ -282,11 +282,12 @@ def open_video(path: Path, effort: Effort = "exact", up: Up | None = None) -> It
 def _video_stream(
     path: Path, container: av.container.InputContainer, effort: Effort, lenses: VideoLenses | None
 ) -> av.VideoStream:
-    """The stream of the panoramas, the largest. Raises SceneError."""
+    """The stream of the panoramas, the largest; the first of some that are 2:1. Raises SceneError."""
     streams = largest_streams(container)
     if not streams:
         raise SceneError(f"{path}: there is no video in it that FFmpeg can decode")
-    if len(streams) > 1 and lenses is None:
+    panoramas = streams[0].width == 2 * streams[0].height  # as some cameras store the same twice
+    if len(streams) > 1 and lenses is None and not panoramas:
         raise SceneError(f"{path}: it has a video for each lens; {STITCH}")
     return prepare_stream(streams[0], effort)
 

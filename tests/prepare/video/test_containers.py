@@ -305,6 +305,13 @@ def test_a_video_for_each_lens_is_refused(suffix: str, tmp_path: Path) -> None:
         open_video(path).__enter__()
 
 
+def test_of_two_videos_of_panoramas_the_first_is_used(tmp_path: Path) -> None:
+    frames = known_frames(2)
+    with open_video(write_clip(tmp_path / "clip.mp4", frames, lenses=2)) as video:
+        assert list(video.frames()) == [0, 1]
+        assert same(video.picture(), expected(frames[1]))
+
+
 @pytest.mark.parametrize(
     "damage",
     [
