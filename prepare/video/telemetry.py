@@ -25,6 +25,7 @@ _MOST = 10_000_000  # packets and samples: an accelerometer's of some hours
 _APART = 5.0  # seconds between samples, at most, to interpolate between them
 _RECORDED = 15.0  # the same, of a recorder, which may leave out places on a straight way
 _ALIKE = 0.05  # of the length of a video: as long as a recorder's track, if nothing says when it begins
+_TOGETHER, _LAPSE = 60.0, 3.0  # seconds between the begins of video and track; times as long as the video
 _NEAR = 1.0  # seconds from a sample, at most, where there is none on the other side
 _STEPS = 1.0  # seconds before and after over which an accelerometer is averaged: some steps of a walker
 _HIGHEST = 1e5  # metres, and metres per square second: more is damage
@@ -164,7 +165,13 @@ def _recorded(path: Path, begin: float | None, lasts: float) -> tuple[Series | N
             f"{path}: not used, as the video begins at {shown[0]} UTC, and the positions are those of "
             f"{shown[1]} to {shown[2]}; correct the clock of one, such as creation_time of the video"
         )
-    return _on_earth(times, track.places), f"{path}: GPS is taken from it, {inside:,} positions"
+    line = f"{path}: GPS is taken from it, {inside:,} positions"
+    if not track.relative and abs(times[0]) <= _TOGETHER and length > _LAPSE * lasts:
+        line += (
+            f"; they cover {length:,.0f} s from the begin of the video, which lasts {lasts:,.0f} s: if it is a"
+            " time lapse, its time is not theirs: remove or rename the file"
+        )
+    return _on_earth(times, track.places), line
 
 
 class _Collected:

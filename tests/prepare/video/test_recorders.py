@@ -67,6 +67,20 @@ def test_without_a_clock_a_track_as_long_as_the_video_begins_with_it(
         assert "the video does not say when it begins, and the positions cover 36 s, not its 12 s" in note
 
 
+@pytest.mark.parametrize(("length", "said"), [(2 * SECONDS, False), (300 * SECONDS, True)])
+def test_a_track_that_outlasts_a_video_by_far_may_be_that_of_a_time_lapse(
+    length: int, said: bool, tmp_path: Path
+) -> None:
+    """A minute of video that was taken in five hours has the places of its first minute."""
+    clip = video(tmp_path / "walk.mp4", BEGIN)
+    gpx(tmp_path / "walk.gpx", BEGIN, [0, 5, 10, float(length)])
+    telemetry, (note,) = read_telemetry(clip)
+    assert telemetry is not None
+    assert (
+        "they cover 3,600 s from the begin of the video, which lasts 12 s: if it is a time" in note
+    ) == said
+
+
 def test_a_track_of_another_time_is_named_and_not_used(tmp_path: Path) -> None:
     clip = video(tmp_path / "walk.mp4", BEGIN)
     gpx(tmp_path / "walk.gpx", BEGIN + timedelta(hours=2), [0, 5])
