@@ -168,8 +168,8 @@ def _recorded(path: Path, begin: float | None, lasts: float) -> tuple[Series | N
     line = f"{path}: GPS is taken from it, {inside:,} positions"
     if not track.relative and abs(times[0]) <= _TOGETHER and length > _LAPSE * lasts:
         line += (
-            f"; they cover {length:,.0f} s from the begin of the video, which lasts {lasts:,.0f} s: if it is a"
-            " time lapse, its time is not theirs: remove or rename the file"
+            f"; they cover {length:,.0f} s from the begin of the video, which lasts {lasts:,.0f} s: if it is"
+            " a time lapse, its time is not theirs: remove or rename the file"
         )
     return _on_earth(times, track.places), line
 
