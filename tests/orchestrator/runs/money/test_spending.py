@@ -49,8 +49,13 @@ def test_a_machine_costs_from_when_it_comes_until_it_goes() -> None:
 def test_the_machine_of_the_driver_costs_from_the_start_under_one_id() -> None:
     own, again = NodeReserved(OWN, "host", "kind", 3600.0), replace(A, before=OWN)
     state = after(
-        *[(0, BEGAN), (0, own), (10, again), (15, RunEnded(Outcome.FAILED))],  # it has an id of Ray's by then
-        *[(100, RunBegan("host", 1, True, 15)), (100, own), (107, again)],
+        (0, BEGAN),
+        (0, own),
+        (10, again),  # it has an id of Ray's by then
+        (15, RunEnded(Outcome.FAILED)),
+        (100, RunBegan("host", 1, True, 15)),
+        (100, own),
+        (107, again),
     )
     assert set(state.money.machines) == {"node"}
     assert parts(state.money.until(110)) == pytest.approx((25, 25, 0))
