@@ -166,17 +166,7 @@ def view(
     port: Annotated[int, option("PORT", "Port to serve on; 0 = any free port.", min=0, max=65535)] = 0,
 ) -> None:
     """Show the model of a run, a block or a file in 3D, in the browser, until Ctrl-C."""
-    _require(source)
-    from panolog.orchestrator.runs.folder import RunFolder, read_head
-
-    if source.is_dir():
-        read_head(RunFolder(source))
-    elif task is not None or camera is not None:
-        raise InputError("--task and --camera need the folder of a run, not a file")
-    if up is not None and source.suffix.lower() != ".ply":
-        raise InputError("--up is of a PLY: what else is shown says itself where up is; leave it out")
-    if output is not None and not output.absolute().parent.is_dir():
-        raise InputError(f"{output.parent}: there is no such folder for the page")
+    _require_shown(source, output, of_run=task is not None or camera is not None, of_ply=up is not None)
     with ExitStack() as open_until_the_end:
         with progress_bar("reading the model") as show:
             from panolog.export.georeference import Georeference
@@ -202,6 +192,21 @@ def view(
             _say_count(site.shown)
         _open_served(server.url, server.server_port)
         serve(server)
+
+
+def _require_shown(source: Path, output: Path | None, *, of_run: bool, of_ply: bool) -> None:
+    """Refuses what cannot be shown. Args: of_run, of_ply, whether options of these alone are given."""
+    _require(source)
+    from panolog.orchestrator.runs.folder import RunFolder, read_head
+
+    if source.is_dir():
+        read_head(RunFolder(source))
+    elif of_run:
+        raise InputError("--task and --camera need the folder of a run, not a file")
+    if of_ply and source.suffix.lower() != ".ply":
+        raise InputError("--up is of a PLY: what else is shown says itself where up is; leave it out")
+    if output is not None and not output.absolute().parent.is_dir():
+        raise InputError(f"{output.parent}: there is no such folder for the page")
 
 
 def _open_served(url: str, port: int) -> None:
