@@ -119,7 +119,7 @@ def test_a_program_measures(
 
 
 def test_what_a_run_shows_changes_no_model(scenes: dict[str, Path]) -> None:
-    words = [scenes["scene"], "--cost", "--iterations", "40", "--width", "32"]
+    words = [str(scenes["scene"]), "--cost", "--iterations", "40", "--width", "32"]
     command = [sys.executable, "-m", "benchmarks.living", *words]
     ended = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
     assert ended.stdout.endswith("the models are equal to the byte\n"), ended.stderr

@@ -248,7 +248,7 @@ def test_an_unforeseen_error_is_one_line_and_recorded(
     assert (answer.exit_code, answer.stdout) == (1, "")
     assert "Traceback" not in answer.stderr
     assert answer.stderr.splitlines()[-1].startswith(f"panolog: {line}")
-    notice, *_, ended = [item.record for item in read_records(RunFolder(killed).database)][-7:]
+    notice, *_, ended = [item.record for item in read_records(RunFolder(killed).database)][-8:]
     assert notice == Noticed(None, "resumed by the supervisor after: killed by signal 9")
     assert isinstance(ended, RunEnded)
     assert (ended.outcome, ended.transient) == ("failed", True)
