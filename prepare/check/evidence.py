@@ -16,14 +16,15 @@ Array = NDArray[np.float64]
 MEMORY = 400_000_000  # bytes of decoded panoramas
 MOST_VIEWS, FEWEST_VIEWS = 48, 8
 POINTS = 1500  # of each panorama
-_COLORLESS = 2.0  # of 255: standard deviation below which a cloud is of one colour
+_COLORLESS = 2.0  # of 255: standard deviation below which a cloud says nothing of colours
+_FEW = 20  # points whose colours fit some wrong pose by chance
 _GRID, _BEHIND = 48, 1.2  # columns of a grid of directions; farther than that times the nearest is hidden
 WIDEST = 4096  # pixels; wider panoramas are shrunk
 
 
 def is_colorless(colors: NDArray[np.uint8] | Array) -> bool:
-    """Whether colours (N, 3) of 0 to 255, one at least, are all about the same."""
-    return float(colors.std(axis=0).max()) < _COLORLESS
+    """Whether colours (N, 3) of 0 to 255 say nothing: there are few, or they are all about the same."""
+    return len(colors) < _FEW or float(colors.std(axis=0).max()) < _COLORLESS
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ class Evidence:
 
     @property
     def colorless(self) -> bool:
-        """Whether the points have no colours, so that only patches and tracks can be checked."""
+        """Whether colours of points say nothing, so that only patches and tracks can be checked."""
         return is_colorless(self.colors)
 
     @property
@@ -107,7 +108,10 @@ def _spread(scene: Scene) -> tuple[int, ...]:
 def _tracks(
     scene: Scene, views: Sequence[int]
 ) -> tuple[tuple[NDArray[np.int64], ...], tuple[Array, ...] | None]:
-    """What each panorama sees, and where in units of the width; without tracks only `views` see any."""
+    """What each panorama sees, and where in units of the width; without tracks only `views` see any.
+
+    A model whose images have no lines of observations says what each sees, but not where.
+    """
     if not any(len(panorama.observed) for panorama in scene.panoramas):
         decoded, nothing = set(views), np.empty(0, np.int64)
         return tuple(
@@ -115,6 +119,9 @@ def _tracks(
             for row, panorama in enumerate(scene.panoramas)
         ), None
     model = read_colmap(model_folder(scene.root))
+    if not any(len(image.points) for image in model.images):
+        observed = [panorama.observed for panorama in scene.panoramas]
+        return tuple(seen[_some(len(seen), row)] for row, seen in enumerate(observed)), None
     images = {image.name: image for image in model.images}
     rows, pixels = [], []
     for index, panorama in enumerate(scene.panoramas):
@@ -130,9 +137,13 @@ def _tracks(
 
 
 def likely_seen(points: Array, center: Array) -> NDArray[np.int64]:
-    """(M,) rows of the nearest points (P, 3) that are probably not hidden by one in the same direction."""
+    """(M,) rows of the nearest points (P, 3) that are probably not hidden by one in the same direction.
+
+    Of points at the same place, which a cloud may have by thousands, the first counts.
+    """
     distance = np.linalg.norm(points - center, axis=1)
-    rows = np.argsort(distance, kind="stable")[: 4 * POINTS]
+    rows = np.argsort(distance, kind="stable")
+    rows = rows[np.diff(distance[rows], prepend=-1) > 0][: 4 * POINTS]
     where = project(points[rows] - center)  # the grid's orientation is of no matter
     cell = np.floor(where * _GRID).astype(np.int64) @ (1, _GRID)
     _, first, of = np.unique(cell, return_index=True, return_inverse=True)

@@ -12,7 +12,7 @@ from panolog.scene.files import some_of
 from panolog.scene.model import Scene
 from panolog.scene.read import DEPTHS, MASKS, SKY_MASKS
 
-_LOOKED_AT = 12  # masks, evenly chosen
+_LOOKED_AT = 48  # masks, evenly chosen
 _MOST = 0.5  # of the sphere that masks leave out, from which on they may be inverted
 _BLACK = "black or transparent is what is ignored"
 
@@ -37,22 +37,25 @@ def look_at_layers(scene: Scene) -> Layers:
 
 
 def _masks(scene: Scene) -> tuple[NDArray[np.float64], list[str]]:
-    """The shares of the sphere that some masks leave out, and a line of it; both empty without masks."""
-    masks = [panorama.mask for panorama in scene.panoramas if panorama.mask is not None]
+    """The shares of the sphere that some masks leave out, and lines of them; both empty without masks."""
+    masks = {panorama.name: panorama.mask for panorama in scene.panoramas if panorama.mask is not None}
     if not masks:
         return np.zeros(0), []
     chosen = np.unique(np.linspace(0, len(masks) - 1, min(_LOOKED_AT, len(masks))).astype(int))
-    shares = np.array([share_of_sphere(~read_mask(masks[row])) for row in chosen])
+    names = [list(masks)[row] for row in chosen]
+    shares = np.array([share_of_sphere(~read_mask(masks[name])) for name in names])
     mean = float(shares.mean())
+    some = f" of {len(names)} that were looked at" if len(names) < len(masks) else ""
     line = (
         f"masks: {len(masks)} of {len(scene.panoramas)} panoramas have one, and {mean:.1%} of the sphere is "
-        f"ignored ({shares.min():.1%} to {shares.max():.1%})"
+        f"ignored ({shares.min():.1%} to {shares.max():.1%}{some})"
     )
     if mean == 0:
         line += f"; nothing is: {_BLACK}"
     elif mean > _MOST:
         line += f"; that is most of it: {_BLACK}, invert them if it is to be used"
-    return shares, [line]
+    blank = [name for name, share in zip(names, shares, strict=True) if share == 1]
+    return shares, [line, *([f"masks: nothing is left of {some_of(blank, 'panorama')}"] if blank else [])]
 
 
 def _unmatched(scene: Scene) -> list[str]:

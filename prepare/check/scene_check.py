@@ -65,7 +65,7 @@ class SceneCheck:
         if self.reprojection_px is not None:
             found.append(f"reprojection: median {self.reprojection_px:.2f} px")
         if self.color_correlation is None:
-            found.append("the points have no colours: only tracks and patches are checked")
+            found.append("the points have no colours, or are few: only tracks and patches are checked")
         else:
             found.append(f"colours of points and pixels: correlation {self.color_correlation:.2f}")
         found.append(f"patches of the same points in two views: correlation {self.patch_correlation:.2f}")

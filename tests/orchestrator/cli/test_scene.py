@@ -171,8 +171,9 @@ def test_what_masks_ignore_and_files_that_match_nothing_are_shown(scene: Path) -
     lost = ", ".join(f"other_{name}" for name in NAMES[2:])
     assert shown[1] == f"masks: 2 files ({lost}): not used, as no panorama of the model is called so"
     assert shown[0] in call("info", scene).stdout
-    for name in NAMES[:2]:
-        cv2.imwrite(str(folder / name), np.zeros((32, 64), np.uint8))
+    cv2.imwrite(str(folder / NAMES[0]), np.zeros((32, 64), np.uint8))
+    assert f"masks: nothing is left of 1 panorama ({NAMES[0]})" in call("check", scene).stdout
+    cv2.imwrite(str(folder / NAMES[1]), np.zeros((32, 64), np.uint8))
     *_, problem = json.loads(call("check", scene, "--json").stdout)["problems"]
     assert problem.startswith("masks: nothing is left of 2 panoramas that were looked at")
     for name in NAMES[:2]:

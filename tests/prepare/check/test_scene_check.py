@@ -1,6 +1,7 @@
 """`panolog scene check` finds what is wrong with a town that was broken, and nothing in sound scenes."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from itertools import cycle
@@ -232,6 +233,52 @@ def test_a_cloud_without_colors(tracks: bool, town: Scene, tmp_path: Path) -> No
     assert "the points have no colours" in "\n".join(found.lines())
     (problem,) = check_scene(inverse(grey, tmp_path)).problems
     assert ("the poses are camera-to-world" if tracks else "hardly correlate") in problem
+
+
+def test_a_model_whose_images_have_no_lines_of_observations(town: Scene, tmp_path: Path) -> None:
+    """Points name the images that see them, but not where: all colours counted as wrong."""
+    model = read_colmap(town.root / "sparse" / "0")
+    shutil.copytree(town.root / "images", tmp_path / "images")
+    folder = tmp_path / "sparse" / "0"
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text(f"1 EQUIRECTANGULAR {town.width} {town.height}\n")
+    poses = [
+        " ".join(
+            map(str, [row, *Rotation.from_matrix(it.rotation).as_quat(scalar_first=True), *it.translation, 1])
+        )
+        for row, it in enumerate(model.images, 1)
+    ]
+    lines = [f"{pose} {it.name}" for pose, it in zip(poses, model.images, strict=True)]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    seen = [np.isin(np.arange(len(model.points)), it.observed) for it in model.images]
+    tracks = [
+        " ".join(f"{row} 0" for row, own in enumerate(seen, 1) if own[point]) for point in range(len(seen[0]))
+    ]
+    rows = zip(model.points, model.colors, tracks, strict=True)
+    points = [
+        f"{n} {x} {y} {z} {r} {g} {b} 0 {track}" for n, ((x, y, z), (r, g, b), track) in enumerate(rows, 1)
+    ]
+    (folder / "points3D.txt").write_text("\n".join(points) + "\n")
+    found = check_scene(read_scene(tmp_path))
+    assert found.problems == ()
+    assert found.observations > 0 and found.reprojection_px is None
+    assert found.color_correlation is not None and found.color_correlation > 0.6
+
+
+def test_the_same_point_thousands_of_times_counts_once(town: Scene) -> None:
+    """The exposures and the shift were those of one point."""
+    plain = without_tracks(town)
+    copies = np.concatenate([np.arange(len(town.points)), np.zeros(5000, np.int64)])
+    many = check_scene(replace(plain, points=town.points[copies], colors=town.colors[copies]))
+    assert many.picture_shift_px == check_scene(plain).picture_shift_px
+
+
+def test_the_colours_of_six_points_say_nothing(town: Scene) -> None:
+    """Six fit some wrong convention by chance."""
+    few = replace(without_tracks(town), points=town.points[:6], colors=town.colors[:6])
+    found = check_scene(few)
+    assert found.color_correlation is None
+    assert not [it for it in found.problems if it.startswith(("axes", "names", "pixels"))]
 
 
 def test_half_a_pixel_in_the_tracks(town: Scene, tmp_path: Path) -> None:
