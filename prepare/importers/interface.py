@@ -170,7 +170,7 @@ def find_panorama(where: str, folders: Sequence[Path], name: str) -> tuple[str, 
                     return str(candidate), found
     except (ValueError, OSError) as error:  # a name that no file system can have
         raise SceneError(f"{where}: the image name {name[:80]!r} cannot be a file's") from error
-    searched = " or ".join(str(folder) for folder in folders)
+    searched = " or ".join(dict.fromkeys(map(str, folders)))
     raise SceneError(f"{where}: {name[:80]} is not in {searched}; say where the panoramas are with --images")
 
 

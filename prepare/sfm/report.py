@@ -114,10 +114,8 @@ class SfmReport:
             if image["name"] in elsewhere:
                 continue
             why = ", and no second pair confirms what one says" if image["unconfirmed"] else ""
-            yield (
-                f"no pose: {image['name']} (shares at most {image['matches']} features, "
-                f"with {image['most_shared_with']}{why})"
-            )
+            shared = f"at most {image['matches']} features, with {image['most_shared_with']}{why}"
+            yield f"no pose: {image['name']} (shares {shared if image['matches'] else 'no features'})"
         for link in content["weak_links"]:
             jump = "by any factor" if link["scale_error"] is None else f"by {link['scale_error']:.1%}"
             yield (

@@ -131,6 +131,15 @@ def test_metashape_in_geographic_coordinates(tmp_path: Path) -> None:
         FORMATS["metashape"].read(source)
 
 
+def test_a_folder_that_was_searched_is_named_once(tmp_path: Path) -> None:
+    _, source = nerfstudio(tmp_path / "source")
+    next((tmp_path / "source" / "images").iterdir()).unlink()
+    with pytest.raises(InputError, match="is not in ") as refused:
+        FORMATS["nerfstudio"].read(source)
+    folders = str(refused.value).partition(" is not in ")[2].partition(";")[0].split(" or ")
+    assert len(folders) == len(set(folders))
+
+
 def test_faces_that_are_no_rig(tmp_path: Path) -> None:
     _, source = panorama_sfm(tmp_path / "source")
     with pytest.raises(InputError, match="say where their panoramas are with --images"):

@@ -36,6 +36,12 @@ def test_json_and_plot_show_the_same(tmp_path: Path) -> None:
     assert red.sum() > 200  # the links, the pair and the panorama without a pose
 
 
+def test_a_panorama_that_shares_nothing_names_no_other() -> None:
+    report = faulty()
+    report = replace(report, found=replace(report.found, missing={3: (3, 0)}))
+    assert "no pose: d.jpg (shares no features)" in list(report.lines())
+
+
 def test_a_panorama_that_one_pair_alone_held_says_so() -> None:
     report = faulty()
     report = replace(report, found=replace(report.found, unconfirmed=frozenset({3})))
