@@ -22,6 +22,7 @@ from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.surfaces import NO_POINTS, Points
 
 DARKEST = 0.25 / 255  # initial: colours are clamped at 0, where they have no gradient and would stay black
+COLORLESS = 2.0  # of 255: standard deviation below which a cloud says nothing of colours
 NEIGHBOURS = 3  # whose distances set the size of a Gaussian, 3DGS
 # Initial sizes as fractions of the distance to the nearest camera. A lone point, far from its neighbours, may
 # not cover more than a fifth of a radian; a duplicate point may not vanish (a pixel is about 3e-3 radians).
@@ -137,9 +138,27 @@ def first_model(
     pixels: int,
     view: Callable[[int], View | None],
 ) -> Gaussians:
-    """What Stage I starts with: `scene_gaussians` and `sky_gaussians`. Args: pixels of a panorama."""
+    """What Stage I starts with: `scene_gaussians` and `sky_gaussians`. Args: pixels of a panorama.
+
+    Points that all have about one colour, as of programs that write none, get that of the panoramas.
+    """
+    if len(chosen) and float(scene.colors[chosen].std(axis=0).max()) < COLORLESS:
+        scene = _with_colors(scene, chosen, views, view)
     points, count = scene_gaussians(scene, chosen, more, config.initial_opacity), config.sky.number(pixels)
     return concatenate(points, sky_gaussians(scene, config.sky, count, views, view)) if count else points
+
+
+def _with_colors(
+    scene: Scene, chosen: NDArray[np.int64], views: Sequence[int], view: Callable[[int], View | None]
+) -> Scene:
+    """The scene, whose chosen points have the colour of their pixels in the nearest of the views."""
+    colors = scene.colors.copy()
+    _, nearest = cKDTree(scene.centers[list(views)]).query(scene.points[chosen])
+    for place in np.unique(nearest):
+        rows = chosen[nearest == place]
+        found = _colors(scene, scene.points[rows], [views[place]], view)
+        colors[rows] = np.rint(255 * found.clip(0, 1))
+    return replace(scene, colors=colors)
 
 
 def _neighbour_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:
