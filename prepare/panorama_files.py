@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.file_kinds import VIDEOS, describe_left_out
+from panolog.prepare.file_kinds import VIDEOS, converted_here, describe_left_out
 from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
@@ -70,7 +70,7 @@ def look_into(folder: Path, used: Collection[str] = ()) -> FolderContent:
     That are files of other kinds than images, and what systems add: hidden files, such as macOS's
     `._NAME.jpg`, hidden folders, such as `.thumbnails`, and thumbnails of network disks.
 
-    Args: used, suffixes in lower case of files that are read as well.
+    Args: used, suffixes in lower case of files that are read as well. Those of pictures are images.
     """
     files, hidden, seen = list[Path](), list[str](), set[Path]()
     for place, folders, names in os.walk(folder, followlinks=True):
@@ -89,7 +89,8 @@ def look_into(folder: Path, used: Collection[str] = ()) -> FolderContent:
                 files.append(path)
             elif path.suffix.lower() in SUFFIXES:
                 hidden.append(path.relative_to(folder).as_posix())
-    images = [path for path in files if path.suffix.lower() in SUFFIXES and path.is_file()]
+    kinds = {*SUFFIXES, *converted_here().intersection(used)}
+    images = [path for path in files if path.suffix.lower() in kinds and path.is_file()]
     videos = [path for path in files if path.suffix.lower() in VIDEOS and path.is_file()]
     left_out = describe_left_out(sorted(it for it in files if it.suffix.lower() not in used), folder)
     if hidden:

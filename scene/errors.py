@@ -20,6 +20,7 @@ PACKAGES = {  # a module: its name for people, and the extra of pyproject.toml
     "uvicorn": ("uvicorn", "dashboard"),
     "OpenEXR": ("OpenEXR", "export"),
     "pyproj": ("pyproj", "export"),
+    "pi_heif": ("pi-heif", "formats"),
 }
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import av
 
-from panolog.prepare.file_kinds import VIDEOS
+from panolog.prepare.file_kinds import VIDEOS, converted_here
 from panolog.prepare.panorama_files import look_into, pictures_below
 from panolog.prepare.stitching.pictures import INSP
 from panolog.prepare.video.lenses import first_lens
@@ -81,7 +81,9 @@ def _pictures(folder: Path) -> list[Path]:
     """The pictures of a folder, also those of two lenses, in the natural order of their names."""
     inner = pictures_below(folder)
     raw = [it for it in inner.rglob("*") if it.suffix.lower() == INSP and not it.name.startswith(".")]
-    return sorted({*look_into(inner).images, *raw}, key=lambda it: natural_key(it.as_posix()))
+    return sorted(
+        {*look_into(inner, converted_here()).images, *raw}, key=lambda it: natural_key(it.as_posix())
+    )
 
 
 def _without_companions(sources: Sequence[Source]) -> tuple[list[Source], list[str]]:

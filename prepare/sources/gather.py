@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
+from panolog.prepare.file_kinds import converted_here
 from panolog.prepare.panorama_files import (
     SUFFIXES,
     LayerFiles,
@@ -19,6 +20,7 @@ from panolog.prepare.panorama_files import (
     masks_among,
     pictures_below,
 )
+from panolog.prepare.sources.convert import as_png
 from panolog.prepare.sources.find import Source, Sources
 from panolog.prepare.sources.sizes import to_one_size
 from panolog.prepare.stitching.lenses import Up
@@ -157,7 +159,7 @@ def _stitched(
     lines = [f"{some_of(others)}: left out, as pictures are taken from {given}"] if others else []
     pictures = raw_pictures(given)
     if not pictures:
-        return folder, [*lines, *look_into(given).left_out]
+        return folder, [*lines, *look_into(given, converted_here()).left_out]
     stitch_pictures(pictures, given, place / "stitched", up=up, progress=progress, note=note)
     return place / "stitched", [*lines, *look_into(given, {INSP}).left_out]
 
@@ -185,6 +187,7 @@ def _completed(
     panoramas = [row.panorama for row in rows]
     layers = {layer: [row.layers.get(layer) for row in rows] for layer in _LAYERS}
     kept, layers, lines = without_copies(panoramas, layers, least, known)
+    kept = as_png(kept, folder.with_name("converted"), progress)
     return _rows(complete_panoramas(kept, folder, progress), layers), lines
 
 
@@ -207,7 +210,7 @@ def panoramas_in_folder(
     if not source.is_dir():
         raise SceneError(f"{source}: there is no such folder or video")
     inner = pictures_below(source)
-    content = look_into(inner)
+    content = look_into(inner, converted_here())
     images = [path for path in content.images if path.relative_to(inner).parts[0] not in _LAYERS]
     among = masks_among(images)
     files = [path for path in images if path not in among.values()]

@@ -37,8 +37,8 @@ def test_links_are_followed_and_what_systems_add_is_left_out(tmp_path: Path) -> 
 KINDS = {
     "insp": "a photograph of two fisheye lenses .*; stitch it",
     "insv": "a video of two lenses; stitch it",
-    "DNG": "a camera's raw data; develop it to TIFF or JPEG",
-    "heic": "HEIC; convert it with `heif-convert",
+    "DNG": "a camera's raw data; develop all alike to TIFF or JPEG",
+    "heic": r"HEIC; pip install 'panolog\[formats\]' reads it; or convert it: `heif-convert",
     "jfif": "a JPEG; rename it to NAME.jpg",
     "avif": "AVIF; convert it with `avifdec",
     "jxl": "JPEG XL; convert it with `djxl",
@@ -61,7 +61,7 @@ def test_other_kinds_are_counted_and_named(kind: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("a.heic", "HEIC; convert it"),
+        ("a.heic", "HEIC; pip install"),
         ("a.zip", "an archive; unpack it, and"),
         ("a.jpg", "is one picture; give the folder"),
     ],

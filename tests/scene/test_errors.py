@@ -58,7 +58,7 @@ def distributions(extra: str) -> set[str]:
 
 def distribution(module: str) -> str:
     """What brings a module; a few do not list theirs, and have its name."""
-    return known().get(module, [module])[0].lower()
+    return known().get(module, [module])[0].lower().replace("_", "-")
 
 
 @cache

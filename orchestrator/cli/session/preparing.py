@@ -185,14 +185,16 @@ def _look_at(given: Sequence[Path]) -> tuple[bool, int, int, bool]:
 def _sizes(panoramas: Sequence[PanoramaFile]) -> Iterator[tuple[Path, int, int]]:
     """The file, width and height of each panorama. Raises SceneError if the first shows fisheye circles."""
     from panolog.prepare.panorama_files import load_resized
+    from panolog.prepare.sources.convert import displayed_size, is_converted
     from panolog.prepare.world.cropped import whole_size
     from panolog.scene.image_files import read_info
 
-    first = read_info(panoramas[0].path)
-    if first.width == 2 * first.height:
+    first = None if is_converted(panoramas[0].path) else read_info(panoramas[0].path)
+    if first is not None and first.width == 2 * first.height:
         load_resized(panoramas[0].path, 256)  # as all show them, they are refused at once
     for panorama in panoramas:
-        yield panorama.path, *whole_size(panorama.path)
+        size = displayed_size if is_converted(panorama.path) else whole_size
+        yield panorama.path, *size(panorama.path)
 
 
 def check_output(root: Path, settings: Settings) -> None:

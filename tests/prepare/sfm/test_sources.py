@@ -111,10 +111,10 @@ def test_what_is_left_out_is_in_the_refusal(tmp_path: Path) -> None:
     folder = tmp_path / "images"
     _pictures(folder)
     (folder / "0.png").rename(folder / "0.insp")
-    (folder / "2.HEIC").touch()
+    (folder / "2.jxl").touch()
     lines = (
         r"1 file \(0\.insp\): left out, each a photograph of two fisheye",
-        r"1 file \(2\.HEIC\): left out, each HEIC; convert it with `heif",
+        r"1 file \(2\.jxl\): left out, each JPEG XL; convert it with `djxl",
     )
     words = "2 panoramas .*; at least 3 are needed; " + ".*; ".join(lines)
     with pytest.raises(InputError, match=words):
