@@ -111,6 +111,9 @@ def _decoded(path: Path, data: bytes, flags: int) -> NDArray[Any]:
         raise _truncated(path)
     if pixels is None:
         kind = kind_of(data)
+        tiff = data.startswith(_TIFF) and flags != cv2.IMREAD_UNCHANGED  # one of 32 bits has no colours
+        if tiff and (bits := 8 * _decoded(path, data, cv2.IMREAD_UNCHANGED).itemsize) > _BITS:
+            raise ImageError(f"{path}: {bits} bits a channel; save it with 8 or 16 bits")
         named = f"it is {kind}, whatever its name says; save it as JPEG or PNG" if kind else None
         raise ImageError(
             f"{path}: cannot be decoded; {named or 'the image is damaged or of an unknown format'}"

@@ -9,7 +9,7 @@ from PIL import Image
 
 from panolog.scene import image_files
 from panolog.scene.errors import ImageError, InputError
-from panolog.scene.image_files import check_images, decode_panorama, read_info
+from panolog.scene.image_files import check_images, decode, decode_panorama, read_info
 from panolog.scene.pictures.headers import ImageInfo, read_header
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
@@ -155,6 +155,9 @@ def test_32_bits_are_refused_by_name(kind: type, tmp_path: Path) -> None:
     cv2.imwrite(str(path), PIXELS.astype(kind))
     with pytest.raises(InputError, match=r"a\.tif: 32 bits a channel; save it with 8 or 16 bits"):
         check_images([path])
+    if kind is np.float32:
+        with pytest.raises(InputError, match=r"a\.tif: 32 bits a channel; save it with 8 or 16 bits"):
+            decode(path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
 
 @pytest.mark.parametrize(
