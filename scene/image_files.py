@@ -110,14 +110,12 @@ def _decoded(path: Path, data: bytes, flags: int) -> NDArray[Any]:
     if pixels is not None and data.startswith(_JPEG) and is_cut(data, pixels, flags):
         raise _truncated(path)
     if pixels is None:
-        kind = kind_of(data)
         tiff = data.startswith(_TIFF) and flags != cv2.IMREAD_UNCHANGED  # one of 32 bits has no colours
         if tiff and (bits := 8 * _decoded(path, data, cv2.IMREAD_UNCHANGED).itemsize) > _BITS:
             raise ImageError(f"{path}: {bits} bits a channel; save it with 8 or 16 bits")
-        named = f"it is {kind}, whatever its name says; save it as JPEG or PNG" if kind else None
-        raise ImageError(
-            f"{path}: cannot be decoded; {named or 'the image is damaged or of an unknown format'}"
-        )
+        kind, why = kind_of(data), "the image is damaged or of an unknown format"
+        why = f"it is {kind}, whatever its name says; save it as JPEG or PNG" if kind else why
+        raise ImageError(f"{path}: cannot be decoded; {why}")
     return pixels
 
 
