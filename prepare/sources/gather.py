@@ -187,8 +187,8 @@ def _completed(
     panoramas = [row.panorama for row in rows]
     layers = {layer: [row.layers.get(layer) for row in rows] for layer in _LAYERS}
     kept, layers, lines = without_copies(panoramas, layers, least, known)
-    kept = as_png(kept, folder.with_name("converted"), progress)
-    return _rows(complete_panoramas(kept, folder, progress), layers), lines
+    kept = as_png(kept, folder.with_name("converted"), part_of(progress, 0, 2))
+    return _rows(complete_panoramas(kept, folder, part_of(progress, 1, 2)), layers), lines
 
 
 def _in_order(rows: Sequence[_Row]) -> list[_Row]:

@@ -104,10 +104,10 @@ def test_files_of_second_lenses_and_previews_are_no_videos_of_their_own(tmp_path
 
 
 def test_what_is_no_video_in_a_folder_of_videos_is_named(tmp_path: Path) -> None:
-    file(tmp_path / "a.mp4"), file(tmp_path / "b.mp4"), file(tmp_path / "c.360"), file(tmp_path / "d.heic")
+    file(tmp_path / "a.mp4"), file(tmp_path / "b.mp4"), file(tmp_path / "c.360"), file(tmp_path / "d.jxl")
     found = find_sources([tmp_path])
     assert [source.label for source in found.all] == ["a", "b"]
-    assert [line.partition(":")[0] for line in found.left_out] == ["1 file (c.360)", "1 file (d.heic)"]
+    assert [line.partition(":")[0] for line in found.left_out] == ["1 file (c.360)", "1 file (d.jxl)"]
 
 
 def test_a_folder_of_pictures_is_one_source_whatever_videos_are_in_it(tmp_path: Path) -> None:
