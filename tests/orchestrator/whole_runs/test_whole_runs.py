@@ -48,7 +48,7 @@ import json, os, sys
 from dataclasses import dataclass, replace
 from threading import Event
 from panolog.orchestrator.cli import app
-from panolog.orchestrator.cli.session import session
+from panolog.orchestrator.cli.session import driving
 from panolog.orchestrator.engine.driver.driver import Driver
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.training.trainer import TrainSpec
@@ -88,7 +88,7 @@ def driver(job, journal, pool, hooks, stop):
     journal.on_change = on_change
     return Driver(job, journal, pool, replace(hooks, on_start=wait), stop)
 
-session.Driver = driver
+driving.Driver = driver
 app.main()
 """
 ACCIDENTS = (("CheckpointSaved", "coarse"), ("CheckpointSaved", "block/000"), ("ViewEvaluated", "eval"))

@@ -41,7 +41,7 @@ SETTINGS = tuple(word for setting in SETS for word in ("--set", setting))
 SCRIPT = """
 import sys
 from panolog.orchestrator.cli import app
-from panolog.orchestrator.cli.session import session
+from panolog.orchestrator.cli.session import driving
 from panolog.orchestrator.engine.driver.driver import Driver
 
 blocks, cut = set(), []
@@ -68,7 +68,7 @@ def driver(job, journal, pool, hooks, stop):
     journal.on_change = on_change
     return Driver(job, journal, pool, hooks, stop)
 
-session.Driver = driver
+driving.Driver = driver
 app.main()
 """
 # What a service manager does: a worker that ends because it was given up is started again.
