@@ -25,7 +25,7 @@ _REACHES = np.deg2rad(np.arange(92.5, 106.0, 0.5))  # from the axis to the edge 
 _COARSE = 720  # columns of the ring in which the lenses are first turned against each other
 _COARSE_HALF = np.deg2rad(4.0)  # of its rows, from the seam
 _FINEST = 8192  # columns of the ring in which points are followed
-_EDGE = np.deg2rad(0.7)  # at the edge of a circle that is dark and blurred
+EDGE = np.deg2rad(0.7)  # at the edge of a circle that is dark and blurred
 _ROUNDS = 5
 _CORNERS = 800  # points of a picture, at most
 _FEWEST, _SECTORS, _FEWEST_SECTORS = 60, 12, 7  # points in all, and parts of the ring that have some
@@ -100,7 +100,7 @@ def show(pair: Pair, side: int, picture: Picture, directions: Array) -> tuple[Pi
     pixels, angle = pair.lenses[side].project(directions)
     maps = (pixels[..., 0] - 0.5).astype(np.float32), (pixels[..., 1] - 0.5).astype(np.float32)
     shown = cv2.remap(picture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(shown, np.uint8), pair.shows(pixels, angle, _EDGE)
+    return np.asarray(shown, np.uint8), pair.shows(pixels, angle, EDGE)
 
 
 def follow(pair: Pair, both: Lenses) -> Points:
@@ -122,7 +122,7 @@ def follow(pair: Pair, both: Lenses) -> Points:
     start, end = (it[kept, 0].astype(np.float64) + 0.5 for it in (corners, found))
     seen = [_directions(at, columns, len(directions), half) for at in (start, end)]
     pixels = [lens.project(rays) for lens, rays in zip(pair.lenses, seen, strict=True)]
-    valid = np.logical_and(*(pair.shows(*it, _EDGE / 2) for it in pixels))
+    valid = np.logical_and(*(pair.shows(*it, EDGE / 2) for it in pixels))
     return Points(pixels[0][0][valid], pixels[1][0][valid])
 
 

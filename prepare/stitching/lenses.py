@@ -86,6 +86,7 @@ class Pair:
     lenses: tuple[Lens, Lens]
     size: tuple[int, int]  # width and height of the picture of each
     reach: FiniteFloat  # radians from its axis up to which a lens shows something
+    fall: tuple[FiniteFloat, ...] = ()  # of light towards the rim: see `light`
     up: Up = "up"  # where up is in the circle of the first lens
     camera: str = ""  # that made the pictures, by their EXIF
     error: FiniteFloat = 0.0  # median difference of the two in what both show, in degrees
@@ -105,6 +106,14 @@ class Pair:
         one, other = (lens.scaled(factor) for lens in self.lenses)
         size = (max(1, round(self.size[0] * factor)), max(1, round(self.size[1] * factor)))
         return replace(self, lenses=(one, other), size=size)
+
+    def light(self, angle: Array) -> Array:
+        """Values of a lens's picture over those at its middle, at angles from the axis in radians.
+
+        The logarithm has a term of each of `fall`, with even powers of the angle over `reach`.
+        """
+        square = (angle / self.reach) ** 2
+        return np.asarray(np.exp(-np.polynomial.polynomial.polyval(square, (0.0, *self.fall))))
 
     def shows(self, pixels: Array, angle: Array, margin: float = 0.0) -> NDArray[np.bool_]:
         """Whether a lens shows what it projects to (..., 2) pixels at angles (...); margin in radians."""

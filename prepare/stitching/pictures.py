@@ -14,6 +14,7 @@ from panolog.prepare.provenance import MAX_BYTES
 from panolog.prepare.stitching.calibrate import AGREED, Lenses, OverlapError, calibrate, disagreement
 from panolog.prepare.stitching.circles import CircleError, Picture, halves
 from panolog.prepare.stitching.lenses import APPROXIMATE, Pair, Up, pairs_as_json, read_pairs
+from panolog.prepare.stitching.light import fall_off
 from panolog.prepare.stitching.stitch import Stitcher
 from panolog.prepare.world.exif import camera_of, essential_exif
 from panolog.prepare.world.image_blocks import EXIF_HEAD, with_segments
@@ -98,6 +99,7 @@ def lenses_in(source: Path, size: tuple[int, int], pictures: Sequence[Lenses]) -
     """
     try:
         pair = calibrate(pictures)
+        pair = replace(pair, fall=fall_off(pair, pictures))
     except (CircleError, OverlapError) as error:
         raise SceneError(
             f"{source}: its two fisheye circles cannot be stitched: {error}; or {STITCH_THERE}"
@@ -190,5 +192,8 @@ def reduced(picture: Picture) -> Lenses:
 
 
 def _spread(count: int) -> list[int]:
-    """Rows of up to `_SAMPLED` of so many, from the first to the last."""
-    return sorted({round(float(it)) for it in np.linspace(0, count - 1, min(count, _SAMPLED))})
+    """Rows of up to `_SAMPLED` of so many, from the first to the last, and two that follow each other."""
+    if count <= _SAMPLED:
+        return list(range(count))
+    first = np.linspace(0, count - 2, _SAMPLED // 2).round().astype(int)
+    return [int(row) + turn for row in first for turn in (0, 1)]

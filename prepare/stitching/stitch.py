@@ -8,17 +8,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.stitching.calibrate import Lenses, ring, show
+from panolog.prepare.stitching.calibrate import Lenses
 from panolog.prepare.stitching.circles import Picture, Pixel
 from panolog.prepare.stitching.lenses import Pair, Up
+from panolog.prepare.stitching.light import gains
 
 _BLEND = np.deg2rad(2.0)  # on either side of the seam: what is near is double there
 _ROWS = 128  # of a panorama that are computed together
 _TURNS: dict[Up, int] = {"up": 0, "right": 90, "down": 180, "left": 270}  # degrees clockwise
-_COLUMNS = 1024  # of the ring in which the brightness of both lenses is compared
-_DARK, _BRIGHT = 16, 240  # of 255: outside of these, brightness is cut off
-_MOST = 4.0  # by which two lenses differ in brightness, at most
-_FULL = 255  # weight of a lens where it is alone
 
 
 @dataclass(frozen=True)
@@ -28,7 +25,7 @@ class _Part:
     rows: slice
     columns: NDArray[np.intp]
     maps: tuple[NDArray[Any], NDArray[Any]]  # as OpenCV's `remap` takes them
-    weight: Picture  # (rows, columns)
+    weight: NDArray[np.float16]  # (rows, columns) its share, over its light there
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ class Stitcher:
             mixed = np.zeros((rows.stop - rows.start, *shape[1:]), np.float32)
             for part, picture, factor in zip(parts, both, factors, strict=True):
                 found = cv2.remap(picture, *part.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-                weight = part.weight.astype(np.float32) / _FULL
+                weight = part.weight.astype(np.float32)
                 weight = weight.reshape(weight.shape + (1,) * (found.ndim - 2))
                 mixed[:, part.columns] += found * (weight * np.asarray(factor, np.float32))
             whole[rows] = np.clip(mixed + 0.5, 0, highest).astype(whole.dtype)
@@ -87,27 +84,12 @@ class Stitcher:
         first = np.where(
             there & there_too, first, np.where(there_too, 0.0, np.where(there, 1.0, first.round()))
         )
-        weight = np.rint(first * _FULL).astype(np.uint8)
-        weights = (weight, np.asarray(_FULL - weight, np.uint8))
         found = []
-        for (pixels, _), share in zip(shown, weights, strict=True):
-            columns = np.flatnonzero(share.any(axis=0))
+        for (pixels, angle), share in zip(shown, (first, 1 - first), strict=True):
+            weight = (share / self.pair.light(angle)).astype(np.float16)
+            columns = np.flatnonzero(weight.any(axis=0))
             at = (pixels[:, columns] - 0.5).astype(np.float32)
             maps = cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)
             one, other = (np.asarray(it) for it in maps)
-            found.append(_Part(rows, columns, (one, other), share[:, columns]))
+            found.append(_Part(rows, columns, (one, other), weight[:, columns]))
         return found[0], found[1]
-
-
-def gains(pair: Pair, both: Lenses) -> NDArray[np.float64]:
-    """(3,) by which the first lens is darker than the second one, in the median of what both show."""
-    directions = ring(_COLUMNS, pair.reach - np.pi / 2)
-    (one, there), (other, there_too) = (show(pair, side, both[side], directions) for side in range(2))
-    common = there & there_too
-    found = np.ones(3)
-    for channel in range(3):
-        a, b = one[common, channel].astype(np.float64), other[common, channel].astype(np.float64)
-        used = (np.minimum(a, b) > _DARK) & (np.maximum(a, b) < _BRIGHT)
-        if used.any():
-            found[channel] = np.clip(np.exp(np.median(np.log(b[used] / a[used]))), 1 / _MOST, _MOST)
-    return found

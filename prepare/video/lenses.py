@@ -36,6 +36,7 @@ from panolog.prepare.video.streams import (
 )
 
 _SAMPLED = 8  # frames in which the lenses are looked for
+_LATER = 1.0  # seconds from the first to the second of two of these
 _SAME = 0.004  # seconds between two frames that were taken together, at most
 _FAR = 100  # frames that are decoded to get to one, at most
 _TICK = Fraction(1, 1000)  # the time base in which frames are joined
@@ -247,7 +248,8 @@ def _samples(
     converter, seconds = Converter(), max(0, container.duration or 0) / av.time_base
     begin = (container.start_time or 0) / av.time_base
     for row in range(_SAMPLED if seconds else 1):
-        wanted = begin + seconds * row / _SAMPLED
+        # Two that follow each other show the same things.
+        wanted = begin + seconds * (row - row % 2) / _SAMPLED + row % 2 * min(_LATER, seconds / _SAMPLED)
         if row:
             container.seek(round(wanted * av.time_base))
             if other is not None:

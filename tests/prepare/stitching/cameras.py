@@ -1,11 +1,18 @@
 """A camera of two fisheye lenses that are known: double spheres, as of Usenko and others (3DV 2018)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
+from panolog.prepare.stitching.calibrate import ring
+from panolog.prepare.stitching.lenses import Pair
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -23,6 +30,8 @@ class DoubleSphere:
     rotation: Array  # (3, 3) from body axes
     reach: float  # degrees from the axis
     gain: float = 1.0
+    rim: float = 1.0  # values at `reach` over those at its middle: a cos⁴ of a power of the angle
+    steep: float = 1.0  # that power
 
     def project(self, directions: Array) -> tuple[Array, Array]:
         """(..., 2) pixels, and (...) degrees from the axis."""
@@ -52,8 +61,10 @@ class DoubleSphere:
         shown = cv2.remap(panorama, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP).astype(np.float64)
         edge = np.interp(np.deg2rad(self.reach), angles, radii)
         lit = np.clip(edge - radius + 0.5, 0, 1)[..., None]
+        outer = (angle / np.deg2rad(self.reach)) ** self.steep
+        falls = np.cos(outer * np.arccos(self.rim**0.25))[..., None] ** 4
         grain = np.random.default_rng(seed).normal(0, noise, shown.shape)
-        return np.asarray(np.clip(shown * self.gain * lit + grain + 2, 0, 255), np.uint8)
+        return np.asarray(np.clip(shown * self.gain * falls * lit + grain + 2, 0, 255), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -70,15 +81,34 @@ class Camera:
         )
 
 
-def camera(size: int = 512, *, turned: float = 0.0, tilt: float = 1.0, gain: float = 1.2) -> Camera:
+def camera(
+    size: int = 512,
+    *,
+    turned: float = 0.0,
+    tilt: float = 1.0,
+    gain: float = 1.2,
+    rim: float = 1.0,
+    steep: float = 1.0,
+) -> Camera:
     """Lenses that differ in centre, radius, projection and brightness; `tilt` and `turned` in degrees.
 
-    Args: tilt, of the second lens against the first; turned, its picture about its axis; gain, of its light.
+    Args: tilt, of the second lens against the first; turned, its picture about its axis; gain, of its light;
+    rim, steep: of both.
     """
     tilted = Rotation.from_rotvec(np.deg2rad(tilt) * np.array([0.6, 0.64, 0.48])).as_matrix()
     about = Rotation.from_rotvec([0.0, 0.0, np.deg2rad(turned)]).as_matrix()
     half = size / 2
-    one = DoubleSphere((half * 1.006, half * 0.992), half * 0.478, -0.20, 0.59, np.eye(3), 98.5, gain**-0.5)
+    one = DoubleSphere(
+        (half * 1.006, half * 0.992),
+        half * 0.478,
+        -0.20,
+        0.59,
+        np.eye(3),
+        98.5,
+        gain**-0.5,
+        rim,
+        steep,
+    )
     other = DoubleSphere(
         (half * 0.989, half * 1.010),
         half * 0.475,
@@ -87,5 +117,40 @@ def camera(size: int = 512, *, turned: float = 0.0, tilt: float = 1.0, gain: flo
         about @ tilted @ BEHIND,
         98.5,
         gain**0.5,
+        rim,
+        steep,
     )
     return Camera((one, other), size)
+
+
+def errors(known: Camera, found: Pair, width: int) -> tuple[Array, Array]:
+    """(2, N) how far both lenses are from the true ones in what both show, and (N,) from each other.
+
+    Args: width, of the panorama in whose pixels that is.
+    """
+    directions = ring(720, np.deg2rad(8)).reshape(-1, 3)
+    pixels, angles = zip(*(lens.project(directions) for lens in known.lenses), strict=True)
+    both = (angles[0] < known.lenses[0].reach - 0.5) & (angles[1] < known.lenses[1].reach - 0.5)
+    seen = [lens.directions(at[both]) for lens, at in zip(found.lenses, pixels, strict=True)]
+    scale = width / 2 / np.pi
+    off = np.stack([np.linalg.norm(it - directions[both], axis=1) for it in seen])
+    return off * scale, np.linalg.norm(seen[0] - seen[1], axis=1) * scale
+
+
+def write(path: Path, *lenses: Sequence[Image]) -> Path:
+    """A video with a stream for each of `lenses`, H.264 and nearly without loss, a key frame every eighth."""
+    height, width = lenses[0][0].shape[:2]
+    with av.open(str(path), "w", format="mp4") as container:
+        streams = []
+        for _ in lenses:
+            stream = container.add_stream("libx264", rate=30, options={"crf": "12", "g": "8"})
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            streams.append(stream)
+        for number, pictures in enumerate(zip(*lenses, strict=True)):
+            for stream, picture in zip(streams, pictures, strict=True):
+                frame = av.VideoFrame.from_ndarray(picture, "bgr24")
+                frame.pts, frame.time_base = number, Fraction(1, 30)
+                container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode(None))
+    return path

@@ -1,18 +1,21 @@
 """Lenses found from the pictures alone are those of a camera that is known."""
 
+from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from panolog.prepare.stitching.calibrate import OverlapError, calibrate, disagreement, ring
+from panolog.prepare.stitching.calibrate import OverlapError, calibrate, disagreement
 from panolog.prepare.stitching.circles import CircleError, Picture, find_circle, halves
-from panolog.prepare.stitching.lenses import Array, Pair
-from panolog.prepare.stitching.stitch import Stitcher, gains
+from panolog.prepare.stitching.light import gains
+from panolog.prepare.stitching.pictures import lenses_in
+from panolog.prepare.stitching.stitch import Stitcher
 from panolog.scene.image_files import decode_colors
 from tests.data import shared
-from tests.prepare.stitching.cameras import Camera, camera
+from tests.prepare.stitching.cameras import Camera, camera, errors
 from tests.prepare.video.videos import Shot, render
 
 pytestmark = pytest.mark.system
@@ -28,20 +31,6 @@ def panoramas(count: int) -> list[Picture]:
 
 def taken(known: Camera, views: list[Picture]) -> list[tuple[Picture, Picture]]:
     return [halves(known.picture(view, seed)) for seed, view in enumerate(views)]
-
-
-def errors(known: Camera, found: Pair, width: int) -> tuple[Array, Array]:
-    """(2, N) how far both lenses are from the true ones in what both show, and (N,) from each other.
-
-    Args: width, of the panorama in whose pixels that is.
-    """
-    directions = ring(720, np.deg2rad(8)).reshape(-1, 3)
-    pixels, angles = zip(*(lens.project(directions) for lens in known.lenses), strict=True)
-    both = (angles[0] < known.lenses[0].reach - 0.5) & (angles[1] < known.lenses[1].reach - 0.5)
-    seen = [lens.directions(at[both]) for lens, at in zip(found.lenses, pixels, strict=True)]
-    scale = width / 2 / np.pi
-    off = np.stack([np.linalg.norm(it - directions[both], axis=1) for it in seen])
-    return off * scale, np.linalg.norm(seen[0] - seen[1], axis=1) * scale
 
 
 @pytest.mark.parametrize("turned", [0.0, 90.0, 178.0])
@@ -93,6 +82,21 @@ def test_the_panorama_is_the_true_one_and_even() -> None:
     turned = calibrate(taken(camera(512, turned=90), views))
     again = Stitcher(turned, SMALL).panorama(taken(camera(512, turned=90), views[:1])[0])
     assert decibels(again, stitched) > 30  # how a circle is turned does not matter
+
+
+@pytest.mark.parametrize(("rim", "steep"), [(1.0, 1), (0.8, 1), (0.6, 1), (0.6, 2)])
+def test_the_fall_off_of_light_is_found_and_taken_back(rim: float, steep: int) -> None:
+    views = panoramas(4)
+    pictures = taken(camera(512, rim=rim, steep=steep), views)
+    found = lenses_in(Path("folder"), (512, 512), pictures)
+    outer = np.linspace(0, 1, 20)
+    true = np.cos(outer**steep * np.arccos(rim**0.25)) ** 4
+    light = found.light(outer * np.deg2rad(98.5))
+    assert np.allclose(light, true, atol=0.04) and (np.diff(light) <= 0).all()
+    assert np.allclose(gains(found, pictures[0]), 1.2, atol=0.02)
+    if rim < 1:
+        lifted, dark = (Stitcher(it, SMALL).panorama(pictures[0]) for it in (found, replace(found, fall=())))
+        assert decibels(lifted, views[0]) > decibels(dark, views[0]) + 1.5
 
 
 def test_what_is_near_is_left_out_of_the_fit() -> None:

@@ -1,10 +1,8 @@
 """Raw videos of two lenses: both circles in each frame, two streams, two files."""
 
 import json
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -24,7 +22,7 @@ from panolog.scene.image_files import read_info
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
 from tests.orchestrator.cli.program import call, one_line, shown
-from tests.prepare.stitching.cameras import camera
+from tests.prepare.stitching.cameras import camera, write
 from tests.prepare.video.videos import numbers, render, walk
 
 pytestmark = pytest.mark.system
@@ -38,25 +36,6 @@ def walked() -> list[tuple[Image, Image]]:
     """(H, W, 3) panoramas of a walk, and their two circles side by side."""
     known, views = camera(400), [render(it, 1024, bearer=False) for it in walk([0.12] * COUNT)]
     return [(view, known.picture(view, seed)) for seed, view in enumerate(views)]
-
-
-def write(path: Path, *lenses: list[Image]) -> Path:
-    """A video with a stream for each of `lenses`, H.264 and nearly without loss, a key frame every eighth."""
-    height, width = lenses[0][0].shape[:2]
-    with av.open(str(path), "w", format="mp4") as container:
-        streams = []
-        for _ in lenses:
-            stream = container.add_stream("libx264", rate=30, options={"crf": "12", "g": "8"})
-            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            streams.append(stream)
-        for number, pictures in enumerate(zip(*lenses, strict=True)):
-            for stream, picture in zip(streams, pictures, strict=True):
-                frame = av.VideoFrame.from_ndarray(picture, "bgr24")
-                frame.pts, frame.time_base = number, Fraction(1, 30)
-                container.mux(stream.encode(frame))
-        for stream in streams:
-            container.mux(stream.encode(None))
-    return path
 
 
 def raw(kind: str, folder: Path, pictures: list[Image]) -> Path:
