@@ -110,9 +110,10 @@ class Pair:
     def light(self, angle: Array) -> Array:
         """Values of a lens's picture over those at its middle, at angles from the axis in radians.
 
-        The logarithm has a term of each of `fall`, with even powers of the angle over `reach`.
+        The logarithm has a term of each of `fall`, with even powers of the angle over `reach`; beyond that it
+        is constant.
         """
-        square = (angle / self.reach) ** 2
+        square = np.minimum(angle / self.reach, 1) ** 2
         return np.asarray(np.exp(-np.polynomial.polynomial.polyval(square, (0.0, *self.fall))))
 
     def shows(self, pixels: Array, angle: Array, margin: float = 0.0) -> NDArray[np.bool_]:
