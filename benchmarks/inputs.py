@@ -113,11 +113,13 @@ def _rows(options: argparse.Namespace, scratch: Path) -> Iterator[Row]:
             place = re.sub(r"\W", "_", f"{maker.stem}_{case}_{len(group['commands'])}_{number}")
             names = {"case": case, "out": place, "made": f"{place}_made"}
             code, text = _make(maker, group.get("make", "").format(**names), scratch)
+            said = [] if code == 0 else [text]
             for command in () if code else group["commands"].split(" && "):
                 code, text = _run([options.panolog, *command.format(**names).split()], scratch)
+                said.append(text)
                 if code:
                     break
-            yield _judged(group, case, expected, code, text)
+            yield _judged(group, case, expected, code, "\n".join(said))
 
 
 def _make(maker: Path, arguments: str, scratch: Path) -> tuple[int, str]:
