@@ -165,15 +165,13 @@ def say_results(root: Path, state: Any) -> None:
         say("there is no model: the limit has ended the run before its first checkpoint")
         return
     say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")
+    metrics = f"{folder.metrics} ({metrics_line(state.metrics or {}) or NOTHING_HELD_OUT})"
     try:
-        measured = read_measured(folder)
+        if read_measured(folder) is None:
+            metrics = f"are missing; {command('eval', root)} measures them again"
     except InputError as error:
-        say(f"metrics   {error}")
-    else:
-        if measured is None:
-            say(f"metrics   are missing; {command('eval', root)} measures them again")
-        else:
-            say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {}) or NOTHING_HELD_OUT})")
+        metrics = str(error)
+    say(f"metrics   {metrics}")
     if folder.images.is_dir():
         say(f"pictures  {folder.images}")
     if folder.web.is_dir():

@@ -19,7 +19,7 @@ from panolog.orchestrator.runs.config import RESOLVED, RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, command_line, flat, read_json, write_json
 from panolog.orchestrator.runs.reading import WAYS_OUT
 from panolog.orchestrator.runs.records import PreflightSaved, RunBegan, Stored
-from panolog.orchestrator.runs.state import RunState, replay
+from panolog.orchestrator.runs.state import replay
 from panolog.orchestrator.runs.store import read_milestones
 from panolog.scene.errors import ConfigError, RunFolderError, wrong_value
 from panolog.scene.files import SUFFIX
@@ -103,17 +103,19 @@ def read_history(folder: RunFolder) -> list[Stored]:
     Raises InputError as `read_milestones` and `require_history`.
     """
     records = read_milestones(folder.database) if folder.database.exists() else []
-    require_history(folder, replay(records))
+    require_history(folder, begun=any(isinstance(stored.record, RunBegan) for stored in records))
     return records
 
 
-def require_history(folder: RunFolder, state: RunState) -> None:
+def require_history(folder: RunFolder, *, begun: bool) -> None:
     """Raises RunFolderError if run.db is lost, or empty, of a run that has begun to train.
 
     A driver that took it for a new one would train again, over the files of what is finished.
+
+    Args: begun, whether run.db has a record of a driver.
     """
     made = (folder.point_cloud, folder.of(COARSE), folder.preflight)
-    there = [path for path in made if path.exists()] if state.driver is None else []
+    there = [] if begun else [path for path in made if path.exists()]
     if there:
         raise RunFolderError(
             f"{folder.database}: is missing or holds nothing, but the run has made"

@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from panolog.orchestrator.engine.driver.journal import Journal
-from panolog.orchestrator.engine.driver.purse import require_left
+from panolog.orchestrator.engine.driver.purse import require_left, reserve_own
 from panolog.orchestrator.engine.driver.requests import interrupt
 from panolog.orchestrator.engine.stages.outline import write_outline, write_sketch
 from panolog.orchestrator.engine.stages.scenes import divided
@@ -80,6 +80,7 @@ class Preparation:
         Raises InputError if a step cannot be done, the check finds that the scene is wrong, or a limit is
         reached; RunError if a network fails or a process is killed; KeyboardInterrupt at a request to stop.
         """
+        reserve_own(self.journal)
         write_settings(self.folder, self.settings)
         with stoppable(self.folder):
             steps = {Step.SFM: self._find_poses, Step.DEPTH: self._estimate_depth, Step.CHECK: self._check}

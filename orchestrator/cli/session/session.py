@@ -126,7 +126,7 @@ def resume(
     info = run_info.read_info(folder)
     with lock.hold(folder.lock), closing(_opened(folder, info.config)) as database:
         journal = Journal(database, on_change)
-        run_info.require_history(folder, journal.state)
+        run_info.require_history(folder, begun=journal.state.driver is not None)
         budget = (wanted or Wanted()).budget(journal.state)
         if _is_over(journal.state, budget):
             done = journal.state.outcome == Outcome.DONE
@@ -203,9 +203,7 @@ class _Beginning:
         """Makes the scene of a run that was given none, and returns run.json with it. Raises as `make`."""
         if settings is not None:
             from panolog.orchestrator.cli.session.making import Preparation
-            from panolog.orchestrator.engine.driver.purse import reserve_own
 
-            reserve_own(self.journal)
             self.made = Preparation(self.folder, settings, info.config, self.journal).make()
             config = preparing.with_width(self.made.width, info.config)
             info = info.model_copy(update={"scene": preparing.reference(self.made), "config": config})
