@@ -204,9 +204,10 @@ def _binary_cameras(path: Path) -> Iterator[ColmapCamera]:
     cursor = _Cursor(path)
     for _ in range(cursor.count(CAMERA.size)):
         number, model, width, height = cursor.take(CAMERA)
-        if model not in _MODELS | _OTHERS:
+        known = _MODELS.get(model) or _OTHERS.get(model)
+        if known is None:
             raise unknown_camera(f"{path}: camera {number}", f"id {model}")
-        name, parameters = (_MODELS | _OTHERS)[model]
+        name, parameters = known
         params = cursor.take(struct.Struct(f"<{parameters}d"))
         yield _camera(str(path), number, name, (width, height), params)
     cursor.end()

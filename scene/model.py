@@ -13,6 +13,12 @@ from panolog.scene.files import stem_of
 
 Vector: TypeAlias = tuple[float, float, float]
 NO_OFFSET: Vector = (0.0, 0.0, 0.0)
+_PLAIN = 2.0  # of 255: standard deviation of each channel, below which a cloud says nothing of colours
+
+
+def of_one_color(colors: NDArray[np.integer] | NDArray[np.floating]) -> bool:
+    """Whether colours (N, 3) of 0 to 255, one at least, are about the same, as of a cloud that has none."""
+    return float(colors.std(axis=0).max()) < _PLAIN
 
 
 @dataclass(frozen=True, eq=False)

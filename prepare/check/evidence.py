@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from panolog.scene.colmap import read_colmap
 from panolog.scene.image_files import decode_with_alpha
-from panolog.scene.model import Scene
+from panolog.scene.model import Scene, of_one_color
 from panolog.scene.projection import project_to_fractions, project_to_pixels
 from panolog.scene.read import model_folder
 
@@ -16,7 +16,6 @@ Array = NDArray[np.float64]
 MEMORY = 400_000_000  # bytes of decoded panoramas
 MOST_VIEWS, FEWEST_VIEWS = 48, 8
 POINTS = 1500  # of each panorama
-_COLORLESS = 2.0  # of 255: standard deviation below which a cloud says nothing of colours
 _FEW = 20  # points whose colours fit some wrong pose by chance
 _GRID, _BEHIND = 48, 1.2  # columns of a grid of directions; farther than that times the nearest is hidden
 WIDEST = 4096  # pixels; wider panoramas are shrunk
@@ -24,7 +23,7 @@ WIDEST = 4096  # pixels; wider panoramas are shrunk
 
 def is_colorless(colors: NDArray[np.uint8] | Array) -> bool:
     """Whether colours (N, 3) of 0 to 255 say nothing: there are few, or they are all about the same."""
-    return len(colors) < _FEW or float(colors.std(axis=0).max()) < _COLORLESS
+    return len(colors) < _FEW or of_one_color(colors)
 
 
 @dataclass(frozen=True, eq=False)

@@ -81,7 +81,7 @@ def _fits_nowhere(fit: Array, every: Array) -> bool:
 def _color_fits(scene: Scene) -> Array:
     """(K, 2) of `_color_fit`; NaN where it is not known."""
     every = np.full((len(scene.panoramas), 2), np.nan)
-    if len(scene.points) == 0 or is_colorless(scene.colors):
+    if is_colorless(scene.colors):
         return every
     turns = Rotation.random(_TURNED, random_state=1).as_matrix()
     with ThreadPoolExecutor(initializer=cv2.setNumThreads, initargs=(1,)) as threads:

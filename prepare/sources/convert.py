@@ -19,20 +19,12 @@ from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.provenance import MAX_BYTES
 from panolog.scene.errors import ImageError, SceneError, require
 from panolog.scene.files import atomic, stem_of
+from panolog.scene.pictures.headers import DAMAGE
 from panolog.scene.pictures.profiles import in_srgb
 from panolog.scene.write import Progress, no_progress
 
 _THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama
-_DAMAGE = (
-    SyntaxError,
-    ValueError,
-    LookupError,
-    TypeError,
-    ArithmeticError,
-    OSError,
-    RuntimeError,
-    struct.error,
-)
+_DAMAGE = (*DAMAGE, RuntimeError)  # which libheif raises as well
 _HEAD = 2**20  # bytes in which a file says what its colours are
 _PLAIN = (1, 2, 5, 6)  # primaries of BT.709, unknown, of BT.601: what sRGB is close to
 _HDR = (16, 18)  # transfer functions PQ and HLG

@@ -11,7 +11,6 @@ All of this is optional: anything missing, damaged or impossible is left out.
 
 import io
 import math
-import struct
 import warnings
 from dataclasses import dataclass
 from datetime import datetime
@@ -26,6 +25,7 @@ from PIL import ExifTags, Image
 
 from panolog.prepare.world.image_blocks import Bounded, read_blocks
 from panolog.scene.errors import SceneError
+from panolog.scene.pictures.headers import DAMAGE
 
 _GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
 _XMP = (
@@ -57,7 +57,6 @@ _GPS = (
     ExifTags.GPS.GPSAltitude,
     ExifTags.GPS.GPSAltitudeRef,
 )
-_DAMAGE = (SyntaxError, ValueError, LookupError, TypeError, ArithmeticError, OSError, struct.error)
 
 
 @dataclass(frozen=True)
@@ -170,7 +169,7 @@ def essential_exif(path: Path) -> bytes | None:
             if ExifTags.Base.DateTime in tags:
                 reduced[ExifTags.Base.DateTime] = tags[ExifTags.Base.DateTime]
             return reduced.tobytes().removeprefix(b"Exif\0\0") if len(reduced) else None
-        except _DAMAGE:
+        except DAMAGE:
             return None
 
 
@@ -182,7 +181,7 @@ def camera_of(path: Path) -> str:
             tags = _tags(read_blocks(file)[0])
             serial = tags.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.BodySerialNumber)
             parts = (tags.get(ExifTags.Base.Make), tags.get(ExifTags.Base.Model), serial)
-        except _DAMAGE:
+        except DAMAGE:
             return ""
     return " ".join(text for it in parts if (text := str(it or "").strip("\0 ")[:80]))
 
@@ -193,7 +192,7 @@ def _tags(exif: Bounded | None) -> Image.Exif:
     if exif is not None:
         try:
             tags.load_from_fp(exif)
-        except _DAMAGE:
+        except DAMAGE:
             return Image.Exif()
     return tags
 
@@ -202,7 +201,7 @@ def _packet(tags: Image.Exif) -> bytes | None:
     """The XMP of a TIFF."""
     try:
         return _bytes(tags.get(_XMP_TAG))
-    except _DAMAGE:
+    except DAMAGE:
         return None
 
 
@@ -214,7 +213,7 @@ def _fix(tags: Image.Exif) -> GpsFix | None:
         longitude = _angle(gps[ExifTags.GPS.GPSLongitude], gps.get(ExifTags.GPS.GPSLongitudeRef), "EW")
         if not (abs(latitude) <= 90 and abs(longitude) <= 180) or latitude == longitude == 0:
             return None
-    except _DAMAGE:
+    except DAMAGE:
         return None
     return GpsFix(latitude, longitude, _altitude(gps))
 
@@ -232,7 +231,7 @@ def _angle(parts: Any, reference: Any, names: str) -> float:
 def _altitude(gps: dict[int, Any]) -> float | None:
     try:
         altitude = float(gps[ExifTags.GPS.GPSAltitude])
-    except _DAMAGE:
+    except DAMAGE:
         return None
     reference = _bytes(gps.get(ExifTags.GPS.GPSAltitudeRef))
     below = reference is not None and reference[:1] in (b"\1", b"\3")  # 3: below the ellipsoid, EXIF 3.0
@@ -247,7 +246,7 @@ def _time(tags: Image.Exif) -> datetime | None:
         fraction = str(details.get(ExifTags.Base.SubsecTimeOriginal, "")).strip("\0 ") if taken else ""
         text = str(taken or tags.get(ExifTags.Base.DateTime, ""))[:19]
         time = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
-    except _DAMAGE:
+    except DAMAGE:
         return None
     digits = fraction[:6] if fraction.isascii() and fraction.isdigit() else "0"
     return time.replace(microsecond=int(digits.ljust(6, "0")))
@@ -257,7 +256,7 @@ def _exposure(tags: Image.Exif) -> float | None:
     """The exposure in stops, from the fields themselves or from their APEX values."""
     try:
         details = tags.get_ifd(ExifTags.IFD.Exif)
-    except _DAMAGE:
+    except DAMAGE:
         return None
     base = ExifTags.Base
     time = _within(details.get(base.ExposureTime), 1e-7, 1e4)
@@ -278,7 +277,7 @@ def _within(value: Any, least: float, most: float) -> float | None:
     """A number of EXIF, the first where there are several; None if it is none between the limits."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
-    except _DAMAGE:
+    except DAMAGE:
         return None
     return number if least <= number <= most else None
 
@@ -286,7 +285,7 @@ def _within(value: Any, least: float, most: float) -> float | None:
 def _orientation(tags: Image.Exif) -> int:
     try:
         value = tags.get(ExifTags.Base.Orientation)
-    except _DAMAGE:
+    except DAMAGE:
         return 1
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
@@ -297,7 +296,7 @@ def _parsed(xmp: bytes | None) -> Element | None:
         return None
     try:
         root: Element = fromstring(xmp.strip(b"\0 \t\r\n"), forbid_dtd=True)
-    except _DAMAGE:
+    except DAMAGE:
         return None
     return root
 

@@ -9,7 +9,8 @@ from typing import Any, BinaryIO
 from PIL import ExifTags
 from PIL import TiffImagePlugin as Tiff
 
-_DAMAGE = (SyntaxError, ValueError, LookupError, TypeError, ArithmeticError, OSError, struct.error)
+# What Pillow raises for a damaged file.
+DAMAGE = (SyntaxError, ValueError, LookupError, TypeError, ArithmeticError, OSError, struct.error)
 _CHANNELS = {1: (1,), 2: (3, 4), 6: (3,)}  # of TIFF by photometric interpretation: grey, RGB, YCbCr
 _WEBP = 30  # bytes, with the size in any of its three kinds
 
@@ -37,7 +38,7 @@ def read_header(file: BinaryIO) -> ImageInfo | None:
         if head[:2] in (Tiff.II, Tiff.MM):
             return _tiff(file, head[:8], size)
         return _webp(head, size) if head[8:12] == b"WEBP" else None
-    except _DAMAGE:
+    except DAMAGE:
         return None
 
 
@@ -57,7 +58,7 @@ def without_orientation(data: bytes) -> bytes:
 
 
 def _tiff(file: BinaryIO, head: bytes, size: int) -> ImageInfo | None:
-    """Of the first directory. Raises one of `_DAMAGE`."""
+    """Of the first directory. Raises one of `DAMAGE`."""
     tags: Any = Tiff.ImageFileDirectory_v2(head)
     file.seek(tags.next)
     tags.load(file)

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
+from panolog.scene.pictures.headers import DAMAGE
+
 _JPEG, _JPEG_SCAN, _APP2, _JPEG_HEAD = b"\xff\xd8", 0xDA, 0xE2, b"ICC_PROFILE\0"
 _PNG, _TIFF = b"\x89PNG\r\n\x1a\n", (b"II*\0", b"MM\0*")
 _TIFF_TAG = 34675  # InterColorProfile
@@ -22,16 +24,7 @@ _LARGEST = 2**24  # bytes of a profile; those with tables have some megabytes
 _MODES = {"RGB": "RGB", "GRAY": "L"}  # of Pillow, by the colours of a profile
 _CLOSE = 1  # of 255: a profile that changes no colour by more is sRGB's own
 _PIXELS = 2**20  # that are converted at a time
-_DAMAGE = (
-    SyntaxError,
-    ValueError,
-    LookupError,
-    TypeError,
-    ArithmeticError,
-    OSError,
-    struct.error,
-    zlib.error,
-)
+_DAMAGE = (*DAMAGE, zlib.error)
 
 
 class _Conversion(NamedTuple):

@@ -16,13 +16,12 @@ from panolog.partition.bounds import baseline, strays
 from panolog.partition.cells import Volume
 from panolog.scene.gaussians import SH_C0, SH_REST, Gaussians, concatenate, logit
 from panolog.scene.images import View, pixels, unexposed
-from panolog.scene.model import Scene
+from panolog.scene.model import Scene, of_one_color
 from panolog.scene.projection import fibonacci_sphere, project_to_pixels
 from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.surfaces import NO_POINTS, Points
 
 DARKEST = 0.25 / 255  # initial: colours are clamped at 0, where they have no gradient and would stay black
-COLORLESS = 2.0  # of 255: standard deviation below which a cloud says nothing of colours
 NEIGHBOURS = 3  # whose distances set the size of a Gaussian, 3DGS
 # Initial sizes as fractions of the distance to the nearest camera. A lone point, far from its neighbours, may
 # not cover more than a fifth of a radian; a duplicate point may not vanish (a pixel is about 3e-3 radians).
@@ -142,7 +141,7 @@ def first_model(
 
     Points that all have about one colour, as of programs that write none, get that of the panoramas.
     """
-    if len(chosen) and float(scene.colors[chosen].std(axis=0).max()) < COLORLESS:
+    if len(chosen) and of_one_color(scene.colors[chosen]):
         scene = _with_colors(scene, chosen, views, view)
     points, count = scene_gaussians(scene, chosen, more, config.initial_opacity), config.sky.number(pixels)
     return concatenate(points, sky_gaussians(scene, config.sky, count, views, view)) if count else points
