@@ -60,7 +60,7 @@ def photograph(scene: Scene, folder: Path, known: Camera) -> list[Path]:
 
 
 def overlap(source: str, stitched: Path, known: Camera) -> Overlap:
-    """Of the lenses in the folder of stitched panoramas."""
+    """How far the lenses of a folder of stitched panoramas are from the known ones, in the overlap."""
     (found,) = read_pairs(stitched / "lenses.json")
     off, apart = errors(known, found.resized((known.size, known.size)), FULL)
     return Overlap(source, float(np.sqrt((off**2).mean())), float(off.max()), float(apart.max()))
@@ -109,7 +109,7 @@ def quality(name: str, scene: Scene, truth: Scene, options: argparse.Namespace) 
 
 
 def measure(options: argparse.Namespace) -> report.Report:
-    """All of it."""
+    """Stitches stills and a video of a scene, and trains on true and on stitched panoramas."""
     folder: Path = options.output
     truth = bare(panolog.read_scene(options.scene))
     known = camera(FULL // 2, turned=0.7, rim=options.rim)

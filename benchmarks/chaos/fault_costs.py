@@ -69,7 +69,7 @@ class FaultCost:
 
     @property
     def seconds(self) -> float:
-        """All of it."""
+        """Seconds that the faults have cost in all: of work done again, and of recovery."""
         return self.redone + self.recovery
 
     @property

@@ -89,7 +89,10 @@ def _overlap(pair: Pair, both: Lenses) -> Iterator[_Common]:
 
 
 def _in_channels(one: Picture, other: Picture, angle: Array, angle_of_other: Array) -> Iterator[_Common]:
-    """Of values (N, 3) at angles (N,) over the reach, where brightness is not cut off."""
+    """What two pictures have in common in each channel, where brightness is not cut off.
+
+    Args: values (N, 3) of the same things in both, and their angles (N,) over the reach.
+    """
     powers = 2 * np.arange(1, _TERMS + 1)
     terms = angle[:, None] ** powers - angle_of_other[:, None] ** powers
     for a, b in zip(one.T.astype(np.float64), other.T.astype(np.float64), strict=True):
@@ -107,7 +110,7 @@ class _Points:
 
     @staticmethod
     def of(pair: Pair, side: int, picture: Picture) -> "_Points":
-        """Those of SIFT."""
+        """The points of a picture that SIFT finds."""
         lens = pair.lenses[side]
         found, marks = cv2.SIFT_create(_POINTS).detectAndCompute(picture, None)  # type: ignore[attr-defined]
         at = np.array([it.pt for it in found]).reshape(-1, 2)

@@ -98,7 +98,7 @@ def test_a_jpeg_that_was_cut_and_closed_again_is_truncated(
 
 @pytest.mark.parametrize("quality", [80, 100])
 def test_a_progressive_jpeg_that_lacks_scans_is_truncated(tmp_path: Path, quality: int) -> None:
-    """It is decoded, blurred; also where only the last bits of the last scan are missing."""
+    """OpenCV decodes such a file, blurred; also where only the last bits of the last scan are missing."""
     path, large = tmp_path / "a.jpg", cv2.resize(PIXELS, (256, 128))
     form = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_QUALITY, quality]
     for pixels in (large, np.full_like(large, 128), large[..., 0]):

@@ -1,9 +1,8 @@
 """What a run has cost so far, and what of that was wasted: a pure function of its records.
 
 A machine costs its price from when the driver first sees it, its own from when it begins, until it is gone or
-the driver has ended. Several
-tasks on it bear equal parts; while none runs, it is idle. What an attempt has done since its last checkpoint
-is lost when it ends without another. Nothing else is counted.
+the driver has ended. Several tasks on it bear equal parts; while none runs, it is idle. What an attempt has
+done since its last checkpoint is lost when it ends without another. Nothing else is counted.
 """
 
 from collections.abc import Iterable
@@ -78,7 +77,7 @@ class PaidMachine:
         )
 
     def with_used(self, other: "PaidMachine") -> "PaidMachine":
-        """The same with what it has cost under another id."""
+        """This machine, with what it has cost under another id added."""
         used, idle, lost = self.used + other.used, self.idle + other.idle, self.lost + other.lost
         return replace(self, used=used, idle=idle, lost=lost)
 
