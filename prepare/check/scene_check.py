@@ -134,7 +134,7 @@ def check_scene(scene: Scene) -> SceneCheck:
         black_nadir_degrees=_black_nadir(evidence),
         layers=layers.lines,
         blank=tuple(blank),
-        problems=(*_blanks(blank), *problems, *layers.problems),
+        problems=(*_blanks(blank), *(problems or layers.inverted), *layers.problems),
     )
 
 

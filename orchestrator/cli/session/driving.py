@@ -119,7 +119,8 @@ class Driving:
             used = journal.state.money.until(time.time()).used.cost
             require_enough(seconds, budget, workers.nodes(), used=used)
         lines = [_FAR.format(self.scene.offset)] if any(self.scene.offset) else []
-        lines += [*look_at_layers(self.scene).lines, *([] if self.scene.test else [NOTHING_HELD_OUT])]
+        in_layers = look_at_layers(self.scene)
+        lines += [*in_layers.lines, *in_layers.inverted, *([] if self.scene.test else [NOTHING_HELD_OUT])]
         layers = [Noticed(None, line) for line in lines]
         journal.record([Noticed(Part.PREFLIGHT, found.summary()), *layers, done])
         return found.config

@@ -13,6 +13,8 @@ from shutil import copytree
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from panolog.orchestrator.cli.session import preparing, session
@@ -214,6 +216,16 @@ def test_a_scene_far_from_its_origin_and_a_gpu_that_torch_cannot_use_are_noticed
     messages = [notice["message"] for notice in status(tmp_path / "run")["notices"]]
     assert any(str(moved.offset) in message for message in messages)
     assert "RTX 4090 is not used: its driver; the CPU is used" in messages
+
+
+def test_a_run_says_that_its_sky_masks_are_inverted(scene: Path, tmp_path: Path) -> None:
+    inverted = copytree(scene, tmp_path / "scene")
+    for image in (inverted / "images").iterdir():
+        path = inverted / "skymasks" / f"{image.stem}.png"
+        path.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(path), np.zeros((32, 64), np.uint8))
+    start(inverted, tmp_path / "run")
+    assert any("black is sky; invert them" in message for message in notices(tmp_path / "run"))
 
 
 def test_two_drivers_of_one_folder(scene: Path, tmp_path: Path) -> None:
