@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from panolog.orchestrator.runs.money.records import OfMoney
+from panolog.orchestrator.runs.money.records import OfMoney, OfRun
 from panolog.workers.tasks import CALIBRATE, DELIVER, EVAL, MERGE, PLAN, StrEnum, TaskId
 
 
@@ -43,7 +43,7 @@ class Part(StrEnum):
 
 
 @dataclass(frozen=True)
-class RunBegan:
+class RunBegan(OfRun):
     """A driver has taken the run over."""
 
     host: str
@@ -52,7 +52,6 @@ class RunBegan:
     previous: float | None = None  # seconds since the epoch: the last record of the driver before
     code: str = ""  # `info.own_code` of its version
     settings: dict[str, object] = field(default_factory=dict)  # of run.json, if that was resolved by then
-    task: None = None
 
 
 @dataclass(frozen=True)
@@ -264,11 +263,10 @@ class Transferred:
 
 
 @dataclass(frozen=True)
-class StopRequested:
+class StopRequested(OfRun):
     """The user requests the run to stop; tasks that train write a last checkpoint."""
 
     tasks: int  # that train
-    task: None = None
 
 
 @dataclass(frozen=True)
@@ -301,23 +299,21 @@ class TaskYielded:
 
 
 @dataclass(frozen=True)
-class RunWaiting:
+class RunWaiting(OfRun):
     """The run waits: its disk is full or cannot be reached, or there is no machine for its tasks."""
 
     reason: str  # for people: what is wrong, and what to do about it
-    task: None = None
 
 
 @dataclass(frozen=True)
-class RunContinued:
+class RunContinued(OfRun):
     """The run does not wait any more."""
 
     seconds: float  # that the run has waited
-    task: None = None
 
 
 @dataclass(frozen=True)
-class NodeQuarantined:
+class NodeQuarantined(OfRun):
     """Nothing more is placed on a node or a GPU, as different tasks have failed there one after another."""
 
     node: str  # Node.id or Node.card
@@ -325,55 +321,49 @@ class NodeQuarantined:
     reason: str  # one line
     until: float  # seconds since the epoch
     tasks: tuple[str, ...] = ()  # whose failures there do not count
-    task: None = None
 
 
 @dataclass(frozen=True)
-class NodeReleased:
+class NodeReleased(OfRun):
     """A node or a GPU in quarantine is used again."""
 
     node: str  # Node.id or Node.card
     host: str  # with the GPU, if that alone is meant
     reason: str = ""  # one line
-    task: None = None
 
 
 @dataclass(frozen=True)
-class NodeLeaving:
+class NodeLeaving(OfRun):
     """A node has announced that it leaves: nothing more is placed there, and its tasks save and move."""
 
     node: str  # Node.id
     host: str
     kind: Leaving
     seconds: float | None = None  # until it leaves; None = not known
-    task: None = None
 
 
 @dataclass(frozen=True)
-class NodeStaying:
+class NodeStaying(OfRun):
     """The announcement was withdrawn: the node is used again."""
 
     node: str  # Node.id
     host: str
-    task: None = None
 
 
 @dataclass(frozen=True)
-class NodeLeft:
+class NodeLeft(OfRun):
     """A node that had announced it has left."""
 
     node: str  # Node.id
     host: str
-    task: None = None
 
 
 @dataclass(frozen=True)
-class RunEnded:
+class RunEnded(OfRun):
     """A driver has ended."""
 
     outcome: Outcome
     reason: str = ""
-    task: None = None
     transient: bool = False  # the cause need not be the run itself: another driver may succeed
     detail: str = ""  # the traceback of an unexpected error
 

@@ -23,6 +23,7 @@ from panolog.orchestrator.runs.records import (
     Leaving,
     ModelSaved,
     Noticed,
+    OfRun,
     Outcome,
     Part,
     Progressed,
@@ -35,7 +36,6 @@ from panolog.scene.errors import RunFolderError, RunLockedError
 from panolog.workers.tasks import TaskId
 
 _TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Record.__args__}
-_OF_RUN = ["Noticed", *(name for name, kind in _TYPES.items() if getattr(kind, "task", "") is None)]
 _USAGE_S = 0.5  # to wait for the locks of readers before usage, which is replaced soon
 _LATEST = (Progressed.__name__, CheckpointSaved.__name__)  # of these only the last of a task matters to state
 PICTURES = "type IN ('PreviewSaved', 'ViewEvaluated')"  # found by an index
@@ -279,7 +279,9 @@ def from_json(kind: str, text: str) -> Record:
     """The inverse of `to_json`. Raises InputError for a record that this version does not know."""
     try:
         fields: Any = {n: tuple(v) if isinstance(v, list) else v for n, v in json.loads(text).items()}
-        fields["task"] = _subject(kind, fields["task"])
+        name = fields.pop("task")
+        if not issubclass(_TYPES[kind], OfRun):
+            fields["task"] = _subject(kind, name)
         match kind:
             case "PlanSaved":
                 fields["blocks"] = tuple(BlockPlan(**block) for block in fields["blocks"])
@@ -303,8 +305,6 @@ def fields_of(record: Record) -> dict[str, Any]:
 
 
 def _subject(kind: str, name: str) -> TaskId | Part | None:
-    if kind in _OF_RUN and not name:
-        return None
-    if kind == Noticed.__name__ and name in list(Part):
-        return Part(name)
+    if kind == Noticed.__name__ and name in ("", *Part):
+        return Part(name) if name else None
     return TaskId.parse(name)
