@@ -245,7 +245,7 @@ class Driver:
         demands = Demands(self._sizes, self._state)
         running = demands.running({t: it.placement for t, it in self._attempts.items()}, self._clock.time())
         nodes = quarantine.usable(self._state, self._nodes)
-        self._placed = self._machines.place(demands.of(tasks), lambda: demands.work(tasks), running, nodes)
+        self._placed = self._machines.place(demands, tasks, running, nodes)
         known = ((task, self._state.tasks.get(task)) for task in tasks)
         if any(state and state.failures and task not in self._attempts for task, state in known):
             self._again = self._clock.monotonic() + _REVIEW_S

@@ -1,20 +1,22 @@
 """The machines of a run, as its driver sees them from turn to turn."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 
+from panolog.orchestrator.engine.driver.demands import Demands
 from panolog.orchestrator.engine.driver.job import Job
 from panolog.orchestrator.engine.driver.journal import Journal
 from panolog.orchestrator.engine.estimates.calibration import basis_of
 from panolog.orchestrator.engine.scheduling import leaving, placement, quarantine
 from panolog.orchestrator.engine.scheduling.expected import Coming, Expected
-from panolog.orchestrator.engine.scheduling.placement import Demand, Placed, Running
+from panolog.orchestrator.engine.scheduling.placement import Placed, Running
 from panolog.orchestrator.engine.scheduling.pool import Pool
 from panolog.orchestrator.engine.scheduling.scaling import IDLE_S, Growth, Work
 from panolog.orchestrator.runs.clock import Clock
 from panolog.orchestrator.runs.machines.nodes import Node
 from panolog.orchestrator.runs.money.prices import of_record, price_by
 from panolog.orchestrator.runs.records import NodeLeaving, Noticed
+from panolog.workers.tasks import TaskId
 
 _NAMED = 6  # paused blocks that are named one by one
 
@@ -54,22 +56,22 @@ class Machines:
         return "" if stays else state.nodes[node].host
 
     def place(
-        self,
-        waiting: Sequence[Demand],
-        work: Callable[[], Work],
-        running: Sequence[Running],
-        nodes: Sequence[Node],
+        self, demands: Demands, tasks: Sequence[TaskId], running: Sequence[Running], nodes: Sequence[Node]
     ) -> list[Placed]:
         """The tasks that start now; requests the machines that the others should have.
 
-        Args: waiting, all tasks that wait; work, which they are; running, what runs; nodes that can be used.
+        Args: tasks, all that wait; running, what runs; nodes that can be used.
         """
-        growth = self._pool.growth()
-        come = self._grow(growth, work(), running, nodes) if growth.groups else Coming()
+        growth, come = self._pool.growth(), Coming()
+        if growth.groups:
+            work = demands.work(tasks)
+            waiting, come = work.demands, self._grow(growth, work, running, nodes)
+        else:  # no need to know how long the stage takes
+            waiting = demands.of(tasks)
         every, busy = [*nodes, *come.nodes], [*running, *come.fill]
         placed = placement.place(waiting, every, busy, cuda=self._cuda)
         idle = not placed and not running
-        self._journal.explain(self._why(growth, waits=bool(waiting)) if idle else "")
+        self._journal.explain(self._why(growth, waits=bool(tasks)) if idle else "")
         return placed
 
     @property
@@ -85,14 +87,10 @@ class Machines:
     def _grow(self, growth: Growth, work: Work, running: Sequence[Running], nodes: Sequence[Node]) -> Coming:
         """Requests what a stage should have besides, and returns what is coming."""
         budget = self._journal.state.money.budget
-        prices = of_record(budget.prices) if budget else None
-        settings, cuda = self._config.scaling, self._cuda
-        scaling = self._expected.scaling(growth, nodes, settings.overhead, price_by(prices), cuda=cuda)
-        found = self._expected.decide(scaling, work, running, nodes, settings.patience)
+        price, settings = price_by(of_record(budget.prices) if budget else None), self._config.scaling
+        found = self._expected.decide(growth, work, running, nodes, settings, price, cuda=self._cuda)
         if found.more:
-            texts = {group.name: group.text() for group in growth.groups}
-            names = ", ".join(f"{count} more of {texts[name]}" for name, count in found.more.items())
-            stage = work.demands[0].task.stage
+            names, stage = _named(growth, found.more, "more of"), work.demands[0].task.stage
             self._journal.record([Noticed(None, f"requested from Ray's autoscaler for {stage}: {names}")])
         self._pool.request(found.wanted)
         return found
@@ -114,9 +112,9 @@ class Machines:
         if not since:
             why = f"waiting for a machine with a {what}: Ray's autoscaler has started all that it may"
             return why + growth.report
-        when = f"{datetime.fromtimestamp(self._expected.first).astimezone():%H:%M:%S}"
-        texts = {group.name: group.text() for group in growth.groups}
-        names = ", ".join(f"{len(times)} of {texts[name]}" for name, times in since.items())
+        first = min(times[0] for times in since.values())
+        when = f"{datetime.fromtimestamp(first).astimezone():%H:%M:%S}"
+        names = _named(growth, {name: len(times) for name, times in since.items()}, "of")
         return f"waiting for machines: {names}, requested from Ray's autoscaler at {when}{growth.report}"
 
     def _review_leaving(self, there: Sequence[Node], able: Sequence[Node]) -> bool:
@@ -134,6 +132,12 @@ class Machines:
             self._journal.record(changes)
             self._journal.record(quarantine.notice(self._journal.state, nodes, config))
         return bool(changes)
+
+
+def _named(growth: Growth, counts: Mapping[str, int], of: str) -> str:
+    """So many machines of each group, for people."""
+    texts = {group.name: group.text() for group in growth.groups}
+    return ", ".join(f"{count} {of} {texts[name]}" for name, count in counts.items())
 
 
 def _paused(blocks: Sequence[int]) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from panolog.orchestrator.engine.scheduling.placement import Running
 from panolog.orchestrator.engine.scheduling.scaling import STARTUP_S, Growth, Price, Scaling, Work, coming
 from panolog.orchestrator.runs.clock import Clock
+from panolog.orchestrator.runs.machines.config import ScalingConfig
 from panolog.orchestrator.runs.machines.nodes import Node
 
 _USUAL = 2  # measured starts that the usual one counts as
@@ -39,49 +40,31 @@ class Expected:
         """Seconds from a request to its machine: what is usual at first, then more and more as measured."""
         return (_USUAL * STARTUP_S + sum(self._startups)) / (_USUAL + len(self._startups))
 
-    def scaling(
-        self,
-        growth: Growth,
-        nodes: Sequence[Node],
-        overhead: float,
-        price: Price,
-        *,
-        cuda: bool,
-    ) -> Scaling:
-        """What an autoscaler can start, with what is known by now. Args: nodes that can be used."""
-        self._review(growth, nodes)
-        return Scaling(growth, cuda, overhead, self.startup, self.known, price)
-
     def decide(
         self,
-        scaling: Scaling,
+        growth: Growth,
         work: Work,
         running: Sequence[Running],
         nodes: Sequence[Node],
-        patience: float,
+        settings: ScalingConfig,
+        price: Price,
+        *,
+        cuda: bool,
     ) -> Coming:
-        """Which machines should be requested now, and which are coming.
-
-        Args: as `Scaling.wanted`; patience, seconds after which those of a group that has given none count no
-        more.
-        """
-        late = self._note_late(patience)
+        """Which machines should be requested now, and which are coming. Args: as `Scaling.wanted`."""
+        self._review(growth, nodes)
+        scaling = Scaling(growth, cuda, settings.overhead, self.startup, self.known, price)
+        late = self._note_late(settings.patience)
         wanted = scaling.wanted(work, running, nodes, late)
         more = self._change(wanted)
-        groups = {group.name: group for group in scaling.growth.groups}
+        groups, now = {group.name: group for group in growth.groups}, self._clock.time()
         found = [
-            (scaling.node(groups[name], number), seconds)
-            for name, times in self._left().items()
+            (scaling.node(groups[name], number), max(0.0, time + self.startup - now))
+            for name, times in self.since.items()
             if name not in late
-            for number, seconds in enumerate(times)
+            for number, time in enumerate(times)
         ]
-        fill = coming(found, cuda=scaling.cuda)
-        return Coming(wanted, more, tuple(node for node, _ in found), tuple(fill))
-
-    @property
-    def first(self) -> float:
-        """When the earliest of the requests was made, in seconds since the epoch."""
-        return min(times[0] for times in self.since.values())
+        return Coming(wanted, more, tuple(node for node, _ in found), tuple(coming(found, cuda=cuda)))
 
     def _review(self, growth: Growth, nodes: Sequence[Node]) -> None:
         """Takes note of which have come. Args: nodes that can be used."""
@@ -109,8 +92,3 @@ class Expected:
         self._dry |= {name: now for name in late if name not in self._dry}
         self._dry = {name: at for name, at in self._dry.items() if name in late or now - at < _DRY_S}
         return set(self._dry)
-
-    def _left(self) -> dict[str, list[float]]:
-        """Seconds until each should come, by group."""
-        now, startup = self._clock.time(), self.startup
-        return {name: [max(0.0, t + startup - now) for t in times] for name, times in self.since.items()}

@@ -10,6 +10,7 @@ from panolog.orchestrator.engine.scheduling import placement
 from panolog.orchestrator.engine.scheduling.expected import Coming, Expected
 from panolog.orchestrator.engine.scheduling.placement import Demand, Running
 from panolog.orchestrator.engine.scheduling.scaling import IDLE_S, STARTUP_S, Group, Growth, Scaling, Work
+from panolog.orchestrator.runs.machines.config import ScalingConfig
 from panolog.orchestrator.runs.machines.nodes import Gpu, Node, Placement
 from panolog.workers.tasks import TaskId
 from tests.orchestrator.fakes import SetClock
@@ -111,8 +112,8 @@ def test_what_could_come_is_what_pays() -> None:
 def decide(
     expected: Expected, growth: Growth, tasks: Work, nodes: Sequence[Node] = (), patience: float = 600
 ) -> Coming:
-    found = expected.scaling(growth, nodes, 0.1, lambda _: None, cuda=True)
-    return expected.decide(found, tasks, (), nodes, patience)
+    settings = ScalingConfig(overhead=0.1, patience=patience)
+    return expected.decide(growth, tasks, (), nodes, settings, lambda _: None, cuda=True)
 
 
 def test_tasks_wait_for_a_large_machine_that_is_coming_but_not_for_ever() -> None:
