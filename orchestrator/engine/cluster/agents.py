@@ -13,8 +13,8 @@ from typing import Any
 
 import ray
 from ray.exceptions import RayError
-from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from panolog.orchestrator.engine.cluster.nodes import on_node
 from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
 from panolog.orchestrator.engine.scheduling.watch import Watch
 from panolog.orchestrator.runs.records import Leaving
@@ -65,10 +65,7 @@ class Agents:
         """Makes sure that a node has its agent; returns before that is up."""
         if id == self._home or id in self._known:
             return
-        here = NodeAffinitySchedulingStrategy(id, soft=False)
-        remote: Any = ray.remote(Agent)
-        options = {"num_cpus": 0, "max_concurrency": 4, "max_restarts": -1, "max_task_retries": -1}
-        actor = remote.options(**options, scheduling_strategy=here).remote()
+        actor = on_node(Agent, id, max_concurrency=4, max_restarts=-1, max_task_retries=-1).remote()
         self._known[id] = _Known(actor, actor.next_notice.remote(None))
 
     def stop(self, id: str, pid: int) -> None:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from ray.experimental import get_object_locations
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from panolog.orchestrator.engine.cluster.nodes import on_node
 from panolog.orchestrator.engine.scheduling.delivery import payload
 from panolog.orchestrator.runs.machines.usage import Usage, measure
 from panolog.scene.errors import RunError
@@ -225,9 +226,7 @@ class FileSharing:
         """Removes the copies on all machines that can be reached. Until then a resumed run finds them."""
         nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
         removals = [
-            ray.remote(_remove)
-            .options(num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False))
-            .remote(self._cache)
+            on_node(_remove, node).remote(self._cache)
             for node in nodes
             if node != self._home and self._server is not None
         ]

@@ -86,7 +86,7 @@ class RayNodes:
         if id == self.home:
             return oom_kills()
         try:
-            kills: int | None = ray.get(on_node(oom_kills, id).remote(), timeout=_TIMEOUT_S)
+            kills: int | None = ray.get(on_node(oom_kills, id, max_retries=0).remote(), timeout=_TIMEOUT_S)
         except RayError:
             return None
         return kills
@@ -105,7 +105,8 @@ class RayNodes:
             if id == self.home:  # asking takes a process of its own elsewhere
                 self._know(raw[id], *describe(gpus, self._name))
             else:
-                self._pending[id] = raw[id], on_node(describe, id).remote(gpus, self._name)
+                described = on_node(describe, id, max_retries=0).remote(gpus, self._name)
+                self._pending[id] = raw[id], described
 
     def _collect(self) -> None:
         for id, (raw, answer) in list(self._pending.items()):
@@ -139,7 +140,7 @@ def describe(gpus: int, name: str) -> tuple[int, tuple[Gpu, ...], str]:
     return free, describe_gpus(gpus), instance_type()
 
 
-def on_node(function: Any, id: str) -> Any:
-    """A function as a remote one that takes no resources and runs on one machine only."""
+def on_node(what: Any, id: str, **options: Any) -> Any:
+    """A function or an actor as a remote one that takes no resources and runs on one machine only."""
     here = NodeAffinitySchedulingStrategy(id, soft=False)
-    return ray.remote(function).options(num_cpus=0, max_retries=0, scheduling_strategy=here)
+    return ray.remote(what).options(num_cpus=0, scheduling_strategy=here, **options)
