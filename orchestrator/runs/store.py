@@ -15,6 +15,7 @@ from typing import Any
 
 from panolog.orchestrator.runs import thinning
 from panolog.orchestrator.runs.clock import CLOCK, Clock
+from panolog.orchestrator.runs.money.records import OfRun
 from panolog.orchestrator.runs.reading import TIMEOUT_S, has_table, query, require_own_journal, unusable
 from panolog.orchestrator.runs.records import (
     BlockPlan,
@@ -23,7 +24,6 @@ from panolog.orchestrator.runs.records import (
     Leaving,
     ModelSaved,
     Noticed,
-    OfRun,
     Outcome,
     Part,
     Progressed,
@@ -94,6 +94,18 @@ class _Stream:
         return abs(time - self.time) >= thinning.interval(self.stored)
 
 
+@contextmanager
+def transaction(connection: sqlite3.Connection) -> Iterator[None]:
+    """All or nothing of what is written in the context, after what any other connection writes."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        connection.execute("COMMIT")
+    finally:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+
+
 class Database:
     """The writer. One for each run folder, opened by the process that has the run's lock."""
 
@@ -157,14 +169,9 @@ class Database:
     def _transaction(self, timeout_s: float) -> Iterator[None]:
         """All or nothing of what is written in the context, if the run is still this driver's."""
         self._connection.execute(f"PRAGMA busy_timeout = {round(1000 * timeout_s)}")
-        self._connection.execute("BEGIN IMMEDIATE")
-        try:
+        with transaction(self._connection):
             self.require_own()
             yield
-            self._connection.execute("COMMIT")
-        finally:
-            if self._connection.in_transaction:
-                self._connection.execute("ROLLBACK")
 
     def _read_last(self) -> int:
         sql = "SELECT MAX((SELECT IFNULL(MAX(id), 0) FROM events), (SELECT IFNULL(MAX(id), 0) FROM latest))"

@@ -15,6 +15,7 @@ from typing import Any
 
 from panolog.orchestrator.runs.clock import CLOCK, Clock
 from panolog.orchestrator.runs.queue.entries import Command, Entry, Identity, Needs, Share, State
+from panolog.orchestrator.runs.store import transaction
 from panolog.scene.errors import QueueError
 from panolog.scene.files import user_folder
 
@@ -87,7 +88,7 @@ class Queue:
         self._connection.execute("PRAGMA synchronous = FULL")  # a start is on disk before the run begins
         version = self._version()
         if version < _VERSION:
-            with self._transaction():
+            with transaction(self._connection):
                 for made in range(self._version() + 1, _VERSION + 1):  # another command may have been quicker
                     for statement in filter(str.strip, _CHANGES[made].split(";")):
                         self._connection.execute(statement)
@@ -109,7 +110,7 @@ class Queue:
 
         Raises QueueError if the queue has this run, or is full.
         """
-        with self._transaction():
+        with transaction(self._connection):
             live = (State.WAITING, State.RUNNING)
             for entry in self._select("run = ? AND state IN (?, ?)", (str(command.run), *live)):
                 raise QueueError(
@@ -154,7 +155,7 @@ class Queue:
 
     def move(self, id: int, before: int | None) -> None:
         """Moves a waiting entry before another one, or to the end. Raises QueueError if one does not wait."""
-        with self._transaction():
+        with transaction(self._connection):
             self._require(id, State.WAITING, doing="moved")
             if before is not None:
                 self._require(before, State.WAITING, doing="a place to move to")
@@ -172,7 +173,7 @@ class Queue:
 
         Args: dead, the caller has found that nothing of a running entry is alive, and no runner is at work.
         """
-        with self._transaction():
+        with transaction(self._connection):
             if self.entry(id).state == State.RUNNING and not dead:
                 run = self.entry(id).command.run
                 raise QueueError(f"entry {id} is running; stop it first: `panolog stop {run}`")
@@ -183,7 +184,7 @@ class Queue:
 
         Args: needs, instead of those that it had.
         """
-        with self._transaction():
+        with transaction(self._connection):
             self._require(id, State.FAILED, State.STOPPED, doing="tried again")
             if needs is not None:
                 self._update(id, needs=json.dumps(asdict(needs)))
@@ -193,7 +194,7 @@ class Queue:
 
     def claim(self, id: int) -> Entry | None:
         """A waiting entry, which is running from now on; None if it does not wait any more."""
-        with self._transaction():
+        with transaction(self._connection):
             for _ in self._select("id = ? AND state = 'waiting'", (id,)):
                 self._update(id, state=State.RUNNING, began=self._clock.time(), reason="")
                 return self.entry(id)
@@ -201,18 +202,18 @@ class Queue:
 
     def note(self, id: int, reason: str) -> None:
         """Notes what an entry waits for; does nothing for one that has ended or was removed meanwhile."""
-        with self._transaction():
+        with transaction(self._connection):
             for _ in self._select("id = ? AND state IN ('waiting', 'running')", (id,)):
                 self._update(id, reason=reason)
 
     def forget_waits(self) -> None:
         """Removes all notes of what entries wait for."""
-        with self._transaction():
+        with transaction(self._connection):
             self._connection.execute("UPDATE entries SET reason = '' WHERE state IN ('waiting', 'running')")
 
     def launched(self, id: int, process: Identity, share: Share | None = None) -> None:
         """Notes process and share of a running entry, before anything of the run begins."""
-        with self._transaction():
+        with transaction(self._connection):
             starts = self._require(id, State.RUNNING, doing="started").starts + 1
             changes = {"boot": process.boot, "pid": process.pid, "started": process.started, "reason": ""}
             held = None if share is None else json.dumps(asdict(share))
@@ -220,13 +221,13 @@ class Queue:
 
     def end(self, id: int, state: State, code: int | None, reason: str) -> None:
         """Notes how a running entry has ended."""
-        with self._transaction():
+        with transaction(self._connection):
             self._require(id, State.RUNNING, doing="ended")
             self._update(id, state=state, code=code, reason=reason, ended=self._clock.time(), share=None)
 
     def lose(self, id: int) -> int:
         """Counts that the process of a running entry was killed; returns how often in a row, each soon."""
-        with self._transaction():
+        with transaction(self._connection):
             entry = self._require(id, State.RUNNING, doing="lost")
             lasted = self._clock.time() - (entry.began or 0.0)
             losses = 1 if lasted > _LASTING_S else entry.losses + 1
@@ -250,17 +251,6 @@ class Queue:
             return [_entry(row) for row in self._connection.execute(sql, values).fetchall()]
         except (ValueError, TypeError, KeyError) as error:
             raise QueueError(f"{self.folder / DATABASE}: is damaged: {error}; move it away") from error
-
-    @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        """All or nothing of what is written in the context, after every other command's."""
-        self._connection.execute("BEGIN IMMEDIATE")
-        try:
-            yield
-            self._connection.execute("COMMIT")
-        finally:
-            if self._connection.in_transaction:
-                self._connection.execute("ROLLBACK")
 
 
 @contextmanager
