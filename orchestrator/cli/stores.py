@@ -48,6 +48,6 @@ def opened(run: str, reader: Literal["status", "events", "report", "export"]) ->
     wanted = {"report": fetch.for_report, "export": fetch.for_export}.get(reader, fetch.for_status)
     with progress_bar(f"reading {url}") as _, fetch.viewed(url, wanted) as found:
         try:
-            yield found.root, bool(found.driver)
+            yield found
         except InputError as error:  # about a file of the copy, which is gone when this is read
-            raise type(error)(str(error).replace(str(found.root), str(url))) from error
+            raise type(error)(str(error).replace(str(found[0]), str(url))) from error

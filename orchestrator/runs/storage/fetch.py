@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from panolog.orchestrator.runs.folder import RunFolder
@@ -22,14 +21,6 @@ _THREADS = 8
 _TRIES = 3  # of a file that was replaced in the store while it was fetched
 _PATIENCE_S = 60.0  # of commands that only read
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Viewed:
-    """A part of a run in a store, as it was when it was read."""
-
-    root: Path  # a folder for as long as the command lasts
-    driver: str  # who is at work on it; "" if no driver is
 
 
 def bring(store: Store, folder: RunFolder, manifest: Manifest | None, say: Say) -> None:
@@ -71,8 +62,10 @@ def fetch_files(store: Store, root: Path, files: dict[str, StoredFile]) -> None:
 
 
 @contextmanager
-def viewed(url: StoreUrl, wanted: Callable[[str], bool]) -> Iterator[Viewed]:
-    """A part of a run in a store, in a temporary folder. Args: wanted, says which files.
+def viewed(url: StoreUrl, wanted: Callable[[str], bool]) -> Iterator[tuple[Path, bool]]:
+    """A part of a run in a store, in a temporary folder, and whether a driver is at work on it.
+
+    Args: wanted, says which files.
 
     Raises StoreError if there is no run, or it is damaged; StoreLostError.
     """
@@ -90,7 +83,7 @@ def viewed(url: StoreUrl, wanted: Callable[[str], bool]) -> Iterator[Viewed]:
             except StoreError:
                 if tried + 1 == _TRIES:
                     raise
-        yield Viewed(root, driver)
+        yield root, bool(driver)
 
 
 def for_status(name: str) -> bool:

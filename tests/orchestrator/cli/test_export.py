@@ -189,8 +189,8 @@ def test_an_error_of_a_run_in_a_store_names_its_url(tmp_path: Path, monkeypatch:
     begun(tmp_path / "run", BEGAN)
 
     @contextmanager
-    def viewed(*_: object) -> Iterator[fetch.Viewed]:
-        yield fetch.Viewed(tmp_path / "run", "")
+    def viewed(*_: object) -> Iterator[tuple[Path, bool]]:
+        yield tmp_path / "run", False
 
     monkeypatch.setattr(fetch, "viewed", viewed)
     url = f"file://{tmp_path}/store/run"

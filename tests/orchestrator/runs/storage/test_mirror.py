@@ -278,10 +278,10 @@ def test_which_folder_is_brought_up_to_date_and_which_is_kept(tmp_path: Path) ->
 
 def test_a_reader_gets_what_it_needs(tmp_path: Path) -> None:
     _, store, _ = stored(tmp_path)
-    with viewed(store.url, for_status) as found:
-        names = {path.name for path in found.root.rglob("*") if path.is_file()}
+    with viewed(store.url, for_status) as (root, driven):
+        names = {path.name for path in root.rglob("*") if path.is_file()}
         assert names == {"run.json", "run.db"}
-        assert found.driver
+        assert driven
     with (
         pytest.raises(StoreError, match="there is no run"),
         viewed(open_store(f"file://{tmp_path}/x").url, for_status),
