@@ -71,7 +71,6 @@ def submit(
     from panolog.orchestrator.engine.cluster.jobs import on_head
     from panolog.orchestrator.runs.config import as_settings
     from panolog.orchestrator.runs.preparation.settings import as_arguments
-    from panolog.orchestrator.watch.follower.plan import words_elsewhere
 
     sources, run = [on_head(it, "SCENE") for it in source], on_head(output, "--output")
     for what, path in {
@@ -82,9 +81,7 @@ def submit(
         if path is not None:
             on_head(path, what)
     words = ["run", *sources, "-o", run, *as_settings(config), *as_arguments(options), *budget.options()]
-    words += words_elsewhere(*targets)
-    words += ["--at-end", at_end] if at_end else []
-    _start(address, run, words, as_json=as_json)
+    _start(address, run, words, targets, at_end, as_json=as_json)
 
 
 @app.command(cls=Command)
@@ -101,14 +98,10 @@ def resume(
 ) -> None:
     """Resume a run on the cluster from its last checkpoints."""
     from panolog.orchestrator.engine.cluster.jobs import on_head
-    from panolog.orchestrator.watch.follower.plan import words_elsewhere
 
     run = on_head(run, "RUN")
-    words = ["resume", run, *budget.options()]
-    words += ["--accept-changes"] * accept_changes
-    words += words_elsewhere(*targets)
-    words += ["--at-end", at_end] if at_end else []
-    _start(address, run, words, as_json=as_json)
+    words = ["resume", run, *budget.options(), *["--accept-changes"] * accept_changes]
+    _start(address, run, words, targets, at_end, as_json=as_json)
 
 
 @app.command(cls=Command)
@@ -173,9 +166,19 @@ def leave(
     say("this machine has left the cluster" if gone else f"tasks of others still run here after {seconds} s")
 
 
-def _start(address: str, run: str, words: Sequence[str], *, as_json: bool) -> None:
+def _start(
+    address: str,
+    run: str,
+    words: Sequence[str],
+    targets: tuple[list[str], list[str]],
+    at_end: str | None,
+    *,
+    as_json: bool,
+) -> None:
     from panolog.orchestrator.engine.cluster.jobs import connect
+    from panolog.orchestrator.watch.follower.plan import words_elsewhere
 
+    words = [*words, *words_elsewhere(*targets), *(["--at-end", at_end] if at_end else [])]
     with progress_bar(f"waiting for the cluster at {address}"):
         cluster = connect(address)
         job = cluster.begin(run, ["panolog", *words, "--address", "auto", "--supervise"])
