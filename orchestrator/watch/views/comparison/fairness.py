@@ -3,34 +3,32 @@
 from collections.abc import Callable, Iterator, Sequence
 
 from panolog.orchestrator.watch.views.comparison.reading import ReadRun
-from panolog.orchestrator.watch.views.comparison.schema import ComparedRun
+from panolog.orchestrator.watch.views.comparison.schema import ComparedRun, MeasuredView
 
 Pair = tuple[ReadRun, ComparedRun]  # a run as it was read and as it is shown
+_CONDITIONS: dict[str, Callable[[MeasuredView], str]] = {  # that are to be the same
+    "at the same width": lambda head: "" if head.width is None else f"{head.width} pixels",
+    "with the same crop at the bottom": lambda head: f"{head.crop_bottom or 0.0:g}",
+    "with the same levels of detail": lambda head: f"of {head.detail:g} pixels" if head.detail else "none",
+}
 
 
 def warnings(runs: Sequence[Pair]) -> Iterator[str]:
     """The reasons, of runs that could be read; the first is what the others are compared with."""
     yield from _unfinished(runs)
     yield from (f"{run.name}: {run.problem}" for run, _ in runs if run.problem)
-    yield from _differing(runs, "not of the same scene", lambda _, shown: (shown.fingerprint or "")[:12])
+    yield from _differ("not of the same scene", [(it.name, (it.fingerprint or "")[:12]) for _, it in runs])
     measured = [pair for pair in runs if pair[0].measured is not None]
     missing = [shown.name for run, shown in runs if run.measured is None and not run.problem]
     if missing:
         yield f"not measured yet, without metrics: {', '.join(missing)}"
     yield from _outdated(measured)
-    yield from _differing(measured, "not measured at the same width", lambda run, _: _width(run))
-    yield from _differing(
-        measured, "not measured with the same crop at the bottom", lambda run, _: _crop(run)
-    )
-    yield from _differing(
-        measured, "not measured with the same levels of detail", lambda run, _: _detail(run)
-    )
+    for what, text in _CONDITIONS.items():
+        heads = [(shown.name, text(run.measured.head)) for run, shown in measured if run.measured]
+        yield from _differ(f"not measured {what}", heads)
     yield from _held_out(measured)
-    yield from _differing(
-        runs,
-        "not on the same machines, so their minutes say little",
-        lambda _, shown: ", ".join(shown.machines),
-    )
+    machines = [(shown.name, ", ".join(shown.machines)) for _, shown in runs]
+    yield from _differ("not on the same machines, so their minutes say little", machines)
 
 
 def _unfinished(runs: Sequence[Pair]) -> Iterator[str]:
@@ -43,25 +41,13 @@ def _unfinished(runs: Sequence[Pair]) -> Iterator[str]:
         yield f"not finished: {', '.join(open_runs)}"
 
 
-def _differing(runs: Sequence[Pair], what: str, text: Callable[[ReadRun, ComparedRun], str]) -> Iterator[str]:
-    """A line with what each run has, if that is not the same; what a run does not state is left out."""
-    texts = [(shown.name, text(run, shown)) for run, shown in runs]
+def _differ(what: str, texts: Sequence[tuple[str, str]]) -> Iterator[str]:
+    """A line with what each run has, if that is not the same; what a run does not state is left out.
+
+    Args: texts, the name of each run and what it has.
+    """
     if len({value for _, value in texts if value}) > 1:
         yield f"{what}: {', '.join(f'{name} {value}' for name, value in texts if value)}"
-
-
-def _width(run: ReadRun) -> str:
-    width = run.measured.head.width if run.measured else None
-    return "" if width is None else f"{width} pixels"
-
-
-def _crop(run: ReadRun) -> str:
-    return f"{run.measured.head.crop_bottom or 0.0:g}" if run.measured else ""
-
-
-def _detail(run: ReadRun) -> str:
-    detail = run.measured.head.detail if run.measured else None
-    return f"of {detail:g} pixels" if detail else "none"
 
 
 def _outdated(runs: Sequence[Pair]) -> Iterator[str]:
