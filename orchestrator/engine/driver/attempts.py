@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from panolog.orchestrator.engine.driver import policy
-from panolog.orchestrator.engine.scheduling import leaving, placement, quarantine
+from panolog.orchestrator.engine.scheduling import placement, quarantine
 from panolog.orchestrator.engine.scheduling.pool import Failed, Hello
 from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.machines.history import leave_of
 from panolog.orchestrator.runs.machines.nodes import Node, Placement
-from panolog.orchestrator.runs.records import TaskFailed, TaskStarted
+from panolog.orchestrator.runs.records import Failure, TaskFailed, TaskStarted
 from panolog.orchestrator.runs.state import RunState
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.scoring import ScoreSpec
@@ -57,7 +58,7 @@ class Attempt:
     ) -> TaskFailed:
         """The record of its failure, with what follows from it. Args: nodes, those that can run tasks."""
         task, where, kind = self.spec.task, self.placement, message.kind
-        preempted = leaving.preempts(state, where.node, kind)
+        preempted = kind == Failure.LOST and leave_of(state.nodes, where.node) is not None
         then = policy.after_failure(
             state.task(task),
             kind,

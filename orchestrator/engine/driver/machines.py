@@ -13,6 +13,7 @@ from panolog.orchestrator.engine.scheduling.placement import Placed, Running
 from panolog.orchestrator.engine.scheduling.pool import Pool
 from panolog.orchestrator.engine.scheduling.scaling import IDLE_S, Growth, Work
 from panolog.orchestrator.runs.clock import Clock
+from panolog.orchestrator.runs.machines.history import leave_of
 from panolog.orchestrator.runs.machines.nodes import Node
 from panolog.orchestrator.runs.money.prices import of_record, price_by
 from panolog.orchestrator.runs.records import NodeLeaving, Noticed
@@ -49,7 +50,7 @@ class Machines:
     def leaves(self, node: str) -> str:
         """The host of a node if its tasks must move because it leaves, else "". Args: node, Node.id."""
         state = self._journal.state
-        if not leaving.announced(state, node):
+        if leave_of(state.nodes, node) is None:
             return ""
         able = placement.able(self._pool.nodes(), cuda=self._cuda)
         stays = any(other.id == node for other in leaving.staying(state, able))

@@ -8,9 +8,9 @@ changes nothing.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from panolog.orchestrator.runs.machines.history import Leave
+from panolog.orchestrator.runs.machines.history import leave_of
 from panolog.orchestrator.runs.machines.nodes import Node
-from panolog.orchestrator.runs.records import Failure, Leaving, NodeLeaving, NodeLeft, NodeStaying, Noticed
+from panolog.orchestrator.runs.records import Leaving, NodeLeaving, NodeLeft, NodeStaying, Noticed
 from panolog.orchestrator.runs.state import RunState
 
 
@@ -36,7 +36,7 @@ def changes(
     records: list[NodeLeaving | NodeStaying | NodeLeft] = []
     hosts = {node.id: node.host for node in nodes}
     for id, host in hosts.items():
-        notice, known = notices.get(id), _leave(state, id)
+        notice, known = notices.get(id), leave_of(state.nodes, id)
         if notice is not None and (known is None or known.kind != notice.kind):
             records.append(NodeLeaving(id, host, notice.kind, notice.seconds))
         elif notice is None and known is not None:
@@ -47,20 +47,12 @@ def changes(
 def staying(state: RunState, nodes: Iterable[Node]) -> list[Node]:
     """The nodes that tasks can still be placed on."""
     nodes = list(nodes)
-    without = [node for node in nodes if _leave(state, node.id) is None]
+    without = [node for node in nodes if leave_of(state.nodes, node.id) is None]
     return without or [
-        node for node in nodes if (leave := _leave(state, node.id)) and leave.kind == Leaving.REBALANCE
+        node
+        for node in nodes
+        if (leave := leave_of(state.nodes, node.id)) and leave.kind == Leaving.REBALANCE
     ]
-
-
-def announced(state: RunState, node: str) -> bool:
-    """Whether a node leaves or has left as it had announced. Args: node, Node.id."""
-    return _leave(state, node) is not None
-
-
-def preempts(state: RunState, node: str, failure: Failure) -> bool:
-    """Whether a failure is the loss of a node that had announced that it leaves."""
-    return failure == Failure.LOST and announced(state, node)
 
 
 def notice(state: RunState, nodes: Sequence[Node]) -> list[Noticed]:
@@ -68,8 +60,3 @@ def notice(state: RunState, nodes: Sequence[Node]) -> list[Noticed]:
     if not nodes or staying(state, nodes):
         return []
     return [Noticed(None, "every machine leaves: the run waits for another one")]
-
-
-def _leave(state: RunState, id: str) -> Leave | None:
-    known = state.nodes.get(id)
-    return known.leave if known else None

@@ -80,6 +80,12 @@ def by_host(nodes: Iterable[NodeState]) -> tuple[NodeState, ...]:
     return tuple(sorted(nodes, key=lambda node: (node.host, node.id)))
 
 
+def leave_of(nodes: Nodes, id: str) -> Leave | None:
+    """That a node leaves, or has left as it had announced; None of any other. Args: id, Node.id."""
+    known = nodes.get(id)
+    return known.leave if known else None
+
+
 def leaves_for_sure(nodes: Iterable[NodeState], host: str) -> bool:
     """Whether a machine is among those that leave, and not only probably."""
     leaves = (node.leave for node in nodes if node.host == host)
@@ -130,8 +136,7 @@ def follow(nodes: Nodes, record: Record, where: Iterable[str], time: float) -> N
         case NodeStaying():
             return _leave(nodes, record, None)
         case NodeLeft():
-            known = nodes.get(record.node)
-            leave = known.leave if known else None
+            leave = leave_of(nodes, record.node)
             return _leave(nodes, record, replace(leave, over=True) if leave else None)
     return nodes
 

@@ -14,6 +14,7 @@ from panolog.orchestrator.engine.scheduling import leaving
 from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
 from panolog.orchestrator.engine.scheduling.pool import NONE
 from panolog.orchestrator.engine.scheduling.scaling import Group, Growth
+from panolog.orchestrator.runs.machines.history import leave_of
 from panolog.orchestrator.runs.machines.nodes import Node, Placement
 from panolog.orchestrator.runs.records import (
     Leaving,
@@ -55,9 +56,9 @@ def test_a_notice_is_recorded_once_and_so_are_its_withdrawal_and_the_end() -> No
     assert leaving.changes(state, [B], {}) == [NodeLeft("aaaa", "spot-a")]
     gone = apply(state, [Stored(2, 230.0, NodeLeft("aaaa", "spot-a"))])
     assert gone.leaving() == ()
-    assert leaving.announced(gone, "aaaa")  # what was lost with it is known to be that
+    assert leave_of(gone.nodes, "aaaa") is not None  # what was lost with it is known to be that
     assert leaving.changes(gone, [B], {}) == []
-    assert not leaving.announced(apply(gone, [Stored(3, 240.0, AGAIN)]), "aaaa")
+    assert leave_of(apply(gone, [Stored(3, 240.0, AGAIN)]).nodes, "aaaa") is None
     assert len(state.notices) == 1
 
 
