@@ -1,4 +1,4 @@
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from itertools import zip_longest
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -62,7 +62,8 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
 
 
 def made(kind: Any) -> st.SearchStrategy[Any]:
-    of_fields = {name: values(of) for name, of in get_type_hints(kind).items()}
+    hints = get_type_hints(kind)
+    of_fields = {field.name: values(hints[field.name]) for field in fields(kind)}
     return st.builds(kind, **of_fields | NAMES.get(kind, {}))
 
 
@@ -169,7 +170,7 @@ def test_rows_of_older_runs_are_read() -> None:
     assert to_json(Noticed(None, "m")) == '{"task":"","message":"m"}'
     plan = from_json("PlanSaved", '{"task":"plan","path":"plan.json","blocks":[]}')
     assert plan == PlanSaved("plan.json", ()) and not after(plan).measures
-    done = '{"outcome":"done","reason":"","task":"","transient":false,"detail":""}'
+    done = '{"outcome":"done","reason":"","transient":false,"detail":"","task":""}'
     assert to_json(RunEnded(Outcome.DONE)) == done
     assert from_json("RunEnded", '{"outcome":"done","reason":"","task":""}') == RunEnded(Outcome.DONE)
 
