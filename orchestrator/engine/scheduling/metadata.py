@@ -19,7 +19,7 @@ from email.utils import parsedate_to_datetime
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 from threading import Event, Timer
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 from urllib.parse import urlsplit
 
 from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
@@ -103,17 +103,17 @@ def _cut_when_late(connected: socket.socket) -> Iterator[Event]:
 class Provider(Protocol):
     """The service of one provider."""
 
+    withdraws: ClassVar[tuple[Leaving, ...]]  # notices that may be withdrawn
+
     def notice(self) -> LeaveNotice | None:
         """Whether this machine leaves. Raises NoAnswerError if the service does not say."""
-
-    def withdraws(self, kind: Leaving) -> bool:
-        """Whether such a notice may be withdrawn."""
 
 
 @dataclass
 class Amazon:
     """EC2, by version 2 of its protocol: each request has a token."""
 
+    withdraws: ClassVar[tuple[Leaving, ...]] = (Leaving.REBALANCE,)
     service: Service
     _token: str = ""
 
@@ -127,10 +127,6 @@ class Amazon:
             return LeaveNotice(Leaving.PREEMPTION, _until(_fields(action).get("time")))
         recommended = self._get("events/recommendations/rebalance") is not None
         return LeaveNotice(Leaving.REBALANCE) if recommended else None
-
-    def withdraws(self, kind: Leaving) -> bool:
-        """An interruption never is."""
-        return kind == Leaving.REBALANCE
 
     def _get(self, name: str) -> str | None:
         path = f"/latest/meta-data/{name}"
@@ -157,6 +153,7 @@ _OF_GOOGLE = {"Metadata-Flavor": "Google"}
 
 @dataclass
 class Google:
+    withdraws: ClassVar[tuple[Leaving, ...]] = (Leaving.MAINTENANCE,)  # it may be over
     service: Service
 
     def there(self) -> bool:
@@ -169,10 +166,6 @@ class Google:
             return LeaveNotice(Leaving.PREEMPTION, _GOOGLE_S)
         stops = self._get("maintenance-event") == "TERMINATE_ON_HOST_MAINTENANCE"
         return LeaveNotice(Leaving.MAINTENANCE) if stops else None
-
-    def withdraws(self, kind: Leaving) -> bool:
-        """Maintenance may be over."""
-        return kind == Leaving.MAINTENANCE
 
     def _get(self, name: str) -> str | None:
         return self.service.text(f"/computeMetadata/v1/instance/{name}", _OF_GOOGLE)
@@ -191,6 +184,7 @@ _EVENTS = {
 class Azure:
     """Azure's Scheduled Events, those of this machine: the service lists those of its whole group."""
 
+    withdraws: ClassVar[tuple[Leaving, ...]] = tuple(Leaving)  # any event may be cancelled
     service: Service
     _name: str = ""
 
@@ -206,10 +200,6 @@ class Azure:
         events = _fields(text or "{}").get("Events")
         notices = list(self._notices(events if isinstance(events, list) else []))
         return min(notices, key=lambda one: _DAY_S if one.seconds is None else one.seconds, default=None)
-
-    def withdraws(self, kind: Leaving) -> bool:
-        """Any event may be cancelled."""
-        return bool(kind)
 
     def _notices(self, events: list[Any]) -> Iterator[LeaveNotice]:
         for event in events:

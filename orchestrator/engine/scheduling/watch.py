@@ -81,7 +81,7 @@ class Watch:
             return self._look_s if self._answered else _RETRY_S
         self._answered = True
         with self._change:
-            holds = self._kind is not None and not provider.withdraws(self._kind) and not self._survived
+            holds = self._kind is not None and self._kind not in provider.withdraws and not self._survived
             if found is None and holds:
                 return self._look_s
             if found is None or self._notice is None or found.kind != self._notice.kind:

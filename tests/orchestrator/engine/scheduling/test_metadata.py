@@ -95,11 +95,11 @@ def test_amazon_announces_an_interruption_with_its_time_and_before_that_recommen
     again = provider.notice()
     assert again is not None and again.kind == Leaving.PREEMPTION
     assert served.tokens == 2
-    assert not provider.withdraws(Leaving.PREEMPTION)
+    assert Leaving.PREEMPTION not in provider.withdraws
     served.values.clear()
     served.values[REBALANCE] = '{"noticeTime": "2026-05-01T08:00:00Z"}'
     assert provider.notice() == LeaveNotice(Leaving.REBALANCE, None)
-    assert provider.withdraws(Leaving.REBALANCE)
+    assert Leaving.REBALANCE in provider.withdraws
     served.spot(-3)  # the clock of the machine is ahead
     assert provider.notice() == LeaveNotice(Leaving.PREEMPTION, 0.0)
 
@@ -137,7 +137,7 @@ def test_azure_schedules_events_for_this_machine_alone(
     assert (notice.kind if notice else None) == kind
     if notice is not None:
         assert notice.seconds is not None and 40 < notice.seconds <= 100
-    assert provider.withdraws(Leaving.PREEMPTION)
+    assert Leaving.PREEMPTION in provider.withdraws
 
 
 WRONG = ['{"action"', "[1]", "null", "[" * 10_000, "x" * 2**17]
