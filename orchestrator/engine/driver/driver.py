@@ -8,7 +8,6 @@ import math
 import sqlite3
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from socket import gethostname
 
 from panolog.orchestrator.engine.driver.attempts import Attempt, WorkerSpec
@@ -103,7 +102,7 @@ class Driver:
         self._hooks = hooks or Hooks()
         self._stop = stop or Stop()
         self._specs = Specs(job, pool)
-        self._results = Results(job, lambda: self._later, self._hooks.on_plan, self._hooks.deliver)
+        self._results = Results(job, pool, self._hooks.on_plan, self._hooks.deliver)
         self._attempts: dict[TaskId, Attempt] = {}  # of the tasks that the pool has
         self._deadlines = Deadlines(job, clock)
         self._evaluations: dict[TaskId, Evaluation] = {}  # that are measured now
@@ -125,10 +124,6 @@ class Driver:
     @property
     def _state(self) -> RunState:
         return self._journal.state
-
-    @cached_property
-    def _later(self) -> Specs:  # of the stages after Stage I
-        return Specs(self._job.learnt, self._pool)
 
     def run(self) -> RunState:
         """Runs until the run has ended, which the caller has begun.
@@ -184,7 +179,7 @@ class Driver:
         for task in list(self._attempts):
             self._pool.cancel(task)
             self._forget(task)
-        measures = 0 if self._state.plan else len(self._later.measures)
+        measures = 0 if self._state.plan else len(self._results.specs.measures)
         self._journal.record([*map(TaskYielded, started), replace(reached, measures=measures)])
         self._news = True
 
@@ -253,7 +248,7 @@ class Driver:
             self._again = self._clock.monotonic() + _LOOK_S
 
     def _start(self, task: TaskId, where: Placement) -> None:
-        specs = self._specs if task.stage in (Stage.DISTRICT, Stage.COARSE) else self._later
+        specs = self._specs if task.stage in (Stage.DISTRICT, Stage.COARSE) else self._results.specs
         spec = self._journal.until_done(lambda: specs.of(task))
         state, iteration = self._state.task(task), 0
         if isinstance(spec, TrainSpec) and spec.checkpoint is not None:

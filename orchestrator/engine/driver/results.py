@@ -1,12 +1,14 @@
 """Results that the driver makes itself, between those of workers."""
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from panolog.orchestrator.engine.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.engine.driver.saving import remove_checkpoints
+from panolog.orchestrator.engine.scheduling.pool import Sharing
 from panolog.orchestrator.engine.stages.evaluation import Evaluation
 from panolog.orchestrator.engine.stages.merging import (
     Early,
@@ -28,18 +30,19 @@ Deliver = Callable[[Job], list[Record]]
 
 
 class Results:
-    def __init__(self, job: Job, later: Callable[[], Specs], on_plan: OnPlan, deliver: Deliver) -> None:
-        """Args: later, the specs after Stage I; on_plan is called with the plan and (N, 3) means of Stage I
-        before plan.json is written; deliver makes the files for viewers and returns their records.
+    def __init__(self, job: Job, pool: Sharing, on_plan: OnPlan, deliver: Deliver) -> None:
+        """Args: on_plan is called with the plan and (N, 3) means of Stage I before plan.json is written;
+        deliver makes the files for viewers and returns their records.
         """
         self._job = job
-        self._later = later
+        self._pool = pool
         self._on_plan = on_plan
         self._deliver = deliver
 
-    @property
-    def _specs(self) -> Specs:
-        return self._later()
+    @cached_property
+    def specs(self) -> Specs:
+        """Those of the stages after Stage I."""
+        return Specs(self._job.learnt, self._pool)
 
     def maker(self, task: TaskId, state: RunState) -> Callable[[], list[Record]] | None:
         """What makes the result of a task and returns its records; None for a task of workers.
@@ -59,7 +62,7 @@ class Results:
             case Stage.EVAL if state.measures:
                 return lambda: self._join(state)
             case Stage.DELIVER:
-                return lambda: self._deliver(self._specs.job)
+                return lambda: self._deliver(self.specs.job)
         return None
 
     def measured(self, task: TaskId, evaluation: Evaluation) -> Record:
@@ -75,19 +78,19 @@ class Results:
         return record
 
     def _plan(self) -> list[Record]:
-        job, means = self._specs.job, self._specs.means
+        job, means = self.specs.job, self.specs.means
         shards = ((job.folder.shard(TaskId.shard(i)), cameras) for i, cameras in enumerate(job.shards))
         scores = join_scores(shards, job.config.grid.count)
         plan = decide_plan(job.scene, means, scores, job.config)
         self._on_plan(plan, means)
         write_plan(job.folder, plan, scores)
-        return plan_records(job.folder, plan, scores, self._specs.passes(), len(self._specs.measures))
+        return plan_records(job.folder, plan, scores, self.specs.passes(), len(self.specs.measures))
 
     def _unite(self, task: TaskId, state: RunState) -> list[Record]:
         folder = self._job.folder
         for later in state.following(task)[0]:  # what it has of an earlier union
             remove_checkpoints(folder, later)
-        return [unite_blocks(folder, state, self._specs.plan, task)]
+        return [unite_blocks(folder, state, self.specs.plan, task)]
 
     def _merge(self, state: RunState) -> list[Record]:
         job, folder = self._job, self._job.folder
@@ -101,10 +104,10 @@ class Results:
         early = None
         if state.money.reached is not None:
             early = Early(job.scene, job.config.densify.prune_opacity, job.config.iterations)
-        return [merge_run(folder, state, self._specs.plan, self._specs.repaired, early)]
+        return [merge_run(folder, state, self.specs.plan, self.specs.repaired, early)]
 
     def _join(self, state: RunState) -> list[Record]:
-        job, faces = self._job, len(self._specs.faces)
+        job, faces = self._job, len(self.specs.faces)
         evaluation = new_evaluation(job, faces, detail=job.config.measured_detail)
         evaluation.join(job.folder, state.measures)
         reason = evaluation.lpips_reason
