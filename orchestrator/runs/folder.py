@@ -326,6 +326,15 @@ def require_plain(folder: RunFolder) -> None:
             raise RunFolderError(f"{path}: is not a {kind}, so this is not the folder of a run")
 
 
+def is_below(path: Path, *places: Path) -> bool:
+    """Whether there is a file that really is below one of some folders, whatever links are on the way."""
+    try:
+        real = path.resolve()
+        return path.is_file() and any(real.is_relative_to(place.resolve()) for place in places)
+    except (OSError, ValueError):  # a name that no file can have
+        return False
+
+
 @contextmanager
 def opened(path: Path, below: Path) -> Iterator[BinaryIO]:
     """A plain file to read, if it really is below a folder. Raises as `open_below`."""

@@ -1,11 +1,12 @@
 """The runs of a comparison as they are read from their folders. Imports no torch."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from panolog.orchestrator.runs import lock, presence
-from panolog.orchestrator.runs.folder import RunFolder, head_of, read_json, require_plain
+from panolog.orchestrator.runs.folder import RunFolder, head_of, is_below, read_json, require_plain
 from panolog.orchestrator.runs.info import read_history
 from panolog.orchestrator.runs.state import RunState
 from panolog.orchestrator.watch.views.comparison.measured import Measured, read_measured
@@ -89,9 +90,7 @@ def read_run(root: Path, name: str) -> ReadRun:
 
 def picture_of(run: ReadRun, view: str) -> str | None:
     """The file with the render of a held-out panorama above its ground truth; None if there is none."""
-    try:
+    with suppress(ValueError):  # a name that no file can have
         path = run.folder.picture(view)
-        inside = path.resolve().is_relative_to(run.folder.images.resolve()) and path.is_file()
-    except (OSError, ValueError):  # a name that no file can have
-        return None
-    return str(path) if inside else None
+        return str(path) if is_below(path, run.folder.images) else None
+    return None

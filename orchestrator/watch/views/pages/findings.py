@@ -5,7 +5,7 @@ from typing import Annotated, TypeVar
 
 from pydantic import Field
 
-from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.folder import RunFolder, is_below
 from panolog.orchestrator.watch.views.comparison.measured import MEASURED_ANEW, read_seams
 from panolog.orchestrator.watch.views.palette import SEAM_GRADES, seam_grade
 from panolog.orchestrator.watch.views.preparation import version_of
@@ -116,9 +116,5 @@ def finding_pictures(folder: RunFolder, found: Findings) -> dict[str, Path]:
             paths[f"seam-{below}-{above}-{name}"] = folder.seam(below, above) / name
     for number, mover in enumerate(found.movers[:_MOVERS]):
         paths[f"mover-{number}.jpg"] = folder.mover_picture(mover.name)
-    own = [place.resolve() for place in (folder.movers, folder.seams.parent)]
-    return {
-        name: path
-        for name, path in paths.items()
-        if path.is_file() and any(path.resolve().is_relative_to(place) for place in own)
-    }
+    own = folder.movers, folder.seams.parent
+    return {name: path for name, path in paths.items() if is_below(path, *own)}

@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import quote
 
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.folder import RunFolder, command_line
+from panolog.orchestrator.runs.folder import RunFolder, command_line, is_below
 from panolog.orchestrator.runs.info import read_history, read_info
 from panolog.orchestrator.runs.records import Noticed, Part, Progressed, Record
 from panolog.orchestrator.watch.views.exposures import exposure_curve
@@ -160,8 +160,7 @@ def _held_out(folder: RunFolder, found: Findings) -> Iterator[tuple[str, Any]]:
     """Some held-out panoramas with their renders and metrics."""
     metrics = found.metrics.views if found.metrics else {}
     paths = {name: folder.picture(name).resolve() for name in metrics}
-    inside = folder.images.resolve()
-    there = [name for name, path in paths.items() if path.is_relative_to(inside) and path.is_file()]
+    there = [name for name, path in paths.items() if is_below(path, folder.images)]
     ranked = sorted(there, key=lambda name: metrics[name].get("psnr") or 0.0)
     pictures = {name: _picture(paths[name]) for name in sorted(spread(ranked, _PICTURES), key=natural_key)}
     shown = [name for name, url in pictures.items() if url is not None]
