@@ -160,25 +160,23 @@ def _later(one: float | None, other: float | None) -> float | None:
 def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: float) -> Iterator[StageView]:
     """The stages of a run in their order, also those to come. Args: now, epoch seconds."""
     state = history.state if running else at_rest(history.state)
-    left_out = set[Stage]()
-    if not _setting(info, "refine", default=True):
-        left_out |= {Stage.SCORE, Stage.PLAN, Stage.BLOCK}
     planned = {task.stage for tasks in state.between for task in tasks}
-    left_out |= {Stage.UNION} | {Stage.ROUND, Stage.REPAIR} - planned  # unions take next to no time
-    if not state.measures:
-        left_out.add(Stage.MEASURE)
-    if not _setting(info, "deliver", default=False):  # nor of older versions
-        left_out.add(Stage.DELIVER)
-    if _setting(info, "districts", default=1) == 1:
-        left_out.add(Stage.DISTRICT)
-    if Stage.PREPARE not in history.spans:
-        left_out.add(Stage.PREPARE)
+    refines = _setting(info, "refine", default=True)
+    shown = {
+        Stage.PREPARE: Stage.PREPARE in history.spans,
+        Stage.CALIBRATE: not history.spans.keys().isdisjoint((Stage.PREPARE, Stage.CALIBRATE)),
+        Stage.DISTRICT: _setting(info, "districts", default=1) != 1,
+        **dict.fromkeys((Stage.SCORE, Stage.PLAN, Stage.BLOCK), refines),
+        Stage.UNION: False,  # it takes next to no time
+        Stage.ROUND: Stage.ROUND in planned,
+        Stage.REPAIR: Stage.REPAIR in planned,
+        Stage.MEASURE: bool(state.measures),
+        Stage.DELIVER: _setting(info, "deliver", default=False),  # older versions did not
+    }
     every = tasks_of(state)
     for name in map(Stage, STAGES):
         span = history.spans.get(name)
-        older = Stage.PREPARE not in history.spans  # that have not recorded it
-        known = span is not None or name is not Stage.CALIBRATE or not older
-        if known and name not in left_out:
+        if shown.get(name, True):
             tasks = [task for task in every if task.id.stage is name]
             cut = history.cut(name)
             at_end = state if cut is None else replace(state, ended=cut)

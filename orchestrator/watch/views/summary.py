@@ -178,11 +178,8 @@ def summarize(
     Args: running, whether a driver works on it; now, epoch seconds; root, the run folder in commands;
     prepared, as `progress_of`.
     """
-    status, stage, reason = (
-        status_of(state, running=running),
-        stage_of(state),
-        reason_of(state, running=running),
-    )
+    status, stage = status_of(state, running=running), stage_of(state)
+    reason = reason_of(state, running=running)
     end = state.ended or (None if running else state.latest) or (time.time() if now is None else now)
     progress = progress_of(state, end, prepared)
     if not running:
