@@ -124,8 +124,6 @@ def as_arguments(options: Options) -> Iterator[str]:
                 yield "--no-gps"
             case "partial", True:
                 yield "--partial"
-            case "pairing", _:
-                yield from ("--pairs", str(value))
             case _:
                 yield from (f"--{name}", str(value))
     if options.nadir is not None:
