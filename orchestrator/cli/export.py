@@ -1,5 +1,6 @@
 """`panolog export`."""
 
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -99,13 +100,10 @@ def export(
 
 
 def _numbers(option: str, text: str, count: int) -> tuple[float, ...]:
-    try:
-        found = tuple(map(float, text.split(",")))
-    except ValueError as error:
-        raise InputError(f"{option} {text}: write {count} numbers, with commas between them") from error
-    if len(found) != count:
-        raise InputError(f"{option} {text}: write {count} numbers, with commas between them")
-    return found
+    with suppress(ValueError):
+        if len(found := tuple(map(float, text.split(",")))) == count:
+            return found
+    raise InputError(f"{option} {text}: write {count} numbers, with commas between them")
 
 
 def _box(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
