@@ -133,9 +133,7 @@ def clear(folder: RunFolder, *, keep_info: bool = False) -> None:
     """Removes what a driver makes before and during its preflight, but for the lock, which it holds."""
     journal = folder.database.with_name(f"{folder.database.name}-journal")
     files = folder.preflight, folder.adjusted, folder.measured, folder.poses, folder.database
-    for path in (*files, folder.presence, journal):
-        path.unlink(missing_ok=True)
-    for path in () if keep_info else (folder.info,):
+    for path in (*files, folder.presence, journal, *(() if keep_info else (folder.info,))):
         path.unlink(missing_ok=True)
     folders = folder.control, folder.sparse, folder.follower, folder.mirror.parent, folder.outline.parent
     for path in (*folders, folder.of(COARSE)):
