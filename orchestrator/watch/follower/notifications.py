@@ -75,10 +75,9 @@ def run_id(records: Sequence[Stored]) -> str:
 class Losses:
     """Finds the machines that leave or were lost, with their tasks, in records that come piece by piece."""
 
-    hosts: dict[TaskId, str] = field(default_factory=dict)
+    starts: dict[TaskId, TaskStarted] = field(default_factory=dict)  # the latest of each task
     found: dict[int, tuple[float, str, list[str]]] = field(default_factory=dict)  # by the first record
     announced: dict[str, tuple[int, float, NodeLeaving]] = field(default_factory=dict)  # by node
-    _nodes: dict[TaskId, str] = field(default_factory=dict)  # Node.id of the latest attempt
     _leaving: dict[str, NodeLeaving] = field(default_factory=dict)  # by node
     _latest: dict[str, int] = field(default_factory=dict)  # by node: the first record of its latest group
 
@@ -87,14 +86,13 @@ class Losses:
         for item in records:
             record = item.record
             if isinstance(record, TaskStarted):
-                self.hosts[record.task] = record.node
-                self._nodes[record.task] = record.node_id
+                self.starts[record.task] = record
             elif isinstance(record, NodeLeaving):
                 self._leaving[record.node] = record
                 if record.kind in _TAKEN:
                     self._announce(item, record.node)
             elif isinstance(record, TaskYielded) and record.leaves:
-                self._announce(item, self._nodes.get(record.task, ""))
+                self._announce(item, self.starts[record.task].node_id if record.task in self.starts else "")
             elif isinstance(record, TaskFailed) and _left(record) and record.node not in self.announced:
                 self._note(item.id, item.time, record)
 
@@ -107,7 +105,7 @@ class Losses:
         if before is not None and time - self.found[before][0] <= _TOGETHER_S:
             self.found[before][2].append(str(record.task))
             return
-        host = self.hosts.get(record.task, "a machine")
+        host = self.starts[record.task].node if record.task in self.starts else "a machine"
         self._latest[record.node] = id
         self.found[id] = (time, f"{host} ({record.node[:8]})" if record.node else host, [str(record.task)])
 
