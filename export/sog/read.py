@@ -9,7 +9,6 @@ number with the bytes of the files.
 import io
 import json
 import math
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from panolog.export.sog.write import MOST
 from panolog.export.splats import REST, Splats
 from panolog.scene.errors import FormatError
 from panolog.scene.files import StrPath
+from panolog.scene.pictures.headers import DAMAGE, read_header
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -162,28 +162,17 @@ def _image(data: bytes, where: str, most: int) -> Bytes:
         with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
             if image.size == (width, height):
                 return np.asarray(image.convert("RGBA"))
-    except (OSError, ValueError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError) as error:
+    except (*DAMAGE, EOFError, Image.DecompressionBombError) as error:
         raise FormatError(f"{where}: damaged ({str(error)[:80]}); copy or export it again") from error
     raise FormatError(f"{where}: its header contradicts itself; export it again")
 
 
 def _size(data: bytes) -> tuple[int, int]:
     """(width, height) by the header of a PNG or WebP, (0, 0) for others: before a decoder takes memory."""
-    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) > 24:
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
         return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
-        return 0, 0
-    match data[12:16]:
-        case b"VP8L":
-            bits = int.from_bytes(data[21:25], "little")
-            return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-        case b"VP8X":
-            return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
-        case b"VP8 ":
-            return int.from_bytes(data[26:28], "little") & 0x3FFF, int.from_bytes(
-                data[28:30], "little"
-            ) & 0x3FFF
-    return 0, 0
+    found = read_header(io.BytesIO(data))
+    return (0, 0) if found is None else (found.width, found.height)
 
 
 class _Reader:
