@@ -18,8 +18,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.export.order import means_of, morton_order
-from panolog.export.splats import REST, ROWS, Splats, SplatSource
+from panolog.export.order import means_of, morton_order, places_in
+from panolog.export.splats import REST, Splats, SplatSource, with_rows
 from panolog.scene.errors import FormatError, PlyError
 from panolog.scene.files import StrPath, atomic
 
@@ -53,18 +53,13 @@ def write_compressed_ply(path: StrPath, source: SplatSource) -> None:
     """
     if not source.count:
         raise FormatError("there is no Gaussian to write; select more of the model")
-    order = _order(means_of(source))
-    place = np.empty(len(order), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    del order
+    place = places_in(_order(means_of(source)))
     bounds = _bounds(source, place)
     words = np.empty((source.count, len(_WORDS)), "<u4")
     rest = np.empty((source.count, 3 * REST[source.degree]), np.uint8)
-    start = 0
-    for piece in source.pieces():
-        rows = place[start : start + len(piece)]
-        words[rows], rest[rows] = _pack(piece, bounds[rows // _CHUNK])
-        start += len(piece)
+    for rows, piece in with_rows(source):
+        own = place[rows]
+        words[own], rest[own] = _pack(piece, bounds[own // _CHUNK])
     with atomic(Path(path)) as temporary, temporary.open("wb") as file:
         file.write(_header(len(bounds), source.count, rest.shape[1]))
         for array in (bounds, words, rest):
@@ -114,13 +109,11 @@ def _bounds(source: SplatSource, place: NDArray[np.int32]) -> NDArray[np.float32
     """(chunks, 18) in the order of `_BOUNDS`."""
     chunks = -(-len(place) // _CHUNK)
     lower = np.full((chunks, 9), np.inf, np.float32)
-    upper, start = -lower, 0
-    for piece in source.pieces():
-        columns = _columns(piece).astype(np.float32)
-        chunk = place[start : start + len(piece)] // _CHUNK
+    upper = -lower
+    for rows, piece in with_rows(source):
+        columns, chunk = _columns(piece).astype(np.float32), place[rows] // _CHUNK
         np.minimum.at(lower, chunk, columns)
         np.maximum.at(upper, chunk, columns)
-        start += len(piece)
     parts = [side[:, at : at + 3] for at in (0, 3, 6) for side in (lower, upper)]
     return np.concatenate(parts, axis=1)
 
@@ -186,22 +179,12 @@ def _unpacked(vertices: NDArray[Any], chunks: Doubles, rest: NDArray[Any] | None
     count = len(vertices)
     columns = 0 if rest is None else len(rest.dtype.names or ())
     codes = np.zeros((count, 0), np.uint8) if rest is None else rest.view(np.uint8).reshape(count, columns)
-    whole = {
-        name: np.empty((count, *shape), np.float32)
-        for name, shape in {
-            "means": (3,),
-            "quats": (4,),
-            "scales": (3,),
-            "opacities": (),
-            "sh0": (3,),
-        }.items()
-    } | {"shN": np.empty((count, columns // 3, 3), np.float32)}
-    for start in range(0, count, ROWS):
-        rows = slice(start, start + ROWS)
-        own = chunks[np.arange(start, min(start + ROWS, count)) // _CHUNK]
-        for name, values in _unpack(vertices[rows], own, codes[rows]).items():
-            whole[name][rows] = values
-    return Splats(**whole)
+
+    def part(rows: slice) -> dict[str, NDArray[Any]]:
+        own = chunks[np.arange(rows.start, rows.stop) // _CHUNK]
+        return _unpack(vertices[rows], own, codes[rows])
+
+    return Splats.made(count, REST.index(columns // 3), part)
 
 
 def _unpack(vertices: NDArray[Any], bounds: Doubles, codes: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:

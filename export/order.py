@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.export.splats import SplatSource
+from panolog.export.splats import SplatSource, with_rows
 
 _BITS = 21  # of each axis
 # Spreads 21 bits to every third one of 63, in steps: shift, then mask.
@@ -34,8 +34,14 @@ def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
 
 def means_of(source: SplatSource) -> NDArray[np.float32]:
     """(N, 3) of all Gaussians of a source: 12 bytes of each."""
-    means, start = np.empty((source.count, 3), np.float32), 0
-    for piece in source.pieces():
-        means[start : start + len(piece)] = piece.means
-        start += len(piece)
+    means = np.empty((source.count, 3), np.float32)
+    for rows, piece in with_rows(source):
+        means[rows] = piece.means
     return means
+
+
+def places_in(order: NDArray[np.int64]) -> NDArray[np.int32]:
+    """(N,) where each row is in an order (N,) of rows."""
+    places = np.empty(len(order), np.int32)
+    places[order] = np.arange(len(order), dtype=np.int32)
+    return places

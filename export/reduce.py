@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.export.splats import Splats, SplatSource
+from panolog.export.splats import Splats, SplatSource, with_rows
 
 _SAMPLE = 100_000  # Gaussians, about, from which the extent of a model is estimated
 
@@ -51,12 +51,9 @@ class Reduced:
 
     def pieces(self) -> Iterator[Splats]:
         """All of them, in the pieces of the source."""
-        start = 0
-        for piece in self.source.pieces():
-            kept = self._kept[start : start + len(piece)]
-            start += len(piece)
-            if kept.any():
-                yield piece.select(kept)
+        for rows, piece in with_rows(self.source):
+            if self._kept[rows].any():
+                yield piece.select(self._kept[rows])
 
 
 def _cover(piece: Splats, middle: NDArray[np.float64], radius: float) -> NDArray[np.float32]:

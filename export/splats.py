@@ -1,9 +1,9 @@
 """Gaussians to export, as columns of numbers: read in pieces, selected and turned, with bounded memory."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -94,6 +94,22 @@ class Splats:
         return Gaussians(**tensors, sky=0, exact=exact)
 
     @staticmethod
+    def made(count: int, degree: int, part: Callable[[slice], Mapping[str, NDArray[Any]]]) -> "Splats":
+        """So many Gaussians, made `ROWS` at a time, so that little more than they needs memory.
+
+        Args: degree, of the spherical harmonics; part, the columns of some rows, by name.
+        """
+        shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (3,)}
+        whole = {
+            name: np.empty((count, *shape), np.float32)
+            for name, shape in {**shapes, "shN": (REST[degree], 3)}.items()
+        }
+        for rows in (slice(start, min(start + ROWS, count)) for start in range(0, count, ROWS)):
+            for name, column in part(rows).items():
+                whole[name][rows] = column
+        return Splats(**whole)
+
+    @staticmethod
     def joined(parts: "list[Splats]") -> "Splats":
         """All of some, at least one, in order."""
         columns = [part.columns() for part in parts]
@@ -116,6 +132,14 @@ class SplatSource(Protocol):
     def pieces(self) -> Iterator[Splats]:
         """All of them, `ROWS` or fewer at a time."""
         ...
+
+
+def with_rows(source: SplatSource) -> Iterator[tuple[slice, Splats]]:
+    """Each piece of a source, with its rows among all Gaussians. Raises what reading the source does."""
+    start = 0
+    for piece in source.pieces():
+        yield slice(start, start + len(piece)), piece
+        start += len(piece)
 
 
 @dataclass(frozen=True, eq=False)

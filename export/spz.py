@@ -21,8 +21,8 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from panolog.export.order import means_of, morton_order
-from panolog.export.splats import REST, ROWS, Splats, SplatSource
+from panolog.export.order import means_of, morton_order, places_in
+from panolog.export.splats import REST, ROWS, Splats, SplatSource, with_rows
 from panolog.export.spz_values import (
     Bytes,
     most_bits,
@@ -154,16 +154,12 @@ class _Header:
 
 def _packed(source: SplatSource, order: NDArray[np.int64]) -> dict[str, Bytes]:
     """All streams but the positions, in that order."""
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
+    place = places_in(order)
     sizes = {name: width for name, width in widths(source.degree, 3).items() if width and name != "positions"}
     streams = {name: np.empty((len(order), width), np.uint8) for name, width in sizes.items()}
-    start = 0
-    for piece in source.pieces():
-        rows = place[start : start + len(piece)]
+    for rows, piece in with_rows(source):
         for name, values in pack(piece).items():
-            streams[name][rows] = values
-        start += len(piece)
+            streams[name][place[rows]] = values
     return streams
 
 
@@ -275,12 +271,9 @@ def _exactly(
 
 
 def _unpacked(streams: dict[str, Bytes], header: _Header) -> Splats:
-    """All Gaussians, a part at a time, so that little more than they needs memory."""
-    count, rest = header.count, REST[min(header.degree, len(REST) - 1)]
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (3,), "shN": (rest, 3)}
-    whole = {name: np.empty((count, *shape), np.float32) for name, shape in shapes.items()}
-    for start in range(0, count, ROWS):
-        part = {name: stream[start : start + ROWS] for name, stream in streams.items()}
-        for name, column in unpack(part, header.bits).columns().items():
-            whole[name][start : start + ROWS] = column
-    return Splats(**whole)
+    """All Gaussians, a part at a time."""
+
+    def part(rows: slice) -> dict[str, NDArray[np.float32]]:
+        return unpack({name: stream[rows] for name, stream in streams.items()}, header.bits).columns()
+
+    return Splats.made(header.count, min(header.degree, len(REST) - 1), part)

@@ -16,10 +16,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.export.order import morton_order
+from panolog.export.order import morton_order, places_in
 from panolog.export.sog.codebook import Histogram, nearest
 from panolog.export.sog.palette import Palette, make_palette, palette_size, sample_size, step_of, units
-from panolog.export.splats import REST, Splats, SplatSource
+from panolog.export.splats import REST, Splats, SplatSource, with_rows
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -78,9 +78,7 @@ def make_layers(source: SplatSource, pool: Executor, *, sort: bool = True) -> La
     survey = _survey(source, pool)
     count = source.count
     low, high = _compressed(survey.means.min(axis=0)), _compressed(survey.means.max(axis=0))
-    places = np.arange(count, dtype=np.int32)
-    if sort:
-        places[morton_order(survey.means)] = np.arange(count, dtype=np.int32)
+    places = places_in(morton_order(survey.means) if sort else np.arange(count))
     survey.means = survey.means[:0]
     usual, palette = _trained(survey, palette_size(count), pool) if source.degree else (1.0, None)
     width = -(-(math.isqrt(count - 1) + 1) // 4) * 4  # the root, rounded up to a multiple of 4
@@ -90,11 +88,10 @@ def make_layers(source: SplatSource, pool: Executor, *, sort: bool = True) -> La
     layers = Layers(count, width, low, high, survey.scales.codebook(), survey.sh0.codebook(), pixels)
     del survey
 
-    def quantise(piece: Splats, start: int) -> None:
-        rows = places[start : start + len(piece)]
-        _quantise(piece, rows, layers)
+    def quantise(rows: slice, piece: Splats) -> None:
+        _quantise(piece, places[rows], layers)
         if palette is not None:
-            pixels["shN_labels"][rows, :2] = _label(piece, palette, usual)
+            pixels["shN_labels"][places[rows], :2] = _label(piece, palette, usual)
 
     for _ in _mapped(source, pool, quantise):
         pass
@@ -103,19 +100,17 @@ def make_layers(source: SplatSource, pool: Executor, *, sort: bool = True) -> La
 
 
 def _mapped(
-    source: SplatSource, pool: Executor, task: Callable[[Splats, int], T]
-) -> Iterator[tuple[Splats, int, T]]:
-    """Each piece, the row at which it starts and what the task returns for these, in order."""
-    waiting: deque[tuple[Splats, int, Future[T]]] = deque()
-    start = 0
-    for piece in source.pieces():
-        waiting.append((piece, start, pool.submit(task, piece, start)))
-        start += len(piece)
+    source: SplatSource, pool: Executor, task: Callable[[slice, Splats], T]
+) -> Iterator[tuple[slice, Splats, T]]:
+    """Each piece, its rows, and what the task returns for these, in order."""
+    waiting: deque[tuple[slice, Splats, Future[T]]] = deque()
+    for rows, piece in with_rows(source):
+        waiting.append((rows, piece, pool.submit(task, rows, piece)))
         if len(waiting) > _AHEAD:
-            first, at, found = waiting.popleft()
-            yield first, at, found.result()
-    for first, at, found in waiting:
-        yield first, at, found.result()
+            at, first, found = waiting.popleft()
+            yield at, first, found.result()
+    for at, first, found in waiting:
+        yield at, first, found.result()
 
 
 def _survey(source: SplatSource, pool: Executor) -> _Survey:
@@ -123,17 +118,17 @@ def _survey(source: SplatSource, pool: Executor) -> _Survey:
     survey = _Survey(np.empty((source.count, 3), np.float32))
     stride = max(1, source.count // sample_size(source.count))
 
-    def look(piece: Splats, start: int) -> tuple[Histogram, Histogram]:
-        survey.means[start : start + len(piece)] = piece.means
+    def look(rows: slice, piece: Splats) -> tuple[Histogram, Histogram]:
+        survey.means[rows] = piece.means
         return Histogram.of(piece.scales), Histogram.of(piece.sh0)
 
-    for piece, start, (scales, sh0) in _mapped(source, pool, look):
+    for rows, piece, (scales, sh0) in _mapped(source, pool, look):
         survey.scales.add(scales)
         survey.sh0.add(sh0)
         if source.degree:
-            rows = piece.select(slice(-start % stride, None, stride))
-            survey.sample.append(np.array(rows.shN.reshape(len(rows), -1)))
-            survey.importance.append(_importance(rows))
+            some = piece.select(slice(-rows.start % stride, None, stride))
+            survey.sample.append(np.array(some.shN.reshape(len(some), -1)))
+            survey.importance.append(_importance(some))
     return survey
 
 
