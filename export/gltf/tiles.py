@@ -51,20 +51,19 @@ def write_tiles(
         folder: what appears; it may not exist before, or is empty.
         source: what to write, y up, in metres if it has a place on the earth; without sky, whose size would
             make every tile near.
-        to_ecef: (4, 4) from the tileset's axes, x, −z and y of the source's, to the earth-centred frame in
-            metres: `enu_to_ecef` if the source's x is east and its −z north. None leaves the tileset where
-            the source has its origin.
+        to_ecef: (4, 4), rigid, from the tileset's axes, x, −z and y of the source's, to the earth-centred
+            frame in metres: `enu_to_ecef` if the source's x is east and its −z north. None leaves the tileset
+            where the source has its origin.
         side, levels: as of `Detail`.
 
-    Raises FormatError: the folder exists already, there is no Gaussian, or `to_ecef` is no rigid transform;
-    OSError: the files cannot be written.
+    Raises FormatError: the folder exists already, or there is no Gaussian; OSError: the files cannot be
+    written.
     """
     folder = Path(folder)
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise FormatError(f"{folder}: exists already; remove it, or choose another folder")
     if not source.count:
         raise FormatError("there is no Gaussian to write; select more of the model")
-    transform = None if to_ecef is None else _checked(to_ecef)
     with atomic_folder(folder) as temporary:
         scratch = temporary / "scratch"
         scratch.mkdir()
@@ -72,7 +71,7 @@ def write_tiles(
         leaves = [_write_leaf(temporary, leaf, detail.sides) for leaf in detail.leaves()]
         shutil.rmtree(scratch)
         root = _tile_of(detail.tree, leaves)
-        write_bytes(temporary / TILESET, _tileset(root, transform))
+        write_bytes(temporary / TILESET, _tileset(root, to_ecef))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,13 +160,3 @@ def _size(corners: Corners) -> float:
 def _around(parts: list[Corners]) -> Corners:
     lower, upper = zip(*parts, strict=True)
     return np.min(lower, axis=0), np.max(upper, axis=0)
-
-
-def _checked(to_ecef: Doubles) -> Doubles:
-    """The transform. Raises FormatError if it does not keep distances: levels of detail would be wrong."""
-    matrix = np.asarray(to_ecef, np.float64)
-    if matrix.shape == (4, 4) and np.isfinite(matrix).all() and np.array_equal(matrix[3], (0, 0, 0, 1)):
-        turn = matrix[:3, :3]
-        if np.abs(turn @ turn.T - np.eye(3)).max() < 1e-6 and np.linalg.det(turn) > 0:
-            return matrix
-    raise FormatError("the transform to the earth is no rotation and translation; export in metres")

@@ -145,17 +145,3 @@ def test_the_folder_appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(OSError, match="No space"):
         write_tiles(tmp_path / "town", InMemory(scattered(100)), to_ecef=None)
     assert [file.name for file in tmp_path.iterdir()] == ["empty"]
-
-
-def test_transforms_that_are_none(tmp_path: Path) -> None:
-    right = enu_to_ecef(48, 11, 500)
-    place = np.diag([0, 0, 0, 1.0])
-    wrong = [
-        *(right @ np.diag([factor, 1, 1, 1]) for factor in (1.01, -1, np.nan)),
-        right + np.roll(place, 2),  # sheared
-        right + np.roll(place, -3),  # projective
-        right[:3],
-    ]
-    for matrix in wrong:
-        with pytest.raises(FormatError, match="no rotation and translation"):
-            write_tiles(tmp_path / "a", InMemory(scattered(100)), to_ecef=matrix)
