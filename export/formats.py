@@ -36,7 +36,7 @@ def write_format(kind: str, model: ChosenModel, path: Path) -> list[Path]:
 
     Raises InputError if the model is damaged, nothing is left of it, or it does not fit; OSError.
     """
-    return _WRITERS[kind](model, path)
+    return _WRITERS[kind](model, path) or [path]
 
 
 def _source(model: ChosenModel, part: Part, frame: Frame | None = None, scale: float = 1.0) -> ModelSource:
@@ -56,9 +56,8 @@ def _for_viewers(model: ChosenModel) -> ModelSource:
     return _source(model, "all", upside_down).with_near_sky()
 
 
-def _sog(model: ChosenModel, path: Path) -> list[Path]:
-    write_sog(path, _for_viewers(model))
-    return [path]
+def _tiles(model: ChosenModel, path: Path) -> None:
+    write_tiles(path, _in_metres(model), to_ecef=model.place.tiles_to_ecef(), levels=model.levels)
 
 
 def _spz(model: ChosenModel, path: Path) -> list[Path]:
@@ -72,12 +71,7 @@ def _spz(model: ChosenModel, path: Path) -> list[Path]:
     return [path, sky]
 
 
-def _compressed_ply(model: ChosenModel, path: Path) -> list[Path]:
-    write_compressed_ply(path, _for_viewers(model))
-    return [path]
-
-
-def _ply(model: ChosenModel, path: Path) -> list[Path]:
+def _ply(model: ChosenModel, path: Path) -> None:
     """Writes a PLY with the columns of every trainer, turned y down: viewers turn such a file upright."""
     if path.resolve() == model.ply.resolve():
         raise InputError(f"{path}: is the model itself; give the upright one another name")
@@ -94,17 +88,6 @@ def _ply(model: ChosenModel, path: Path) -> list[Path]:
             yield part.with_tensors(part.tensors(), sky=max(0, min(len(part), done - first)))
 
     write_ply_parts(path, parts(), count=found.count, sky=sky, exact=exact, exported=found.degree)
-    return [path]
-
-
-def _glb(model: ChosenModel, path: Path) -> list[Path]:
-    write_glb(path, _in_metres(model))
-    return [path]
-
-
-def _tiles(model: ChosenModel, path: Path) -> list[Path]:
-    write_tiles(path, _in_metres(model), to_ecef=model.place.tiles_to_ecef(), levels=model.levels)
-    return [path]
 
 
 def _in_metres(model: ChosenModel) -> ModelSource:
@@ -122,12 +105,13 @@ def _sky_image(model: ChosenModel, path: Path) -> list[Path]:
     return paths
 
 
-_WRITERS: dict[str, Callable[[ChosenModel, Path], list[Path]]] = {
-    "sog": _sog,
+# Those that write more than the path return what they have written.
+_WRITERS: dict[str, Callable[[ChosenModel, Path], list[Path] | None]] = {
+    "sog": lambda model, path: write_sog(path, _for_viewers(model)),
     "spz": _spz,
-    "compressed-ply": _compressed_ply,
+    "compressed-ply": lambda model, path: write_compressed_ply(path, _for_viewers(model)),
     "ply": _ply,
-    "glb": _glb,
+    "glb": lambda model, path: write_glb(path, _in_metres(model)),
     "3dtiles": _tiles,
     "sky-image": _sky_image,
 }
