@@ -75,16 +75,11 @@ class Detail:
         self._cube = _merging_side(means, rows)
         self.sides = self._sides(means, levels)
 
-    @property
-    def leaf_count(self) -> int:
-        """How many leaves there are."""
-        return len(self._nodes)
-
     def leaves(self) -> Iterator[Leaf]:
         """All leaves, in the order of their numbers. Raises OSError if the scratch disk is full."""
         pieces = (piece.columns() for piece in self._source.pieces())
         labels = self._labels.astype(np.int64)
-        runs = sorted_runs(self._scratch, pieces, labels, self.leaf_count)
+        runs = sorted_runs(self._scratch, pieces, labels, len(self._nodes))
         for node, columns in zip(self._nodes, runs, strict=True):
             own = Splats(**columns)
             yield Leaf(node, tuple(self._levels(own.select(morton_order(own.means)))))

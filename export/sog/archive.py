@@ -1,4 +1,4 @@
-"""The files of a SOG, from a folder or a ZIP, read with bounds: hostile files end in one line, not in swap."""
+"""The files of a SOG, from a folder or a ZIP, with bounds: hostile files end in one line, not in swap."""
 
 import io
 import struct

@@ -38,7 +38,7 @@ def test_each_leaf_is_where_the_index_says(streamed: Path, tmp_path: Path) -> No
     detail = Detail(source(5000, 1), tmp_path, side=8, most=800, levels=LEVELS)
     files = [read_sog(streamed / name) for name in meta["filenames"]]
     found = leaves(meta["tree"])
-    assert len(found) == detail.leaf_count > 5
+    assert len(found) > 5
     for leaf, wanted in zip(found, detail.leaves(), strict=True):
         for level, place in leaf["lods"].items():
             part = files[place["file"]].select(slice(place["offset"], place["offset"] + place["count"]))
