@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.networks.manifest import Confidence, DepthManifest, Sky
-from panolog.prepare.networks.seam import Floats, MatchScale, blend
+from panolog.prepare.networks.seam import Floats, blend, named, plane
 from panolog.scene.depth_alignment import AlignmentError, fit_affine
-from panolog.scene.errors import ConfigError
 
 FULL = 65_535  # the greatest value of a map
 NEAREST = 0.25  # metres; 65535 in the maps of metric estimators, which so share one scale: 100 m is 164
@@ -70,15 +69,13 @@ def encode_depth(inverse: Floats, top: float | None = None) -> NDArray[np.uint16
 def _inverse(outputs: dict[str, Floats], manifest: DepthManifest) -> Floats:
     """(h, 2h) inverse radial depth, in 1 / metre where the manifest has a factor; NaN where there is none."""
     what = manifest.depth
-    raw, factor = _plane(outputs, what.output), np.float32(what.factor or 1)
-    with np.errstate(divide="ignore", over="ignore"):  # too near for a number: not finite, and so no value
-        raw = (
-            np.where(raw > 0, 1 / (raw * factor), np.float32(np.nan))
-            if what.kind == "depth"
-            else raw / factor
-        )
-    raw = np.where(np.isfinite(raw), raw, np.float32(np.nan))
-    found = _blended(raw, manifest, what.output, match_scale if what.factor is None else None)
+    with named(f"output {what.output}"):
+        raw, factor = plane(outputs[what.output]), np.float32(what.factor or 1)
+        with np.errstate(divide="ignore", over="ignore"):  # too near for a number: not finite, so no value
+            inverse = 1 / (raw * factor) if what.kind == "depth" else raw / factor
+        known = np.isfinite(inverse) & ((raw > 0) | (what.kind != "depth"))
+        inverse = np.where(known, inverse, np.float32(np.nan))
+        found = blend(inverse, manifest.input, match_scale if what.factor is None else None)
     return found * _radial(found.shape[0], what.distance)
 
 
@@ -123,29 +120,11 @@ def _side(
     """(h, 2h) where the output lies on the threshold's `side`; None if the manifest has no such output."""
     if what is None:
         return None
-    raw = np.nan_to_num(_plane(outputs, what.output), nan=np.nan, posinf=_HUGE, neginf=-_HUGE)
-    values = _blended(raw, manifest, what.output)
+    with named(f"output {what.output}"):
+        raw = np.nan_to_num(plane(outputs[what.output]), nan=np.nan, posinf=_HUGE, neginf=-_HUGE)
+        values = blend(raw, manifest.input)
     if values.shape != size:  # a head of another resolution; scores are smooth, so they may be interpolated
         values = np.asarray(cv2.resize(values, size[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
     above = values > what.threshold
     found = above if what.above == side else ~above
     return np.where(np.isnan(values), side == "unsure", found)
-
-
-def _plane(outputs: dict[str, Floats], name: str) -> Floats:
-    """(K, h, w) of an output with one channel, on axis 1 or 3. Raises ConfigError if it has more."""
-    value = outputs[name]
-    if value.ndim == 4:
-        axis = 1 if value.shape[1] == 1 else 3
-        if value.shape[axis] == 1:
-            value = value.squeeze(axis)
-    if value.ndim != 3:
-        raise ConfigError(f"output {name}: {value.shape} is not one channel for each image")
-    return value
-
-
-def _blended(planes: Floats, manifest: DepthManifest, name: str, fit: MatchScale | None = None) -> Floats:
-    try:
-        return blend(planes, manifest.input, fit)
-    except ValueError as error:
-        raise ConfigError(f"output {name}: {error}; the manifest's input does not fit it") from error

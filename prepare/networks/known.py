@@ -6,7 +6,7 @@ Nothing is downloaded: the table says where a user finds a file, under which lic
 import resource
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,7 +19,7 @@ from panolog.prepare.networks.depth_maps import make_depth, plan_depth
 from panolog.prepare.networks.manifest import ManifestPart, manifest_path, manifest_task
 from panolog.prepare.networks.masks import MaskJob, make_masks
 from panolog.prepare.networks.movers import MoverNetwork
-from panolog.prepare.networks.network import describe_ends, sha256
+from panolog.prepare.networks.network import Network, describe_ends, sha256
 from panolog.prepare.panorama_files import PanoramaFile, list_panoramas
 from panolog.prepare.provenance import read_layer
 from panolog.scene.errors import ConfigError, RunError
@@ -29,8 +29,8 @@ from panolog.synthetic.make import make_town
 
 _TOWN = 512  # pixels of the trial's panoramas before they are enlarged
 _ALL = 0.99  # of the sphere: more is no mask of people in a street without any
-# The device, seconds for a panorama after a first one, and the share as CheckedNetwork has it.
-Trial = tuple[str, float, float]
+# The network, seconds for a panorama after a first one, and the share as CheckedNetwork has it.
+Trial = tuple[Network, float, float]
 
 
 class Known(ManifestPart):
@@ -117,16 +117,15 @@ def check_network(
         raise ConfigError(f"{model}: there is no such model")
     found = sha256(model).hex()
     entry = next((it for it in known_networks() if it.sha256 == found), None)
-    inputs, outputs = describe_ends(model)
-    has = f"the model has inputs {', '.join(inputs)}; outputs {', '.join(outputs)}"
-    path = _manifest(model, entry, has, say)
+    path = _manifest(model, entry, say)
     task = manifest_task(path)
     with TemporaryDirectory(prefix="panolog-models-") as folder:
         pictures = _town(Path(folder) / "town", width)
         try:
-            used, seconds, share = (_mask if task == "mask" else _depth)(model, device, pictures)
+            network, seconds, share = (_mask if task == "mask" else _depth)(model, device, pictures)
         except RunError as error:
             raise ConfigError(str(error)) from error
+    inputs, outputs = network.ends
     return CheckedNetwork(
         file=str(model),
         sha256=found,
@@ -135,7 +134,7 @@ def check_network(
         task=task,
         inputs=inputs,
         outputs=outputs,
-        device=used,
+        device=network.device,
         width=width,
         seconds=seconds,
         memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
@@ -143,13 +142,14 @@ def check_network(
     )
 
 
-def _manifest(model: Path, entry: Known | None, has: str, say: Callable[[str], None]) -> Path:
-    """The manifest of a model, which is written if the table has it. Args: has, the model's ends in words."""
+def _manifest(model: Path, entry: Known | None, say: Callable[[str], None]) -> Path:
+    """The manifest of a model, which is written if the table has it. Raises ConfigError without one."""
     try:
         return manifest_path(model)
     except ConfigError as error:
         if entry is None or entry.manifest is None:
-            raise ConfigError(f"{error}; {has}") from error
+            inputs, outputs = map(", ".join, describe_ends(model))
+            raise ConfigError(f"{error}; the model has inputs {inputs}; outputs {outputs}") from error
     path = model.with_suffix(".yaml")
     write_bytes(path, yaml.safe_dump(entry.manifest, sort_keys=False).encode())
     say(f"{path}: written, as the SHA-256 is that of {entry.name}")
@@ -169,32 +169,39 @@ def _town(folder: Path, width: int) -> list[PanoramaFile]:
 
 
 def _mask(model: Path, device: str, pictures: list[PanoramaFile]) -> Trial:
-    network = MoverNetwork(model, device)
-    shares, seconds = list[float](), 0.0
-    for picture in pictures:
-        began = time.monotonic()
-        shares += [it.ignored for it in make_masks([picture], MaskJob(movers=network))]
-        seconds = time.monotonic() - began
+    movers = MoverNetwork(model, device)
+    seconds, shares = _timed(lambda it: make_masks([it], MaskJob(movers=movers))[0].ignored, pictures)
     if min(shares) > _ALL:
         raise ConfigError(
             f"{model}: masks all of a town without people; look at `above`, `ignore` and the input's values"
         )
-    return network.device, seconds, sum(shares) / len(shares)
+    return movers.network, seconds, sum(shares) / len(shares)
 
 
 def _depth(model: Path, device: str, pictures: list[PanoramaFile]) -> Trial:
-    for path in (picture.layer(DEPTHS) for picture in pictures):
-        path.unlink()
-    seconds, share, name = 0.0, 0.0, ""
     for picture in pictures:
-        job = plan_depth([picture], model, device)
-        began = time.monotonic()
-        make_depth(job)
-        seconds, name = time.monotonic() - began, job.network.device
-        share += float((read_layer(picture.layer(DEPTHS)) > 0).mean()) / len(pictures)
-    if share == 0:
+        picture.layer(DEPTHS).unlink()
+    job = plan_depth(pictures, model, device)
+
+    def estimated(picture: PanoramaFile) -> float:
+        make_depth(replace(job, todo=(picture,)))
+        return float((read_layer(picture.layer(DEPTHS)) > 0).mean())
+
+    seconds, shares = _timed(estimated, pictures)
+    if not any(shares):
         raise ConfigError(f"{model}: finds no depth in a town; look at `kind` and the input's values")
-    return name, seconds, share
+    return job.network, seconds, sum(shares) / len(shares)
+
+
+def _timed(
+    share_of: Callable[[PanoramaFile], float], pictures: list[PanoramaFile]
+) -> tuple[float, list[float]]:
+    """Seconds for the last panorama, and the share of each."""
+    began, shares = 0.0, list[float]()
+    for picture in pictures:
+        began = time.monotonic()
+        shares.append(share_of(picture))
+    return time.monotonic() - began, shares
 
 
 def networks_as_json() -> dict[str, Any]:

@@ -64,6 +64,11 @@ class Network:
             for name, value in zip(self._outputs, found, strict=True)
         }
 
+    @property
+    def ends(self) -> tuple[list[str], list[str]]:
+        """The inputs and the outputs of its file, each as its name, type and shape."""
+        return _ends(self._session)
+
     def _tensor(self, images: NDArray[np.uint8]) -> NDArray[Any]:
         ordered = images if self._given.channels == "RGB" else images[..., ::-1]
         mean, std = (np.array(it, np.float32) for it in (self._given.mean, self._given.std))
@@ -174,29 +179,28 @@ def sha256(path: Path) -> bytes:
     return found.digest()
 
 
-def digest(*files: Path) -> str:
-    """sha256 over the bytes of files, in hexadecimal."""
-    return hashlib.sha256(b"".join(sha256(path) for path in files)).hexdigest()
-
-
 def model_digest(model: Path, manifest: Path) -> str:
-    """`digest` of a model and its manifest, as files record what they were made with."""
+    """The SHA-256 of a model and its manifest in hexadecimal, as files record what they were made with."""
     # Models of more than 2 GiB keep their weights in a file of their own.
     weights = model.with_name(f"{model.name}.data")
-    return digest(model, manifest, *([weights] if weights.is_file() else []))
+    files = (model, manifest, *([weights] if weights.is_file() else []))
+    return hashlib.sha256(b"".join(map(sha256, files))).hexdigest()
 
 
 def describe_ends(model: Path) -> tuple[list[str], list[str]]:
-    """The inputs and the outputs of an ONNX file, each as its name, type and shape.
+    """`Network.ends` of a file without a manifest.
 
-    Raises ConfigError: it is none; DeviceError: onnxruntime is not installed.
+    Raises ConfigError: it is no network; DeviceError: onnxruntime is not installed.
     """
-    session = _session(model, _runtime(), [DEVICES["cpu"]])
+    return _ends(_session(model, _runtime(), [DEVICES["cpu"]]))
 
-    def words(nodes: Any) -> list[str]:
-        return [f"{it.name} ({it.type} {' x '.join(map(str, it.shape))})" for it in nodes]
 
-    return words(session.get_inputs()), words(session.get_outputs())
+def _ends(session: Any) -> tuple[list[str], list[str]]:
+    inputs, outputs = (
+        [f"{it.name} ({it.type} {' x '.join(map(str, it.shape))})" for it in nodes]
+        for nodes in (session.get_inputs(), session.get_outputs())
+    )
+    return inputs, outputs
 
 
 def _session(model: Path, runtime: Any, wanted: list[str]) -> Any:

@@ -5,12 +5,14 @@ panorama has none. So the surroundings of the border are estimated a second time
 it, and the two estimates are blended.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.networks.manifest import Input
+from panolog.scene.errors import ConfigError
 
 Floats = NDArray[np.float32]
 MatchScale = Callable[[Floats, Floats], Floats]
@@ -37,7 +39,10 @@ def blend(estimates: Floats, given: Input, fit: MatchScale | None = None) -> Flo
     """
     height, width = estimates.shape[1:]
     if width * given.height != height * given.width or (given.wrap * height) % given.height:
-        raise ValueError(f"{height} x {width} is not a scaled {given.height} x {given.width}")
+        raise ValueError(
+            f"{height} x {width} is not a scaled {given.height} x {given.width}; the manifest's input does "
+            "not fit it"
+        )
     if given.seam == "turn":
         second = np.roll(estimates[1], -height, axis=1)
         ramp = np.abs(np.arange(width, dtype=np.float32) + np.float32(0.5) - height) / np.float32(height)
@@ -62,3 +67,23 @@ def _mix(first: Floats, second: Floats, share: Floats) -> Floats:
     mixed = first * (1 - share) + second * share
     found: Floats = np.where(np.isnan(first), second, np.where(np.isnan(second), first, mixed))
     return found
+
+
+@contextmanager
+def named(output: str) -> Iterator[None]:
+    """Within it, a ValueError becomes a ConfigError that names an output."""
+    try:
+        yield
+    except ValueError as error:
+        raise ConfigError(f"{output}: {error}") from error
+
+
+def plane(output: Floats) -> Floats:
+    """(K, h, w) of an output with one channel, on axis 1 or 3. Raises ValueError if it has more."""
+    if output.ndim == 4:
+        axis = 1 if output.shape[1] == 1 else 3
+        if output.shape[axis] == 1:
+            output = output.squeeze(axis)
+    if output.ndim != 3:
+        raise ValueError(f"{output.shape} is not one channel for each image")
+    return output
