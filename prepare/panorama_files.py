@@ -1,9 +1,9 @@
 """The panoramas of an unfinished scene: files of images and layers, before it can be read as a scene."""
 
 import os
-from collections.abc import Callable, Collection, Generator, Iterable
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,11 +15,13 @@ from panolog.prepare.file_kinds import VIDEOS, converted_here, describe_left_out
 from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
-from panolog.scene.files import file_of, natural_key, some_of, stem_of
+from panolog.scene.files import atomic, file_of, natural_key, some_of, stem_of
 from panolog.scene.image_files import decode, decode_used, decode_with_alpha, read_info
 from panolog.scene.pictures.kinds import require_panorama
 from panolog.scene.read import check_names, image_folder, model_folder
+from panolog.scene.write import Progress
 
+_THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama
 _ADDED = ("@eaDir", "__MACOSX")  # folders of Synology's thumbnails and of macOS's archives
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")  # the likeliest first
 LayerFiles = dict[str, list[Path | None]]  # by the name of the layer, for each panorama
@@ -189,6 +191,44 @@ def _filled(pixels: NDArray[np.uint8], used: NDArray[np.bool_]) -> NDArray[np.ui
     filled = pixels.copy()
     filled[~used] = pixels.reshape(used.size, *pixels.shape[2:])[of_label[labels[~used]]]
     return filled
+
+
+def remade(
+    panoramas: Sequence[PanoramaFile],
+    suffixes: Mapping[int, str],
+    folder: Path,
+    write: Callable[[int, Path], None],
+    progress: Progress,
+    fits: Callable[[Path], bool] = lambda _: True,
+) -> tuple[PanoramaFile, ...]:
+    """The panoramas, of which some are other files in `folder`, with the times of those that are given.
+
+    What an earlier call has made of a file that has not changed since is not made again, if it fits.
+    Args: suffixes, of the files that are made, by row; write, called with a row and the path to write to, in
+        threads; fits, whether a file that is there is as it is to be.
+
+    Raises what `write` raises, and OSError.
+    """
+
+    def made(row: int) -> PanoramaFile:
+        panorama = panoramas[row]
+        if row not in suffixes:
+            return panorama
+        name = f"{stem_of(panorama.name)}{suffixes[row]}"
+        output, changed = folder / name, panorama.path.stat().st_mtime_ns
+        if not (output.is_file() and output.stat().st_mtime_ns == changed and fits(output)):
+            output.parent.mkdir(parents=True, exist_ok=True)
+            with atomic(output) as temporary:
+                write(row, temporary)
+                os.utime(temporary, ns=(changed, changed))
+        return replace(panorama, name=name, path=output)
+
+    found = list[PanoramaFile]()
+    with ThreadPoolExecutor(_THREADS, "remade") as pool:
+        for panorama in pool.map(made, range(len(panoramas))):
+            found.append(panorama)
+            progress(len(found), len(panoramas))
+    return tuple(found)
 
 
 def prefetch(function: Callable[[In], Out], items: Iterable[In]) -> Generator[tuple[In, Out], None, None]:

@@ -5,8 +5,6 @@ pixels were changed since, in any editor, the digest does not match and the file
 """
 
 import hashlib
-import struct
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,22 +13,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.prepare.world.image_blocks import with_chunks
 from panolog.scene.errors import InputError, SceneError
 from panolog.scene.image_files import decode, decode_mask, layer_record, not_a_panorama, read_info
 from panolog.scene.pictures.headers import ImageInfo
 
 MAX_BYTES = 2**29  # of pixels, 18,900 x 9,450 in colour: more than any camera has
-
-_KEYWORD = b"PanoLOG"
-_HEADER = 33  # bytes of a PNG before its second chunk: the signature and IHDR
+_KEYWORD = b"PanoLOG\0"
 
 
 def png_with_provenance(pixels: NDArray[np.uint8] | NDArray[np.uint16], key: str) -> bytes:
     """The bytes of a grey PNG of `pixels` (H, W), with a record of `key`, 64 hexadecimal digits."""
     encoded = bytes(cv2.imencode(".png", pixels)[1])
-    text = b"tEXt" + _KEYWORD + b"\0" + f"{key} {_digest(pixels)}".encode()
-    chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
-    return encoded[:_HEADER] + chunk + encoded[_HEADER:]
+    return with_chunks(encoded, (b"tEXt", _KEYWORD + f"{key} {_digest(pixels)}".encode()))
 
 
 @dataclass(frozen=True)

@@ -4,26 +4,21 @@ Pillow decodes AVIF, and HEIC with pi-heif, the decoder of pillow-heif without i
 under the GPL. Pixels are turned as the file says, colours are converted to sRGB, and EXIF and XMP are kept.
 """
 
-import os
 import struct
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image, ImageOps
 from PIL.PngImagePlugin import PngInfo
 
 from panolog.prepare.file_kinds import AVIF, HEIC
-from panolog.prepare.panorama_files import PanoramaFile
+from panolog.prepare.panorama_files import PanoramaFile, remade
 from panolog.prepare.provenance import MAX_BYTES
 from panolog.scene.errors import ImageError, SceneError, require
-from panolog.scene.files import atomic, stem_of
 from panolog.scene.pictures.headers import DAMAGE
 from panolog.scene.pictures.profiles import in_srgb
 from panolog.scene.write import Progress, no_progress
 
-_THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama
 _DAMAGE = (*DAMAGE, RuntimeError)  # which libheif raises as well
 _HEAD = 2**20  # bytes in which a file says what its colours are
 _PLAIN = (1, 2, 5, 6)  # primaries of BT.709, unknown, of BT.601: what sRGB is close to
@@ -40,22 +35,8 @@ def as_png(
     Raises SceneError: a picture is damaged, in HDR or larger than any panorama; MissingPackageError: what
     decodes it is missing; OSError: a file cannot be read or written.
     """
-
-    def converted(panorama: PanoramaFile) -> PanoramaFile:
-        if not is_converted(panorama.path):
-            return panorama
-        name = f"{stem_of(panorama.name)}.png"
-        changed, output = panorama.path.stat().st_mtime_ns, folder / name
-        if not (output.is_file() and output.stat().st_mtime_ns == changed):
-            _convert(panorama.path, output, changed)
-        return replace(panorama, name=name, path=output)
-
-    found = list[PanoramaFile]()
-    with ThreadPoolExecutor(_THREADS, "convert") as pool:
-        for panorama in pool.map(converted, panoramas):
-            found.append(panorama)
-            progress(len(found), len(panoramas))
-    return tuple(found)
+    heic = {row: ".png" for row, panorama in enumerate(panoramas) if is_converted(panorama.path)}
+    return remade(panoramas, heic, folder, lambda row, path: _convert(panoramas[row].path, path), progress)
 
 
 def is_converted(path: Path) -> bool:
@@ -86,8 +67,8 @@ def _open(path: Path) -> Image.Image:
     return picture
 
 
-def _convert(path: Path, output: Path, changed: int) -> None:
-    """Writes a picture as PNG. Args: changed, the time of both files in nanoseconds."""
+def _convert(path: Path, output: Path) -> None:
+    """Writes a picture as PNG."""
     with _open(path) as picture:
         _check_colors(path, picture)
         try:
@@ -100,11 +81,8 @@ def _convert(path: Path, output: Path, changed: int) -> None:
         texts = PngInfo()
         if isinstance(xmp := upright.info.get("xmp"), bytes):
             texts.add_itxt("XML:com.adobe.xmp", xmp.decode(errors="replace"))
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with atomic(output) as temporary:
-            exif = upright.info.get("exif") or b""
-            pixels.save(temporary, "PNG", exif=exif, pnginfo=texts, icc_profile=None, compress_level=1)
-            os.utime(temporary, ns=(changed, changed))
+        exif = upright.info.get("exif") or b""
+        pixels.save(output, "PNG", exif=exif, pnginfo=texts, icc_profile=None, compress_level=1)
 
 
 def _check_colors(path: Path, picture: Image.Image) -> None:

@@ -3,26 +3,22 @@
 A picture that lacks a few rows or columns of 2:1 is stretched, as frames of a video are.
 """
 
-import os
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from panolog.prepare.panorama_files import PanoramaFile
+from panolog.prepare.panorama_files import PanoramaFile, remade
 from panolog.prepare.provenance import MAX_BYTES
 from panolog.prepare.video.layout import whole_width
-from panolog.prepare.world.cropped import write_derived
-from panolog.prepare.world.exif import Exif, read_exif
+from panolog.prepare.world.cropped import derived
+from panolog.prepare.world.exif import read_exif
 from panolog.scene.errors import SceneError
-from panolog.scene.files import some_of, stem_of
+from panolog.scene.files import some_of
 from panolog.scene.image_files import decode_colors, decode_used, not_a_panorama, read_info, resize_used
 from panolog.scene.write import Progress, no_progress
 
-_THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama
 _MOST = 4  # times as wide as another: beyond, one of them is a thumbnail
 _JPEG = (".jpg", ".jpeg")
 
@@ -68,40 +64,30 @@ def to_one_size(
         (panorama.path, info.width, info.height) for panorama, info in zip(panoramas, infos, strict=True)
     )
     size = width, width // 2
-    others = [row for row, info in enumerate(infos) if (info.width, info.height) != size]
-    if not others:
+    suffixes = {
+        row: ".jpg" if panoramas[row].path.suffix.lower() in _JPEG else ".png"
+        for row, info in enumerate(infos)
+        if (info.width, info.height) != size
+    }
+    if not suffixes:
         return tuple(panoramas)
     if 3 * size[0] * size[1] > MAX_BYTES:
         raise SceneError(f"{panoramas[0].path}: {size[0]} x {size[1]} pixels are more than any panorama has")
-    exifs = [read_exif(panoramas[row].path) for row in others]  # not in threads, see there
+    exifs = {row: read_exif(panoramas[row].path) for row in suffixes}  # not in threads, see there
 
-    def enlarged(row: int, exif: Exif) -> PanoramaFile:
-        panorama = panoramas[row]
-        suffix = ".jpg" if panorama.path.suffix.lower() in _JPEG else ".png"
-        name = f"{stem_of(panorama.name)}{suffix}"
-        _enlarge(panorama.path, exif, size, folder / name)
-        return replace(panorama, name=name, path=folder / name)
+    def enlarge(row: int, output: Path) -> None:
+        path = panoramas[row].path
+        used = decode_used(path)
+        pixels = np.asarray(cv2.resize(decode_colors(path), size, interpolation=cv2.INTER_CUBIC), np.uint8)
+        if used is not None:
+            pixels = np.dstack([pixels, np.where(resize_used(used, size), 255, 0).astype(np.uint8)])
+        output.write_bytes(derived(path, exifs[row], pixels, suffixes[row]))
 
-    found = list(panoramas)
-    with ThreadPoolExecutor(_THREADS, "enlarge") as pool:
-        for done, (row, panorama) in enumerate(
-            zip(others, pool.map(enlarged, others, exifs), strict=True), 1
-        ):
-            found[row] = panorama
-            progress(done, len(others))
-    names = [panoramas[row].name for row in others]
+    def fits(path: Path) -> bool:
+        info = read_info(path)
+        return (info.width, info.height) == size
+
+    found = remade(panoramas, suffixes, folder, enlarge, progress, fits)
+    names = [panoramas[row].name for row in suffixes]
     note(f"{some_of(names, 'panorama')} of another size than {size[0]} x {size[1]}: scaled to it")
-    return tuple(found)
-
-
-def _enlarge(path: Path, exif: Exif, size: tuple[int, int], output: Path) -> None:
-    """Writes a panorama at another size, unless it is there; the time of both files is the same."""
-    if output.is_file() and output.stat().st_mtime_ns == path.stat().st_mtime_ns:
-        info = read_info(output)
-        if (info.width, info.height) == size:
-            return
-    used = decode_used(path)
-    pixels = np.asarray(cv2.resize(decode_colors(path), size, interpolation=cv2.INTER_CUBIC), np.uint8)
-    if used is not None:
-        pixels = np.dstack([pixels, np.where(resize_used(used, size), 255, 0).astype(np.uint8)])
-    write_derived(path, exif, pixels, output)
+    return found

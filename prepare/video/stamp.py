@@ -7,7 +7,7 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from panolog.prepare.world.exif import Attitude, GpsFix
-from panolog.prepare.world.image_blocks import XMP_HEAD, with_segments
+from panolog.prepare.world.image_blocks import EXIF_HEAD, with_metadata
 
 _SECOND = 1_000_000  # parts of a second; of a second of arc, one is 30 micrometres on the ground
 _LARGEST = 65_534  # ISO that fits; one more means that it does not
@@ -28,12 +28,9 @@ def stamped(
         taken: when it was taken, in UTC.
         exposure: seconds and ISO.
     """
-    contents = []
-    if fix is not None or taken is not None or exposure is not None:
-        contents.append(_exif(fix, taken, exposure))
-    if attitude is not None:
-        contents.append(XMP_HEAD + attitude.packet)
-    return with_segments(jpeg, *contents)
+    known = fix is not None or taken is not None or exposure is not None
+    exif = _exif(fix, taken, exposure) if known else None
+    return with_metadata(jpeg, exif, attitude and attitude.packet)
 
 
 def _exif(fix: GpsFix | None, taken: datetime | None, exposure: tuple[float, float] | None) -> bytes:
@@ -55,7 +52,7 @@ def _exif(fix: GpsFix | None, taken: datetime | None, exposure: tuple[float, flo
         if fix.altitude is not None:
             gps[ExifTags.GPS.GPSAltitudeRef] = b"\0" if fix.altitude >= 0 else b"\1"
             gps[ExifTags.GPS.GPSAltitude] = Fraction(round(abs(fix.altitude) * 1000), 1000)
-    return exif.tobytes()
+    return exif.tobytes().removeprefix(EXIF_HEAD)
 
 
 def _parts(angle: float) -> tuple[Fraction, Fraction, Fraction]:

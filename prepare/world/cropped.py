@@ -4,29 +4,22 @@ Cameras and stitchers that do not see the zenith or the nadir write the part tha
 full panorama it is (`Exif.crop`). It is put there, and the rest is transparent, which is a mask.
 """
 
-import os
-import struct
-import zlib
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.panorama_files import PanoramaFile
+from panolog.prepare.panorama_files import PanoramaFile, remade
 from panolog.prepare.provenance import MAX_BYTES
 from panolog.prepare.world.exif import Crop, Exif, essential_exif, read_exif
-from panolog.prepare.world.image_blocks import EXIF_HEAD, XMP_HEAD, with_segments
+from panolog.prepare.world.image_blocks import with_metadata
 from panolog.scene.errors import SceneError
-from panolog.scene.files import atomic, stem_of
 from panolog.scene.image_files import decode_colors, decode_used, read_info
 from panolog.scene.pictures.headers import ImageInfo
 from panolog.scene.write import Progress, no_progress
 
-_THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama
-_HEADER = 33  # bytes of a PNG before its second chunk
 _QUALITY = 95  # of a JPEG
 
 
@@ -48,29 +41,30 @@ def complete_panoramas(
                 "belong to pixels as they are stored; turn them with `mogrify -auto-orient FILE`, or, if "
                 "they are upright, remove the entry with `exiftool -Orientation= FILE`"
             )
+    crops = {
+        row: it for row, exif in enumerate(exifs) if (it := _crop(panoramas[row].path, exif)) is not None
+    }
 
-    def complete(panorama: PanoramaFile, exif: Exif) -> PanoramaFile:
-        crop = exif.crop
-        if crop is None or crop.is_whole or not _is_cropped(panorama.path, crop):
-            return panorama
-        name = f"{stem_of(panorama.name)}.png"
-        return PanoramaFile(panorama.root, name, _completed(panorama.path, exif, crop, folder / name))
+    def complete(row: int, output: Path) -> None:
+        path = panoramas[row].path
+        output.write_bytes(derived(path, exifs[row], _placed(path, crops[row]), ".png"))
 
-    found = []
-    with ThreadPoolExecutor(_THREADS, "complete") as pool:
-        for panorama in pool.map(complete, panoramas, exifs):
-            found.append(panorama)
-            progress(len(found), len(panoramas))
-    return tuple(found)
+    return remade(panoramas, dict.fromkeys(crops, ".png"), folder, complete, progress)
 
 
 def whole_size(path: Path) -> tuple[int, int]:
     """(width, height) in pixels of what `complete_panoramas` makes of a picture. Raises SceneError."""
-    info, crop = read_info(path), read_exif(path).crop
-    if crop is None or crop.is_whole or not _is_cropped(path, crop):
+    info, crop = read_info(path), _crop(path, read_exif(path))
+    if crop is None:
         return info.width, info.height
     height = _full_height(info, crop)
     return 2 * height, height
+
+
+def _crop(path: Path, exif: Exif) -> Crop | None:
+    """How a picture is cropped; None if nothing is missing. Raises SceneError as `_is_cropped`."""
+    crop = exif.crop
+    return None if crop is None or crop.is_whole or not _is_cropped(path, crop) else crop
 
 
 def _is_cropped(path: Path, crop: Crop) -> bool:
@@ -101,39 +95,15 @@ def _full_height(info: ImageInfo, crop: Crop) -> int:
     return round(crop.full[1] * info.width / crop.size[0])
 
 
-def _completed(path: Path, exif: Exif, crop: Crop, output: Path) -> Path:
-    """Writes the full panorama of a cropped one, unless it is there; the time of both files is the same."""
-    changed = path.stat().st_mtime_ns
-    if output.is_file() and output.stat().st_mtime_ns == changed:
-        return output
-    write_derived(path, exif, _placed(path, crop), output)
-    return output
+def derived(path: Path, exif: Exif, pixels: NDArray[np.uint8], suffix: str) -> bytes:
+    """What was made of a picture as a file, with the picture's place, time, exposure and attitude.
 
-
-def write_derived(path: Path, exif: Exif, pixels: NDArray[np.uint8], output: Path) -> None:
-    """Writes what was made of a picture, as PNG or JPEG by its suffix.
-
-    With the picture's place, time, exposure and attitude, and the time of its file.
-
-    Args: path, of the picture; exif, its own; pixels (H, W, 3) BGR, or (H, W, 4) with opacity.
-    Raises: OSError, it cannot be written.
+    Args: path, of the picture; exif, its own; pixels (H, W, 3) BGR, or (H, W, 4) with opacity; suffix, .png
+        or .jpg.
     """
-    changed, block = path.stat().st_mtime_ns, essential_exif(path)
-    if output.suffix == ".png":
-        encoded = bytes(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
-        chunks = b"" if block is None else _chunk(b"eXIf", block)
-        if exif.attitude is not None:
-            chunks += _chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + exif.attitude.packet)
-        encoded = encoded[:_HEADER] + chunks + encoded[_HEADER:]
-    else:
-        segments = [] if block is None else [EXIF_HEAD + block]
-        segments += [] if exif.attitude is None else [XMP_HEAD + exif.attitude.packet]
-        encoded = bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
-        encoded = with_segments(encoded, *segments)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    with atomic(output) as temporary:
-        temporary.write_bytes(encoded)
-        os.utime(temporary, ns=(changed, changed))
+    options = (cv2.IMWRITE_PNG_COMPRESSION, 1) if suffix == ".png" else (cv2.IMWRITE_JPEG_QUALITY, _QUALITY)
+    encoded = bytes(cv2.imencode(suffix, pixels, options)[1])
+    return with_metadata(encoded, essential_exif(path), exif.attitude and exif.attitude.packet)
 
 
 def _placed(path: Path, crop: Crop) -> NDArray[np.uint8]:
@@ -153,7 +123,3 @@ def _placed(path: Path, crop: Crop) -> NDArray[np.uint8]:
     full[top:bottom, left:right, :3] = pixels
     full[top:bottom, left:right, 3] = 255 if used is None else np.where(used, 255, 0)
     return full
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

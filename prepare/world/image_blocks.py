@@ -11,6 +11,7 @@ _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _APP1 = 0xE1
 EXIF_HEAD, XMP_HEAD = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"  # of segments of a JPEG
+_PNG_HEADER = 33  # bytes of a PNG before its second chunk: the signature and IHDR
 _PNG_XMP = b"XML:com.adobe.xmp\0"
 _BLOCK = 2**20  # bytes of a PNG's EXIF or XMP; a JPEG's have 65,533 at most
 _READ = 2**22  # bytes that are read in all: the entries of EXIF may all point at the same large block
@@ -116,3 +117,23 @@ def with_segments(jpeg: bytes, *contents: bytes) -> bytes:
     marker = bytes((0xFF, _APP1))
     segments = b"".join(marker + (len(it) + 2).to_bytes(2, "big") + it for it in contents)
     return jpeg[:behind] + segments + jpeg[behind:]
+
+
+def with_chunks(png: bytes, *chunks: tuple[bytes, bytes]) -> bytes:
+    """A PNG with these chunks, each a kind of four characters and its data, before the others but IHDR."""
+    packed = b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
+    return png[:_PNG_HEADER] + packed + png[_PNG_HEADER:]
+
+
+def with_metadata(image: bytes, exif: bytes | None, xmp: bytes | None) -> bytes:
+    """A PNG or JPEG, as OpenCV writes it, with EXIF (a TIFF stream) and an XMP packet, if there are any."""
+    if image.startswith(_PNG):
+        chunks = [] if exif is None else [(b"eXIf", exif)]
+        chunks += [] if xmp is None else [(b"iTXt", _PNG_XMP + b"\0\0\0\0" + xmp)]
+        return with_chunks(image, *chunks)
+    segments = [] if exif is None else [EXIF_HEAD + exif]
+    segments += [] if xmp is None else [XMP_HEAD + xmp]
+    return with_segments(image, *segments)

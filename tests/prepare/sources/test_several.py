@@ -17,6 +17,7 @@ from panolog.scene.read import read_scene
 from panolog.scene.write import StageProgress, no_progress
 from tests.prepare.sfm.accuracy import drift
 from tests.prepare.sources.street import PHOTOGRAPH, STEP, Street, make_street
+from tests.prepare.world.stills import crop, write_still
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +105,21 @@ def test_they_become_one_scene(street: Street, tmp_path: Path) -> None:
     assert sum(it["panoramas"] for it in said) == len(names)
     assert f"GX020001, of {street.second}: " in "\n".join(report.lines())
     assert not workspace_folder(tmp_path / "scene").exists()
+
+
+def test_cropped_photographs_of_several_folders_stay_with_their_folder(tmp_path: Path) -> None:
+    for number, folder in enumerate(("north", "south", "west")):
+        (tmp_path / folder).mkdir()
+        pixels = np.full((40, 128, 3), 50 + 100 * number, np.uint8)
+        panorama = crop((128, 64), 0, 12, (128, 40))
+        write_still(tmp_path / folder / "a.jpg", pixels, panorama=panorama)
+    folders = [tmp_path / it for it in ("north", "south", "west")]
+    found = gather(find_sources(folders), tmp_path / "work", SfmSettings(), no_progress)
+    assert [(it.name, it.source) for it in found.panoramas] == [
+        ("north/a.png", "north"),
+        ("south/a.png", "south"),
+        ("west/a.png", "west"),
+    ]
 
 
 def test_a_trajectory_of_times_is_refused_before_anything_is_done(street: Street, tmp_path: Path) -> None:
