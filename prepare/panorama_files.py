@@ -160,8 +160,7 @@ def load_resized(path: Path, width: int) -> NDArray[np.uint8]:
     """
     info = read_info(path)
     check_panorama_size(path, info)
-    reduction = next(it for it in (8, 4, 2, 1) if info.width >= 2 * it * width or it == 1)
-    pixels, used = decode_with_alpha(path, width, reduction)
+    pixels, used = decode_with_alpha(path, width, quick=True)
     require_panorama(path, np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8))
     return pixels if used is None else _filled(pixels, used)
 

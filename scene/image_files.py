@@ -126,31 +126,34 @@ def decode_colors(path: Path) -> NDArray[np.uint8]:
     return to_srgb(np.asarray(pixels, np.uint8), data)
 
 
-def decode_panorama(path: Path, width: int | None = None, reduction: int = 1) -> NDArray[np.uint8]:
+def decode_panorama(path: Path, width: int | None = None) -> NDArray[np.uint8]:
     """(H, W, 3) sRGB of a panorama, resized to `width` if it is given.
 
-    Poses belong to the pixels as they are stored, so an EXIF orientation does not turn them. With a reduction
-    of 2, 4 or 8 a JPEG is decoded at that fraction of its size, in a fraction of the time and memory. Other
-    formats are decoded whole: OpenCV would take a few pixels of each square and leave the others out.
+    Poses belong to the pixels as they are stored, so an EXIF orientation does not turn them.
 
     Raises ImageError: the file is truncated, cannot be decoded or is not 2:1; SceneError: it is missing or
     cannot be read.
     """
-    return decode_with_alpha(path, width, reduction)[0]
+    return decode_with_alpha(path, width)[0]
 
 
 def decode_with_alpha(
-    path: Path, width: int | None = None, reduction: int = 1
+    path: Path, width: int | None = None, *, quick: bool = False
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """As `decode_panorama`, and (H, W) True = use, as a mask: False where the picture is fully transparent.
 
     None where all of it is to be used. A resized pixel that mixes in anything transparent is not used, and
     its colour is that of its parts by how opaque they are, whatever the file has below transparent ones.
+    A quick one is decoded at a fraction of its size if it is a JPEG at least twice as wide as `width`. Other
+    formats are decoded whole: OpenCV would take a few pixels of each square and leave the others out.
 
     Raises ImageError, SceneError: as `decode_panorama`.
     """
     data = _read(path)
-    reduction = reduction if data.startswith(_JPEG) else 1
+    reduction = 1
+    if quick and width is not None and data.startswith(_JPEG):
+        given = _jpeg(path, BytesIO(data)).width
+        reduction = next(it for it in (8, 4, 2, 1) if given >= 2 * it * width or it == 1)
     pixels = _decoded(path, data, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
     found = pixels.shape[1], pixels.shape[0]
     if reduction == 1 and found[0] != 2 * found[1]:

@@ -1,17 +1,17 @@
 """Panoramas that show nothing: black, or of one other colour, which a model learns as it learns a place."""
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import cv2
 import numpy as np
 
+from panolog.prepare.check.evidence import in_threads
 from panolog.prepare.provenance import read_mask
 from panolog.scene.errors import SceneError
 from panolog.scene.image_files import decode_with_alpha
 from panolog.scene.model import Scene
 
-_WIDTH, _REDUCTION = 256, 8  # pixels of a panorama as it is looked at; by how much a JPEG is decoded smaller
+_WIDTH = 256  # pixels of a panorama as it is looked at
 _PLAIN = 1.0  # of 255: standard deviation of each channel, below which only a compression has made it
 
 
@@ -20,19 +20,17 @@ def find_blank(scene: Scene) -> list[str]:
 
     One that is masked altogether, or cannot be decoded, counts as none.
     """
-    with ThreadPoolExecutor(initializer=cv2.setNumThreads, initargs=(1,)) as threads:
-        blank = threads.map(partial(_is_blank, scene), range(len(scene.panoramas)))
-        return [panorama.name for panorama, it in zip(scene.panoramas, blank, strict=True) if it]
+    blank = in_threads(partial(_is_blank, scene), range(len(scene.panoramas)))
+    return [panorama.name for panorama, it in zip(scene.panoramas, blank, strict=True) if it]
 
 
 def _is_blank(scene: Scene, row: int) -> bool:
-    panorama, width = scene.panoramas[row], min(_WIDTH, scene.width)
-    reduction = _REDUCTION if scene.width >= _REDUCTION * width else 1
+    mask = scene.panoramas[row].mask
     try:
-        picture, used = decode_with_alpha(panorama.image, width, reduction)
-        if panorama.mask is not None:
+        picture, used = decode_with_alpha(scene.panoramas[row].image, min(_WIDTH, scene.width), quick=True)
+        if mask is not None:
             small = cv2.resize(
-                read_mask(panorama.mask).astype(np.uint8), picture.shape[1::-1], interpolation=cv2.INTER_AREA
+                read_mask(mask).astype(np.uint8), picture.shape[1::-1], interpolation=cv2.INTER_AREA
             )
             used = (small > 0) & (True if used is None else used)
     except SceneError:

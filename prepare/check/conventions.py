@@ -6,7 +6,8 @@ from itertools import permutations, product
 
 import numpy as np
 
-from panolog.prepare.check.evidence import Array, Evidence, color_agreement, median_or_zero, project
+from panolog.prepare.check.evidence import Array, Evidence, color_agreement, median_or_zero, offsets
+from panolog.scene.projection import rays_of_fractions
 
 GAIN, FIT = 0.15, 0.3  # least gain over ours, and least fit, of a convention that is reported
 _PER_VIEW = 400  # points of each view that conventions are evaluated on
@@ -74,7 +75,9 @@ def convention_fit(
         seen = evidence.seen[row][thinned]
         directions = (evidence.scene.points[seen] @ convention.world.T - center) @ rotation.T
         if by_tracks and evidence.pixels is not None:
-            found = np.linalg.norm(_bearings(evidence.pixels[row][thinned]) - _unit(directions), axis=1)
+            found = np.linalg.norm(
+                rays_of_fractions(evidence.pixels[row][thinned] * (1, 2)) - _unit(directions), axis=1
+            )
             fits.append(float((found < _INLIER).mean()) if len(found) else 0.0)
         else:
             fits.append(color_agreement(evidence, view, directions, seen))
@@ -83,19 +86,13 @@ def convention_fit(
 
 def _pose(evidence: Evidence, row: int, convention: Convention) -> tuple[Array, Array]:
     """(axes @ R, C) of a panorama in that convention."""
-    rotation, translation = evidence.rotations[row], evidence.translations[row]
+    panorama = evidence.scene.panoramas[row]
+    rotation, translation = panorama.rotation, panorama.translation
     if convention.poses == "inverse":
         return convention.axes @ rotation.T, translation
     if convention.poses == "centres":
         return convention.axes @ rotation, translation
     return convention.axes @ rotation, -rotation.T @ translation
-
-
-def _bearings(pixels: Array) -> Array:
-    """Unit vectors (N, 3) of pixels (N, 2) in units of the width."""
-    longitude, latitude = 2 * np.pi * (pixels[:, 0] - 0.5), 2 * np.pi * (pixels[:, 1] - 0.25)
-    flat = np.cos(latitude)
-    return np.stack([flat * np.sin(longitude), np.sin(latitude), flat * np.cos(longitude)], axis=1)
 
 
 def _unit(vectors: Array) -> Array:
@@ -141,8 +138,6 @@ def residuals(evidence: Evidence) -> Array:
         return np.empty((0, 2))
     found = []
     for row, (seen, pixels) in enumerate(zip(evidence.seen, evidence.pixels, strict=True)):
-        apart = pixels - project(evidence.directions(row, evidence.scene.points[seen]))
-        apart[:, 0] = (apart[:, 0] + 0.5) % 1.0 - 0.5
-        apart[:, 0] *= np.cos(2 * np.pi * (pixels[:, 1] - 0.25))
+        apart = offsets(pixels, evidence.directions(row, evidence.scene.points[seen]))
         found.append(apart * evidence.scene.width)
     return np.concatenate(found)

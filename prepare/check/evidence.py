@@ -1,8 +1,11 @@
 """What the check measures on: some decoded panoramas of a scene, and the points that each of them sees."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +16,7 @@ from panolog.scene.projection import project_to_fractions, project_to_pixels
 from panolog.scene.read import model_folder
 
 Array = NDArray[np.float64]
+Found = TypeVar("Found")
 MEMORY = 400_000_000  # bytes of decoded panoramas
 MOST_VIEWS, FEWEST_VIEWS = 48, 8
 POINTS = 1500  # of each panorama
@@ -31,8 +35,6 @@ class Evidence:
     """A scene of K panoramas and P points, with V views, which are some of the panoramas."""
 
     scene: Scene
-    rotations: Array  # (K, 3, 3) world-to-camera
-    translations: Array  # (K, 3)
     colors: Array  # (P, 3) RGB in [0, 255]
     seen: tuple[NDArray[np.int64], ...]  # K of (M,) rows of points, at most POINTS
     pixels: tuple[Array, ...] | None  # K of (M, 2) where they were observed, in units of the width
@@ -44,15 +46,10 @@ class Evidence:
         """Whether colours of points say nothing, so that only patches and tracks can be checked."""
         return is_colorless(self.colors)
 
-    @property
-    def centers(self) -> Array:
-        """(K, 3)."""
-        centers: Array = -np.einsum("kji,kj->ki", self.rotations, self.translations)
-        return centers
-
     def directions(self, row: int, points: Array) -> Array:
         """(N, 3) points (N, 3) of the world in the axes of panorama `row`."""
-        local: Array = points @ self.rotations[row].T + self.translations[row]
+        panorama = self.scene.panoramas[row]
+        local: Array = points @ panorama.rotation.T + panorama.translation
         return local
 
 
@@ -71,8 +68,6 @@ def gather_evidence(scene: Scene) -> Evidence:
             rows, pixels = _opaque(scene, row, used, rows, pixels)
     return Evidence(
         scene=scene,
-        rotations=np.stack([panorama.rotation for panorama in scene.panoramas]),
-        translations=np.stack([panorama.translation for panorama in scene.panoramas]),
         colors=scene.colors.astype(np.float64),
         seen=rows,
         pixels=pixels,
@@ -177,6 +172,23 @@ def bilinear(picture: NDArray[np.uint8] | NDArray[np.float32], where: Array) -> 
 def project(directions: Array) -> Array:
     """(N, 2) in units of the width, of directions (N, 3) in camera axes."""
     return project_to_fractions(directions) * (1.0, 0.5)
+
+
+def offsets(seen: Array, directions: Array) -> Array:
+    """(N, 2) from where directions (N, 3) in camera axes are to where they are seen (N, 2), along the sphere.
+
+    All in units of the width: u is the shorter way around, shrunk by the cosine of the latitude.
+    """
+    apart = seen - project(directions)
+    apart[:, 0] = (apart[:, 0] + 0.5) % 1.0 - 0.5
+    apart[:, 0] *= np.cos(2 * np.pi * (seen[:, 1] - 0.25))
+    return apart
+
+
+def in_threads(function: Callable[..., Found], *arguments: Iterable[Any]) -> Iterator[Found]:
+    """What a function returns for each panorama, in order; OpenCV has one thread in each thread."""
+    with ThreadPoolExecutor(initializer=cv2.setNumThreads, initargs=(1,)) as threads:
+        yield from threads.map(function, *arguments)
 
 
 def correlation(a: Array, b: Array) -> float:

@@ -11,7 +11,6 @@ numbered as frames of a video are, are tied so that the exposure changes smoothl
 
 import re
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -21,7 +20,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from panolog.prepare.check.evidence import Array, bilinear, likely_seen, project
+from panolog.prepare.check.evidence import Array, bilinear, in_threads, likely_seen, project
 from panolog.prepare.world.exif import read_exif
 from panolog.scene.errors import SceneError
 from panolog.scene.image_files import decode_panorama
@@ -90,12 +89,11 @@ def measure_exposures(scene: Scene, rows: Sequence[int], width: int = WIDTH) -> 
     views, points, values = list[NDArray[np.int64]](), list[NDArray[np.int64]](), list[Array]()
     seen = [_seen(scene, row) for row in rows]
     far = _farthest(scene, seen, rows)
-    with ThreadPoolExecutor(initializer=cv2.setNumThreads, initargs=(1,)) as threads:
-        sampled = threads.map(lambda row, some: _samples(scene, row, some, far, width), rows, seen)
-        for number, (found, colors) in enumerate(sampled):
-            views.append(np.full(len(found), number))
-            points.append(found)
-            values.append(colors)
+    sampled = in_threads(lambda row, some: _samples(scene, row, some, far, width), rows, seen)
+    for number, (found, colors) in enumerate(sampled):
+        views.append(np.full(len(found), number))
+        points.append(found)
+        values.append(colors)
     view, point, value = np.concatenate(views), np.concatenate(points), np.concatenate(values)
     _, point, often = np.unique(point, return_inverse=True, return_counts=True)
     shared = often[point] > 1

@@ -5,10 +5,8 @@ tracks, its picture fits the points no better than if it were turned at random, 
 neither can be measured, only a camera far away from all others is found.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -19,6 +17,7 @@ from panolog.prepare.check.evidence import (
     Array,
     bilinear,
     correlation,
+    in_threads,
     is_colorless,
     likely_seen,
     project,
@@ -84,8 +83,7 @@ def _color_fits(scene: Scene) -> Array:
     if is_colorless(scene.colors):
         return every
     turns = Rotation.random(_TURNED, random_state=1).as_matrix()
-    with ThreadPoolExecutor(initializer=cv2.setNumThreads, initargs=(1,)) as threads:
-        every[:] = list(threads.map(partial(_color_fit, scene, turns), range(len(every))))
+    every[:] = list(in_threads(partial(_color_fit, scene, turns), range(len(every))))
     return every
 
 
@@ -94,14 +92,13 @@ def _color_fit(scene: Scene, turns: Array, row: int) -> tuple[float, float]:
 
     Args: turns (N, 3, 3) of the camera. NaN where it sees few, or shows nothing.
     """
-    panorama, width = scene.panoramas[row], min(_WIDTH, scene.width)
+    panorama = scene.panoramas[row]
     seen = panorama.observed
     if len(seen) < FEWEST:
         seen = likely_seen(scene.points, panorama.center)
     seen = seen[:: max(1, len(seen) // POINTS)]
-    reduction = next(it for it in (8, 4, 2, 1) if scene.width >= 2 * it * width or it == 1)
     try:
-        picture, used = decode_with_alpha(panorama.image, width, reduction)
+        picture, used = decode_with_alpha(scene.panoramas[row].image, min(_WIDTH, scene.width), quick=True)
     except SceneError:
         return np.nan, np.nan
     if len(seen) < FEWEST or not picture.std() > 0 or (used is not None and not used.any()):

@@ -107,7 +107,7 @@ def patch_agreement(evidence: Evidence) -> float:
 
 def _pairs(evidence: Evidence) -> list[tuple[int, int]]:
     """Each view with the nearest other one."""
-    centers = evidence.centers[list(evidence.views)]
+    centers = evidence.scene.centers[list(evidence.views)]
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     np.fill_diagonal(apart, np.inf)
     return [(view, int(np.argmin(apart[view]))) for view in range(len(centers))]
@@ -116,7 +116,7 @@ def _pairs(evidence: Evidence) -> list[tuple[int, int]]:
 def _patches(evidence: Evidence, a: int, b: int, point: int) -> float:
     rows = evidence.views[a], evidence.views[b]
     place = evidence.scene.points[point]
-    sight = place - evidence.centers[rows[0]]
+    sight = place - evidence.scene.centers[rows[0]]
     distance = float(np.linalg.norm(sight))
     across = np.linalg.svd(sight[None] / max(distance, 1e-12))[2][1:]  # (2, 3) unit vectors
     size = distance * 2 * np.pi / evidence.pictures[a].shape[1] * 1.5

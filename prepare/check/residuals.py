@@ -5,7 +5,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from panolog.prepare.check.evidence import Array, project
+from panolog.prepare.check.evidence import Array, offsets
 from panolog.scene.colmap import ColmapImage, read_colmap
 from panolog.scene.model import Scene
 from panolog.scene.read import model_folder
@@ -35,10 +35,7 @@ def measure_residuals(scene: Scene, tracks: Tracks) -> Array:
         if image is None or len(image.points) < FEWEST:
             continue
         local = scene.points[image.points] @ panorama.rotation.T + panorama.translation
-        seen = image.pixels / image.camera.width
-        apart = seen - project(local)
-        apart[:, 0] = (apart[:, 0] + 0.5) % 1.0 - 0.5
-        apart[:, 0] *= np.cos(2 * np.pi * (seen[:, 1] - 0.25))
+        apart = offsets(image.pixels / image.camera.width, local)
         found[row] = float(np.median(np.linalg.norm(apart, axis=1))) * scene.width
     return found
 

@@ -99,7 +99,7 @@ def check_scene(scene: Scene) -> SceneCheck:
     apart = residuals(evidence)
     patches = patch_agreement(evidence)
     shift = None if evidence.colorless else common_shift(evidence)
-    up = -evidence.rotations[:, 1].mean(axis=0)
+    up = -np.mean([panorama.rotation[1] for panorama in scene.panoramas], axis=0)
     reprojection = float(np.median(np.linalg.norm(apart, axis=1))) if len(apart) else None
     problems = _conventions(evidence, reprojection)
     colors, exposures = None, measure_exposures(scene, range(len(scene.panoramas)))
