@@ -72,7 +72,7 @@ def _inverse(outputs: dict[str, Floats], manifest: DepthManifest) -> Floats:
     with named(f"output {what.output}"):
         raw, factor = plane(outputs[what.output]), np.float32(what.factor or 1)
         with np.errstate(divide="ignore", over="ignore"):  # too near for a number: not finite, so no value
-            inverse = 1 / (raw * factor) if what.kind == "depth" else raw / factor
+            inverse = np.asarray(1 / (raw * factor) if what.kind == "depth" else raw / factor, np.float32)
         known = np.isfinite(inverse) & ((raw > 0) | (what.kind != "depth"))
         inverse = np.where(known, inverse, np.float32(np.nan))
         found = blend(inverse, manifest.input, match_scale if what.factor is None else None)

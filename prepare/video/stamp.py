@@ -30,7 +30,7 @@ def stamped(
     """
     known = fix is not None or taken is not None or exposure is not None
     exif = _exif(fix, taken, exposure) if known else None
-    return with_metadata(jpeg, exif, attitude and attitude.packet)
+    return with_metadata(jpeg, exif, None if attitude is None else attitude.packet)
 
 
 def _exif(fix: GpsFix | None, taken: datetime | None, exposure: tuple[float, float] | None) -> bytes:

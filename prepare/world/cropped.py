@@ -103,7 +103,8 @@ def derived(path: Path, exif: Exif, pixels: NDArray[np.uint8], suffix: str) -> b
     """
     options = (cv2.IMWRITE_PNG_COMPRESSION, 1) if suffix == ".png" else (cv2.IMWRITE_JPEG_QUALITY, _QUALITY)
     encoded = bytes(cv2.imencode(suffix, pixels, options)[1])
-    return with_metadata(encoded, essential_exif(path), exif.attitude and exif.attitude.packet)
+    xmp = None if exif.attitude is None else exif.attitude.packet
+    return with_metadata(encoded, essential_exif(path), xmp)
 
 
 def _placed(path: Path, crop: Crop) -> NDArray[np.uint8]:
