@@ -6,7 +6,7 @@ side s·2^(k−1) is merged (`partition.levels`): the same sides in all leaves, 
 neighbours on the same level without a step.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from panolog.export.splats import REST, Splats, SplatSource
 from panolog.partition.array_file import sorted_runs
 from panolog.partition.levels import Levels, make_levels
 
+Corners = tuple[NDArray[np.float64], NDArray[np.float64]]  # lower and upper of a box, (3,) each
 MOST = 512 * 1024  # Gaussians of a leaf
 SIDE = 16.0  # metres of a leaf, at most
 _LEAST = 4096  # Gaussians, of which at least a leaf has that is cut because it is large
@@ -123,6 +124,12 @@ class Detail:
         for k in range(1, len(self.sides)):
             level = made.levels[min(k, len(made.levels) - 1)]
             yield _splats(made, np.arange(level.starts[0], level.starts[-1]), own.degree)
+
+
+def around(boxes: Sequence[Corners]) -> Corners:
+    """The box that holds some boxes, at least one."""
+    lower, upper = zip(*boxes, strict=True)
+    return np.min(lower, axis=0), np.max(upper, axis=0)
 
 
 def _merging_side(means: NDArray[np.float32], rows: NDArray[np.int32]) -> float:

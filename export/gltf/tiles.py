@@ -19,14 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.export.detail import SIDE, Detail, Leaf, Node
+from panolog.export.detail import SIDE, Corners, Detail, Leaf, Node, around
 from panolog.export.gltf.glb import BASE, SPZ, encode_glb
 from panolog.export.splats import InMemory, Splats, SplatSource
 from panolog.scene.errors import FormatError
 from panolog.scene.files import StrPath, atomic_folder, write_bytes
 
 Doubles = NDArray[np.float64]
-Corners = tuple[Doubles, Doubles]  # lower and upper, (3,) each
 
 TILESET = "tileset.json"  # the index of a folder
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a tileset's axes of those of its content
@@ -121,7 +120,7 @@ def _tile_of(node: Node, leaves: list[_Tile]) -> _Tile:
     if node.children is None:
         return leaves[node.leaf or 0]
     children = tuple(_tile_of(child, leaves) for child in node.children)
-    corners = _around([child.corners for child in children])
+    corners = around([child.corners for child in children])
     return _Tile(corners, max(_size(corners), *(child.error for child in children)), None, children)
 
 
@@ -131,7 +130,7 @@ def _write_leaf(folder: Path, leaf: Leaf, sides: tuple[float, ...]) -> _Tile:
     for level in range(1, len(leaf.levels)):
         if len(leaf.levels[level]) < _FEWER * len(leaf.levels[chosen[-1]]):
             chosen.append(level)
-    corners = _around([_corners(leaf.levels[level]) for level in chosen])
+    corners = around([_corners(leaf.levels[level]) for level in chosen])
     tile: _Tile | None = None
     for level in chosen:
         name = f"{leaf.node.leaf}-{level}.glb"
@@ -155,8 +154,3 @@ def _corners(splats: Splats) -> Corners:
 
 def _size(corners: Corners) -> float:
     return float(np.linalg.norm(corners[1] - corners[0]))
-
-
-def _around(parts: list[Corners]) -> Corners:
-    lower, upper = zip(*parts, strict=True)
-    return np.min(lower, axis=0), np.max(upper, axis=0)

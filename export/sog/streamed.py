@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.export.detail import MOST, SIDE, Detail, Node
+from panolog.export.detail import MOST, SIDE, Corners, Detail, Node, around
 from panolog.export.sog.folder import GENERATOR, INDEX, META, new_folder, save
 from panolog.export.sog.write import encode, json_bytes, numbers, threads
 from panolog.export.splats import InMemory, Splats, SplatSource
@@ -31,22 +30,6 @@ class _Place(TypedDict):
     file: int
     offset: int
     count: int
-
-
-@dataclass(eq=False)
-class _Box:
-    """The bounds of Gaussians with their sizes."""
-
-    lower: NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.inf))
-    upper: NDArray[np.float64] = field(default_factory=lambda: np.full(3, -np.inf))
-
-    def extend(self, lower: NDArray[np.floating], upper: NDArray[np.floating]) -> None:
-        """Makes it contain another box."""
-        self.lower, self.upper = np.minimum(self.lower, lower), np.maximum(self.upper, upper)
-
-    def json(self) -> dict[str, list[float]]:
-        """As the format has it."""
-        return {"min": numbers(self.lower.astype(np.float32)), "max": numbers(self.upper.astype(np.float32))}
 
 
 @dataclass(eq=False)
@@ -115,14 +98,12 @@ def write_streamed(
         raise FormatError("nothing is selected: a model that streams needs at least one Gaussian")
     with new_folder(Path(folder)) as temporary, threads() as pool:
         detail = Detail(source, temporary, side=side, most=most, levels=levels)
-        chunks, boxes = _Chunks(temporary, pool, most), list[_Box]()
+        chunks, boxes = _Chunks(temporary, pool, most), list[Corners]()
         places: list[dict[str, _Place]] = []
         for leaf in detail.leaves():
             shown = [(level, splats) for level, splats in enumerate(leaf.levels) if len(splats)]
             places.append({str(level): chunks.add(level, splats) for level, splats in shown})
-            boxes.append(_Box())
-            for _, splats in shown:
-                boxes[-1].extend(*bounds(splats))
+            boxes.append(around([bounds(splats) for _, splats in shown]))
         chunks.finish()
         meta: dict[str, Any] = {
             "version": 1,
@@ -139,21 +120,22 @@ def write_streamed(
         save(temporary, {INDEX: json_bytes(meta)})
 
 
-def bounds(splats: Splats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def bounds(splats: Splats) -> Corners:
     """(lower, upper), each (3,), of boxes of one standard deviation around Gaussians, as viewers expect."""
     matrices = np.abs(Rotation.from_quat(splats.quats, scalar_first=True).as_matrix())
     reach = (matrices @ np.exp(splats.scales.astype(np.float64))[:, :, None])[:, :, 0]
     return (splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)
 
 
-def _tree(node: Node, boxes: list[_Box], places: list[dict[str, _Place]]) -> tuple[_Box, dict[str, Any]]:
+def _tree(
+    node: Node, boxes: list[Corners], places: list[dict[str, _Place]]
+) -> tuple[Corners, dict[str, Any]]:
     """The box of a node of the tree, and the node as the format has it."""
     if node.children is None:
         assert node.leaf is not None
-        return boxes[node.leaf], {"bound": boxes[node.leaf].json(), "lods": places[node.leaf]}
-    box, children = _Box(), []
-    for child in node.children:
-        own, found = _tree(child, boxes, places)
-        box.extend(own.lower, own.upper)
-        children.append(found)
-    return box, {"bound": box.json(), "children": children}
+        box, content = boxes[node.leaf], dict[str, Any](lods=places[node.leaf])
+    else:
+        inner, children = zip(*(_tree(child, boxes, places) for child in node.children), strict=True)
+        box, content = around(inner), {"children": list(children)}
+    lower, upper = (numbers(side.astype(np.float32)) for side in box)
+    return box, {"bound": {"min": lower, "max": upper}, **content}
