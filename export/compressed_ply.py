@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.export.order import means_of, morton_order, places_in
-from panolog.export.splats import REST, Splats, SplatSource, with_rows
+from panolog.export.splats import REST, Splats, SplatSource, packed_but_largest, quaternions, with_rows
 from panolog.scene.errors import FormatError, PlyError
 from panolog.scene.files import StrPath, atomic
+from panolog.scene.gaussians import SH_C0
 
 Doubles = NDArray[np.float64]
 Words = NDArray[np.uint32]
@@ -37,7 +38,6 @@ _PLAIN = 12  # of the bounds that files without colours in them have
 _WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _TYPES = {"chunk": "float", "vertex": "uint", "sh": "uchar"}
 _KINDS = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
-_C0 = 0.28209479177387814  # spherical harmonic of degree 0
 _SH = 4.0  # largest coefficient of the degrees beyond
 _SIZE = 20.0  # largest logarithm of a scale
 _FULL = 30.0  # logit that stands for an opacity of 1, and minus it for 0
@@ -102,7 +102,7 @@ def _order(means: NDArray[np.float32]) -> NDArray[np.int64]:
 def _columns(piece: Splats) -> Doubles:
     """(N, 9) what has bounds: the position, the logarithms of the scales, and the colour."""
     sizes = piece.scales.clip(-_SIZE, _SIZE)
-    return np.concatenate([piece.means, sizes, piece.sh0 * _C0 + 0.5], axis=1).astype(np.float64)
+    return np.concatenate([piece.means, sizes, piece.sh0 * SH_C0 + 0.5], axis=1).astype(np.float64)
 
 
 def _bounds(source: SplatSource, place: NDArray[np.int32]) -> NDArray[np.float32]:
@@ -156,22 +156,13 @@ def _pack_rotations(quats: NDArray[np.float32]) -> Words:
     largest = np.abs(quats).argmax(axis=1)
     q = quats * np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1.0, 1.0)
     codes = np.rint((q * np.sqrt(0.5) + 0.5).clip(0, 1) * 1023).astype(np.uint32)
-    packed = largest.astype(np.uint32)
-    for axis in range(4):
-        packed = np.where(largest == axis, packed, packed << np.uint32(10) | codes[:, axis])
-    return np.asarray(packed, np.uint32)
+    return packed_but_largest(codes, largest)
 
 
 def _unpack_rotations(words: Words) -> NDArray[np.float32]:
     """(N, 4) w x y z, unit."""
-    largest = (words >> 30).astype(np.int64)
     others = (_apart(words, (2, 10, 10, 10))[:, 1:] - 0.5) * np.sqrt(2.0)
-    rest = np.sqrt(np.maximum(0, 1 - (others * others).sum(axis=1)))
-    places = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-    q = np.empty((len(words), 4))
-    np.put_along_axis(q, places[largest], others, 1)
-    np.put_along_axis(q, largest[:, None], rest[:, None], 1)
-    return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True), np.float32)
+    return np.asarray(quaternions(others, words >> 30), np.float32)
 
 
 def _unpacked(vertices: NDArray[Any], chunks: Doubles, rest: NDArray[Any] | None) -> Splats:
@@ -202,7 +193,7 @@ def _unpack(vertices: NDArray[Any], bounds: Doubles, codes: NDArray[np.uint8]) -
         "quats": _unpack_rotations(vertices["packed_rotation"]),
         "scales": bounds[:, 6:9] * (1 - sizes) + bounds[:, 9:12] * sizes,
         "opacities": opacities.clip(-_FULL, _FULL),
-        "sh0": (shades - 0.5) / _C0,
+        "sh0": (shades - 0.5) / SH_C0,
         "shN": (sh * (2 * _SH)).reshape(len(codes), 3, -1).transpose(0, 2, 1),
     }
 

@@ -18,6 +18,7 @@ Part = Literal["scene", "sky", "all"]
 
 REST = (0, 3, 8, SH_REST)  # coefficients of one channel beyond degree 0, by degree
 ROWS = 65_536  # of a piece
+KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # components of four, by which is left out
 _INSIDE = 0.999  # of a reach, which a model that was larger has
 _SKY = 20.0  # times as far as the scene reaches: viewers sort by 16 bits of the largest distance
 _LIMIT = (
@@ -274,3 +275,20 @@ class ModelSource:
             chosen = piece.select(self.selection.keeps(piece, scene))
             if len(chosen):
                 yield chosen
+
+
+def quaternions(kept: NDArray[np.floating], largest: NDArray[np.integer]) -> NDArray[np.floating]:
+    """(N, 4) of length 1, of their three smaller components (N, 3) in order and which one is the largest."""
+    found = np.empty((len(kept), 4), kept.dtype)
+    np.put_along_axis(found, KEPT[largest], kept, axis=1)
+    rest = np.sqrt(np.maximum(0, 1 - np.square(kept).sum(axis=1, keepdims=True)))
+    np.put_along_axis(found, largest[:, None].astype(np.int64), rest, axis=1)
+    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+
+
+def packed_but_largest(codes: NDArray[np.uint32], largest: NDArray[np.integer]) -> NDArray[np.uint32]:
+    """(N,) words of which component is the largest, and the codes (N, 4) of the others, 10 bits of each."""
+    packed = largest.astype(np.uint32)
+    for code in np.take_along_axis(codes, KEPT[largest], axis=1).T:
+        packed = packed << np.uint32(10) | code
+    return packed

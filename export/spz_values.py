@@ -9,7 +9,7 @@ three smallest of x y z w with 9 bits and a sign each, and 2 bits for which one 
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.export.splats import REST, Splats
+from panolog.export.splats import REST, Splats, packed_but_largest, quaternions
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -102,34 +102,21 @@ def _pack_rotations(quats: Floats) -> Bytes:
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     negative = (q < 0) ^ (np.take_along_axis(q, largest[:, None], 1) < 0)
     magnitudes = np.rint(np.abs(q) * _MAGNITUDE).clip(0, 511).astype(np.uint32)
-    codes, packed = magnitudes | negative.astype(np.uint32) << 9, largest.astype(np.uint32)
-    for axis in range(4):
-        packed = np.where(largest == axis, packed, packed << np.uint32(10) | codes[:, axis])
+    packed = packed_but_largest(magnitudes | negative.astype(np.uint32) << 9, largest)
     return np.asarray(packed, "<u4").view(np.uint8).reshape(-1, 4)
 
 
 def _unpack_smallest(packed: Bytes) -> Floats:
     """(N, 4) w x y z of what `_pack_rotations` gives."""
-    left = np.ascontiguousarray(packed).view("<u4")[:, 0]
-    largest = left >> 30
-    q = np.zeros((len(packed), 4))
-    for axis in (3, 2, 1, 0):
-        others = largest != axis
-        signs = np.where(left & 512, -1.0, 1.0)
-        q[:, axis] = np.where(others, signs * (left & 511) / _MAGNITUDE, 0)
-        left = np.where(others, left >> 10, left)
-    rest = np.sqrt(np.maximum(0, 1 - (q * q).sum(axis=1)))
-    np.put_along_axis(q, largest[:, None].astype(np.int64), rest[:, None], 1)
-    return _unit(q)
+    words = np.ascontiguousarray(packed).view("<u4")
+    codes = words >> np.array([20, 10, 0], np.uint32)
+    others = np.where(codes & 512, -1.0, 1.0) * (codes & 511) / _MAGNITUDE
+    return np.asarray(quaternions(others, words[:, 0] >> 30)[:, [3, 0, 1, 2]], np.float32)
 
 
 def _unpack_first(packed: Bytes) -> Floats:
     """(N, 4) w x y z of (N, 3), x y z, as version 2 has them: w is not negative."""
     xyz = packed / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(axis=1, keepdims=True)))
-    return _unit(np.concatenate([xyz, w], axis=1))
-
-
-def _unit(q: NDArray[np.float64]) -> Floats:
-    """(N, 4) w x y z, of length 1, of x y z w, of which one has been made so that the length is about 1."""
-    return np.asarray(q[:, [3, 0, 1, 2]] / np.linalg.norm(q, axis=1, keepdims=True), np.float32)
+    quats = np.concatenate([w, xyz], axis=1)
+    return np.asarray(quats / np.linalg.norm(quats, axis=1, keepdims=True), np.float32)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from panolog.export.order import morton_order, places_in
 from panolog.export.sog.codebook import Histogram, nearest
 from panolog.export.sog.palette import Palette, make_palette, palette_size, sample_size, step_of, units
-from panolog.export.splats import REST, Splats, SplatSource, with_rows
+from panolog.export.splats import KEPT, REST, Splats, SplatSource, with_rows
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -32,7 +32,6 @@ _UNIT = 16.0  # the integer weight of a usual Gaussian in the palette
 _AHEAD = 2  # pieces in work besides the one that is read
 _LOGARITHM = 30.0  # at most, so that exp is finite in float32
 _CHANNELS = {"means_l": 3, "means_u": 3, "scales": 3, "quats": 4, "sh0": 4}  # images of any model
-KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # components of w x y z, by which is left out
 
 
 @dataclass(eq=False)

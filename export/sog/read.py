@@ -19,10 +19,10 @@ from PIL import Image
 
 from panolog.export.sog.archive import Archive, Folder
 from panolog.export.sog.folder import INDEX, META
-from panolog.export.sog.layers import COLUMNS, KEPT
+from panolog.export.sog.layers import COLUMNS
 from panolog.export.sog.palette import MOST as MOST_ENTRIES
 from panolog.export.sog.write import MOST
-from panolog.export.splats import REST, Splats
+from panolog.export.splats import REST, Splats, quaternions
 from panolog.scene.errors import FormatError
 from panolog.scene.files import StrPath
 from panolog.scene.pictures.headers import DAMAGE, read_header
@@ -129,10 +129,7 @@ def _quats(pixels: Bytes, where: Path) -> Floats:
             f"{where}: {int((largest < 0).sum()):,} quaternions have a reserved form; export it again"
         )
     kept = (pixels[:, :3] / np.float32(255) - np.float32(0.5)) * np.float32(2**0.5)
-    quats = np.zeros((len(pixels), 4), np.float32)
-    np.put_along_axis(quats, KEPT[largest], kept, axis=1)
-    quats[np.arange(len(quats)), largest] = np.sqrt(np.maximum(0, 1 - np.square(kept).sum(axis=1)))
-    return np.asarray(quats / np.linalg.norm(quats, axis=1, keepdims=True), np.float32)
+    return np.asarray(quaternions(kept, largest), np.float32)
 
 
 def _rest(meta: _Meta, files: Folder | Archive, labels: Bytes) -> Floats:
