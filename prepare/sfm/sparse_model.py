@@ -35,25 +35,6 @@ class SparseModel:
         points = similarity.points(self.points)
         return replace(self, rotations=rotations, translations=translations, points=points)
 
-    def part(self, rows: Sequence[int]) -> "SparseModel":
-        """The panoramas `rows` alone, with the points that at least two of them see."""
-        chosen = [place for place, row in enumerate(self.rows) if row in set(rows)]
-        seen = np.concatenate([np.empty(0, np.int64), *(self.sightings[place][0] for place in chosen)])
-        kept = np.bincount(seen, minlength=len(self.points)) >= 2
-        of_old = np.cumsum(kept) - 1
-        sightings = []
-        for place in chosen:
-            points, where = self.sightings[place]
-            held = kept[points]
-            sightings.append((of_old[points[held]], where[held]))
-        return SparseModel(
-            tuple(self.rows[place] for place in chosen),
-            self.rotations[chosen],
-            self.translations[chosen],
-            self.points[kept],
-            tuple(sightings),
-        )
-
     def points_seen_by(self, views: int) -> int:
         """How many points are seen by at least `views` panoramas."""
         rows = np.concatenate([np.empty(0, np.int64), *(rows for rows, _ in self.sightings)])

@@ -21,11 +21,6 @@ class Posed:
     poses: dict[int, tuple[Array, Array]]  # of rows with a pose: world-to-camera (3, 3) and (3,)
     points: dict[int, Array]  # of these rows (N, 3) the point of each feature, NaN without one
 
-    @property
-    def centers(self) -> dict[int, Array]:
-        """(3,) of rows with a pose."""
-        return {row: -rotation.T @ shift for row, (rotation, shift) in self.poses.items()}
-
 
 def posed(model: pycolmap.Reconstruction, ids: Sequence[int]) -> Posed:
     """The poses and points of a model whose images have the database's `ids`, one for each row."""

@@ -4,13 +4,13 @@ Neighbours in the order of capture show the same place. Where panoramas were not
 share most of the sphere do: `Evidence` measures how much of it they share, not by the number of matches.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, minimum_spanning_tree
 
 from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair, best_coverage
 
@@ -119,25 +119,13 @@ def _strongest_tree(
     what is right. Panoramas that are `given` are connected from the start.
     """
     rank = {edge: place for place, edge in enumerate(first)}
-    label, tree = list(range(count)), set[Edge]()
-    for row in given:
-        label[row] = min(given)
-
-    def root(row: int) -> int:
-        while label[row] != row:
-            label[row] = label[label[row]]
-            row = label[row]
-        return row
-
     order = sorted(
-        pairs,
+        (pair for pair in pairs if not set(given).issuperset(pair.between)),
         key=lambda it: (rank.get(it.between, len(rank)), -it.coverage, -len(it.matches), it.between),
     )
-    for pair in order:
-        a, b = (root(row) for row in pair.between)
-        if a != b:
-            label[b] = a
-            tree.add(pair.between)
+    star = [(min(given), row) for row in given if row > min(given)]
+    edges = [*star, *(pair.between for pair in order)]
+    tree = set(_spanning(edges, np.arange(1.0, len(edges) + 1), count)).difference(star)
     usual = [pair.coverage for pair in pairs if pair.between in tree]
     least = LIKE_OTHERS * float(np.median(usual)) if usual else 0.0
     return tree - {pair.between for pair in pairs if pair.coverage < least} | (tree & weak)
@@ -148,8 +136,7 @@ def hops(edges: Iterable[Edge], count: int, between: Iterable[Edge], most: float
 
     Of few panoramas to all others at a time: a table of all of them would take gigabytes.
     """
-    rows, columns = zip(*edges, strict=True) if (edges := sorted(edges)) else ((), ())
-    graph = csr_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    graph = _graph(edges, count)
     others: dict[int, list[int]] = {}
     for one, other in between:
         others.setdefault(one, []).append(other)
@@ -163,36 +150,35 @@ def hops(edges: Iterable[Edge], count: int, between: Iterable[Edge], most: float
 
 def components(edges: Iterable[Edge], count: int) -> NDArray[np.int32]:
     """(count,) the number of the part of a graph that each panorama belongs to."""
-    rows, columns = zip(*edges, strict=True) if (edges := sorted(edges)) else ((), ())
-    graph = csr_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1])
+    return np.asarray(connected_components(_graph(edges, count), directed=False)[1])
 
 
 def widest_tree(pairs: Iterable[Pair], count: int) -> dict[Edge, float]:
     """The trees of pairs whose least coverage on the way between any two panoramas is largest, with these."""
     coverage = {pair.between: pair.coverage for pair in pairs}
-    rows, columns = zip(*coverage, strict=True) if coverage else ((), ())
     costs = 2.0 - np.array(list(coverage.values()))  # a graph takes 0 for no edge
-    graph = csr_array((costs, (rows, columns)), shape=(count, count))
-    tree = minimum_spanning_tree(graph).tocoo()
-    edges = zip(tree.row.tolist(), tree.col.tolist(), strict=True)
-    return {edge: coverage[edge] for edge in edges}
+    return {edge: coverage[edge] for edge in _spanning(list(coverage), costs, count)}
 
 
 def tree_path(tree: Iterable[Edge], ends: Edge) -> list[Edge]:
     """The edges of a tree between two panoramas, empty if they are not connected."""
-    near: dict[int, list[int]] = {}
-    for a, b in sorted(tree):
-        near.setdefault(a, []).append(b)
-        near.setdefault(b, []).append(a)
-    before, open_ = {ends[0]: ends[0]}, [ends[0]]
-    for row in open_:
-        for other in near.get(row, []):
-            if other not in before:
-                before[other] = row
-                open_.append(other)
-    path, row = [], ends[1]
-    while row in before and row != ends[0]:
-        path.append((min(row, before[row]), max(row, before[row])))
-        row = before[row]
+    edges = list(tree)
+    graph = _graph(edges, 1 + max(map(max, (*edges, ends))))
+    before = breadth_first_order(graph, ends[0], directed=False)[1]  # negative: of the first, or not reached
+    path, row = list[Edge](), ends[1]
+    while (last := int(before[row])) >= 0:
+        path.append((min(row, last), max(row, last)))
+        row = last
     return path
+
+
+def _graph(edges: Iterable[Edge], count: int, costs: NDArray[np.float64] | None = None) -> csr_array:
+    """(count, count) with the costs of edges, or 1."""
+    table = np.array(list(edges), np.int64).reshape(-1, 2)
+    return csr_array((np.ones(len(table)) if costs is None else costs, tuple(table.T)), shape=(count, count))
+
+
+def _spanning(edges: Sequence[Edge], costs: NDArray[np.float64], count: int) -> Iterator[Edge]:
+    """The edges of the cheapest tree of each part of a graph. Args: costs, above 0."""
+    tree = minimum_spanning_tree(_graph(edges, count, costs)).tocoo()
+    return zip(tree.row.tolist(), tree.col.tolist(), strict=True)

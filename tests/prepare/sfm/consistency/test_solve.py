@@ -28,7 +28,9 @@ def _solve(place: Square) -> Solution:
 def _error(place: Square, found: Solution) -> float:
     """Metres, of all panoramas."""
     assert len(found.found.poses) == len(place.centers)
-    return drift(np.stack([found.found.centers[row] for row in range(COUNT)]), place.centers)
+    return drift(
+        np.stack([-turn.T @ shift for _, (turn, shift) in sorted(found.found.poses.items())]), place.centers
+    )
 
 
 def test_neighbours_in_order_outweigh_sides_that_look_the_same_and_give_equal_poses(tmp_path: Path) -> None:
