@@ -1,8 +1,9 @@
 """`panolog scene sfm`: from folders of panoramas and 360° videos to a scene."""
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -81,9 +82,7 @@ def make_scene(
         raise ConfigError("--distance and --trajectory both say how large the world is; leave out one")
     known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
     given = [source] if isinstance(source, Path) else source
-    for path in given:
-        if pictures_below(path).resolve() in output.resolve().parents:
-            raise SceneError(f"{output}: is inside {path}, whose pictures are read; give a folder elsewhere")
+    check_place(output, given)
     sources, folder = find_sources(given), workspace_folder(output.resolve())
     if known is not None:
         check_times(known, [it.is_video for it in sources.all])
@@ -148,10 +147,9 @@ def _write(output: Path, folder: Path, report: SfmReport, link: bool, progress: 
         return
     require_new(scene)
     begun.touch()
-    new = _scene(report.found, report.world)
     write_scene(
         scene,
-        new,
+        new_scene(report.found, _offset(report.world)),
         link=link,
         progress=lambda d, n: progress("scene", d, n),
         complete=lambda folder: write_report(folder, report),
@@ -225,32 +223,45 @@ def _places(
     return places_of(known, [panorama.name for panorama in panoramas], times)
 
 
-def _scene(found: Reconstruction, world: Georeference) -> NewScene:
-    """The scene to be written, in the natural order of names: that of `found` is that of capture."""
+def new_scene(
+    found: Reconstruction,
+    offset: Offset | None,
+    colors: NDArray[np.uint8] | None = None,
+    split: Mapping[str, Sequence[str]] | None = None,
+    known: Sequence[PosedImage] = (),
+) -> NewScene:
+    """The scene to be written, in the natural order of names: that of `found` is that of capture.
+
+    Args: colors and split, as of `NewScene`; known, the first panoramas of the model, whose poses are kept
+        bit by bit.
+    """
     model = found.model
-    names = [found.panoramas[row].name for row in model.rows]
-    order = sorted(range(len(names)), key=lambda place: natural_key(names[place]))
-    rows = [model.rows[place] for place in order]
-    offset = None
-    if world.metric:
-        offset = Offset(offset=(0.0, 0.0, 0.0), metres=1.0)
-    if world.gps is not None:
-        offset = Offset(offset=(0.0, 0.0, 0.0), frame="ENU", origin=world.gps.fixes.origin)
-    images = [
-        PosedImage(
-            names[place],
-            found.panoramas[model.rows[place]].path,
-            model.rotations[place],
-            model.translations[place],
-            model.sightings[place],
-        )
-        for place in order
-    ]
+    kept = [it.quaternion for it in known]
+    poses = zip_longest(model.rows, model.rotations, model.translations, model.sightings, kept)
+    images = [PosedImage(found.panoramas[row].name, found.panoramas[row].path, *pose) for row, *pose in poses]
+    order = sorted(range(len(images)), key=lambda place: natural_key(images[place].name))
     return NewScene(
-        images,
+        [images[place] for place in order],
         found.size,
         model.points,
-        colors=None,
-        layers={layer: [files[row] for row in rows] for layer, files in found.layers.items()},
+        colors,
+        split=split,
+        layers={
+            layer: [files[model.rows[place]] for place in order] for layer, files in found.layers.items()
+        },
         offset=offset,
     )
+
+
+def check_place(output: Path, sources: Iterable[Path]) -> None:
+    """Raises SceneError if a scene would be inside of what it is made from."""
+    for path in sources:
+        if pictures_below(path).resolve() in output.resolve().parents:
+            raise SceneError(f"{output}: is inside {path}, whose pictures are read; give a folder elsewhere")
+
+
+def _offset(world: Georeference) -> Offset | None:
+    """What is known of the scale and the place of a world."""
+    if world.gps is not None:
+        return Offset(offset=(0.0, 0.0, 0.0), frame="ENU", origin=world.gps.fixes.origin)
+    return Offset(offset=(0.0, 0.0, 0.0), metres=1.0) if world.metric else None

@@ -13,6 +13,7 @@ from panolog.prepare.sfm.features import find_features
 from panolog.prepare.sfm.pairs import match_pairs
 from panolog.prepare.sfm.reconstruct import max_error
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
+from panolog.prepare.sfm.trajectory import near_pairs
 from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.errors import SceneError
 from panolog.scene.write import PosedImage, StageProgress, no_progress
@@ -61,14 +62,9 @@ def triangulate(
     return found
 
 
-def neighbours(images: Sequence[PosedImage]) -> set[tuple[int, int]]:
+def neighbours(images: Sequence[PosedImage]) -> list[tuple[int, int]]:
     """Pairs of rows, ascending, of images whose cameras are near each other."""
-    centers = np.stack([-image.rotation.T @ image.translation for image in images])
-    pairs = set()
-    for a, center in enumerate(centers):
-        order = np.argsort(np.linalg.norm(centers - center, axis=1), kind="stable")
-        pairs |= {(min(a, b), max(a, b)) for b in order[: NEIGHBOURS + 1].tolist() if b != a}
-    return pairs
+    return near_pairs(np.stack([-image.rotation.T @ image.translation for image in images]), NEIGHBOURS)
 
 
 def points_of(

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from panolog.prepare.networks.masks import GIVEN
-from panolog.prepare.panorama_files import LayerFiles, PanoramaFile, pictures_below
+from panolog.prepare.panorama_files import LayerFiles, PanoramaFile
 from panolog.prepare.sfm.consistency.agreement import Posed, motion_between
 from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.consistency.evidence import read_evidence
@@ -19,7 +19,7 @@ from panolog.prepare.sfm.features import MEMORY
 from panolog.prepare.sfm.joining.known import KnownScene, read_known, with_new
 from panolog.prepare.sfm.links import links_of
 from panolog.prepare.sfm.pairs import Pairing, Pairs, best_matches, choose_pairs, match_pairs
-from panolog.prepare.sfm.pipeline import SfmSettings, workspace_folder
+from panolog.prepare.sfm.pipeline import SfmSettings, check_place, new_scene, workspace_folder
 from panolog.prepare.sfm.reconstruct import Reconstruction, featured, max_error
 from panolog.prepare.sfm.report import Into, SfmReport, write_report
 from panolog.prepare.sfm.sparse_model import from_colmap
@@ -31,9 +31,9 @@ from panolog.prepare.world.georeference import MAX_SPREAD, Georeference
 from panolog.prepare.world.gravity import find_up
 from panolog.prepare.world.similarity import Similarity
 from panolog.scene.errors import ConfigError, SceneError, in_one_line
-from panolog.scene.files import natural_key, some_of, stem_of, write_bytes
+from panolog.scene.files import some_of, stem_of, write_bytes
 from panolog.scene.read import DEPTH_PARAMS, model_folder
-from panolog.scene.write import NewScene, PosedImage, StageProgress, require_new, write_scene
+from panolog.scene.write import StageProgress, require_new, write_scene
 
 
 def join_scene(
@@ -56,9 +56,7 @@ def join_scene(
     """
     require_new(output)
     _check_settings(settings)
-    for path in (*source, into):
-        if pictures_below(path).resolve() in output.resolve().parents:
-            raise SceneError(f"{output}: is inside {path}, whose pictures are read; give a folder elsewhere")
+    check_place(output, (*source, into))
     known, folder = read_known(into), workspace_folder(output.resolve())
     taken = {known.scene.root.name, *(Path(it.name).parts[0] for it in known.images)}
     sources = find_sources(source, taken)
@@ -71,7 +69,7 @@ def join_scene(
     made = any(panorama.path.is_relative_to(folder) for panorama in found.panoramas)
     write_scene(
         output,
-        _scene(known, found),
+        new_scene(found, known.offset, known.scene.colors, _split(known, found), known.images),
         link=settings.link and not made,  # the workspace is removed, with the panoramas in it
         progress=lambda done, total: progress("scene", done, total),
         complete=lambda new: _complete(new, known, report),
@@ -209,31 +207,12 @@ def _world(known: KnownScene) -> Georeference:
     return Georeference(Similarity(1.0, np.eye(3), np.zeros(3)), frame, metric, up, None, ())
 
 
-def _scene(known: KnownScene, found: Reconstruction) -> NewScene:
-    """The scene to be written, in the natural order of names."""
-    model, count = found.model, len(known.images)
-    images = []
-    for place, row in enumerate(model.rows):
-        panorama = found.panoramas[row]
-        quaternion = known.images[place].quaternion if place < count else None
-        pose = model.rotations[place], model.translations[place]
-        images.append(PosedImage(panorama.name, panorama.path, *pose, model.sightings[place], quaternion))
-    order = sorted(range(len(images)), key=lambda place: natural_key(images[place].name))
-    split = known.split
-    if split is not None:
-        new = [stem_of(image.name) for image in images[count:]]
-        split = {**split, "train.txt": [*split["train.txt"], *new]}
-    return NewScene(
-        [images[place] for place in order],
-        found.size,
-        model.points,
-        known.scene.colors,
-        split=split,
-        layers={
-            layer: [files[model.rows[place]] for place in order] for layer, files in found.layers.items()
-        },
-        offset=known.offset,
-    )
+def _split(known: KnownScene, found: Reconstruction) -> dict[str, list[str]] | None:
+    """The split of the scene, if it has one, whose training panoramas the new ones join."""
+    if known.split is None:
+        return None
+    new = [stem_of(found.panoramas[row].name) for row in found.model.rows[len(known.images) :]]
+    return {**known.split, "train.txt": [*known.split["train.txt"], *new]}
 
 
 def _complete(folder: Path, known: KnownScene, report: SfmReport) -> None:
