@@ -96,13 +96,12 @@ def scale_from_distance(
         centers: (K, 3) their positions.
         metres: between them.
 
-    Raises ConfigError: a panorama is not among them, they are at one place, or the distance is not positive.
+    Raises ConfigError: a panorama is not among them, or they are at one place.
     """
     for name in (first, second):
         if name not in names:
             raise ConfigError(f"--distance: {name} has no pose, as {len(names)} have; name two of those")
     apart = float(np.linalg.norm(centers[names.index(first)] - centers[names.index(second)]))
-    check_metres(metres)
     if apart <= 1e-9 * float(np.linalg.norm(np.ptp(centers, axis=0))) or apart == 0:
         raise ConfigError(
             f"--distance: {first} and {second} are at the same place; name two that are far apart"
