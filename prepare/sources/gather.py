@@ -64,7 +64,7 @@ class Gathered:
 
 
 @dataclass(frozen=True)
-class _Row:
+class Row:
     """A panorama with its layers."""
 
     panorama: PanoramaFile
@@ -89,7 +89,7 @@ def gather(
     notes, left_out = list[str](), list(sources.left_out)
     videos = [it for it in sources.all if it.is_video]
     folders = [it for it in sources.all if not it.is_video]
-    rows = dict[Source, list[_Row]]()
+    rows = dict[Source, list[Row]]()
     for turn, source in enumerate(videos):
         show = part_of(partial(progress, "frames"), turn, len(videos))
         rows[source] = _frames(source, _place(work, source), choice, show, notes.append)
@@ -108,7 +108,7 @@ def gather(
         rows |= {source: [it for it in whole if it.panorama.source == source.label] for source in folders}
     if len(sources.all) > 1:
         rows |= {source: _in_order(rows[source]) for source in folders}
-    found = _rows(*known) + [row for source in sources.all for row in rows[source]]
+    found = rows_of(*known) + [row for source in sources.all for row in rows[source]]
     panoramas = [row.panorama for row in found]
     check_names(work, [panorama.name for panorama in panoramas])
     sized = to_one_size(panoramas, work / "sized", partial(progress, "sizes"), notes.append)
@@ -127,7 +127,7 @@ def _labelled(source: Source, panorama: PanoramaFile) -> PanoramaFile:
     return replace(panorama, name=name, source=source.label)
 
 
-def _frames(source: Source, place: Path, choice: Choice, progress: Progress, note: Note) -> list[_Row]:
+def _frames(source: Source, place: Path, choice: Choice, progress: Progress, note: Note) -> list[Row]:
     """The chosen frames of a video."""
     folder = place / "frames"
     files = extract_frames(
@@ -141,7 +141,7 @@ def _frames(source: Source, place: Path, choice: Choice, progress: Progress, not
     )
     masks = find_layer(folder, MASKS, [file.name for file in files])
     return [
-        _Row(_labelled(source, PanoramaFile(folder, file.name, file)), {MASKS: mask})
+        Row(_labelled(source, PanoramaFile(folder, file.name, file)), {MASKS: mask})
         for file, mask in zip(files, masks, strict=True)
     ]
 
@@ -164,34 +164,35 @@ def _stitched(
     return place / "stitched", [*lines, *look_into(given, {INSP}).left_out]
 
 
-def _photographs(source: Source, folder: Path, least: int) -> list[_Row]:
+def _photographs(source: Source, folder: Path, least: int) -> list[Row]:
     """The panoramas of a source that is a folder. Args: folder, where they are."""
     panoramas, layers = panoramas_in_folder(folder, least)
-    return _rows([_labelled(source, panorama) for panorama in panoramas], layers)
+    return rows_of([_labelled(source, panorama) for panorama in panoramas], layers)
 
 
-def _rows(panoramas: Sequence[PanoramaFile], layers: LayerFiles) -> list[_Row]:
+def rows_of(panoramas: Sequence[PanoramaFile], layers: LayerFiles) -> list[Row]:
+    """Panoramas, each with its layers."""
     return [
-        _Row(panorama, {layer: files[row] for layer, files in layers.items()})
+        Row(panorama, {layer: files[row] for layer, files in layers.items()})
         for row, panorama in enumerate(panoramas)
     ]
 
 
 def _completed(
-    rows: Sequence[_Row], known: Sequence[PanoramaFile], least: int, folder: Path, progress: Progress
-) -> tuple[list[_Row], list[str]]:
+    rows: Sequence[Row], known: Sequence[PanoramaFile], least: int, folder: Path, progress: Progress
+) -> tuple[list[Row], list[str]]:
     """Photographs without copies, also of those that are known, whole where they are cropped.
 
     And a line for each copy.
     """
-    panoramas = [row.panorama for row in rows]
-    layers = {layer: [row.layers.get(layer) for row in rows] for layer in _LAYERS}
-    kept, layers, lines = without_copies(panoramas, layers, least, known)
-    kept = as_png(kept, folder.with_name("converted"), part_of(progress, 0, 2))
-    return _rows(complete_panoramas(kept, folder, part_of(progress, 1, 2)), layers), lines
+    kept, lines = without_copies(rows, least, known)
+    panoramas = [row.panorama for row in kept]
+    whole = as_png(panoramas, folder.with_name("converted"), part_of(progress, 0, 2))
+    whole = complete_panoramas(whole, folder, part_of(progress, 1, 2))
+    return [replace(row, panorama=panorama) for row, panorama in zip(kept, whole, strict=True)], lines
 
 
-def _in_order(rows: Sequence[_Row]) -> list[_Row]:
+def _in_order(rows: Sequence[Row]) -> list[Row]:
     """Photographs in the order in which they were taken, if all say when; else of their names."""
     times = [read_exif(row.panorama.path).time for row in rows]
     known = [(time, place) for place, time in enumerate(times) if time is not None]
@@ -227,32 +228,28 @@ def panoramas_in_folder(
 
 
 def without_copies(
-    panoramas: Sequence[PanoramaFile],
-    layers: LayerFiles,
-    least: int = MIN_CAMERAS,
-    known: Sequence[PanoramaFile] = (),
-) -> tuple[tuple[PanoramaFile, ...], LayerFiles, list[str]]:
-    """The panoramas whose files differ, their layers, and a line for each other one: it shows nothing more.
+    rows: Sequence[Row], least: int = MIN_CAMERAS, known: Sequence[PanoramaFile] = ()
+) -> tuple[list[Row], list[str]]:
+    """The panoramas whose files differ, and a line for each other one: it shows nothing more.
 
     Args: known, others that they are not to be copies of.
     Raises: SceneError, fewer than `least` differ.
     """
-    every = [*known, *panoramas]
+    every = [*known, *(row.panorama for row in rows)]
     sizes = Counter(panorama.path.stat().st_size for panorama in every)
-    first, kept, lines = dict[bytes, str](), list[int](), list[str]()
-    for row, panorama in enumerate(every, start=-len(known)):
+    first, kept, lines = dict[bytes, str](), list[Row](), list[str]()
+    for place, panorama in enumerate(every, start=-len(known)):
         if sizes[panorama.path.stat().st_size] > 1:
             digest = hashlib.sha256(panorama.path.read_bytes()).digest()
-            if digest in first and row >= 0:
+            if digest in first and place >= 0:
                 lines.append(f"{panorama.name}: is a copy of {first[digest]}, left out")
                 continue
             first.setdefault(digest, panorama.name)
-        kept.append(row)
-    kept = kept[len(known) :]
+        if place >= 0:
+            kept.append(rows[place])
     if len(kept) < least:
         raise SceneError(
-            f"{panoramas[0].root}: {len(kept)} panoramas differ, the others are copies; at least {least} are "
-            "needed"
+            f"{rows[0].panorama.root}: {len(kept)} panoramas differ, the others are copies; at least {least} "
+            "are needed"
         )
-    chosen = {layer: [files[row] for row in kept] for layer, files in layers.items()}
-    return tuple(panoramas[row] for row in kept), chosen, lines
+    return kept, lines

@@ -8,7 +8,7 @@ import pytest
 
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
 from panolog.prepare.sources.find import find_sources
-from panolog.prepare.sources.gather import gather, panoramas_in_folder, without_copies
+from panolog.prepare.sources.gather import gather, panoramas_in_folder, rows_of, without_copies
 from panolog.scene.errors import InputError
 from panolog.scene.write import no_progress
 
@@ -53,9 +53,9 @@ def test_copies_are_left_out_by_content_and_named(tmp_path: Path) -> None:
     for name in ("0", "2"):
         cv2.imwrite(str(tmp_path / "masks" / f"{name}.png"), np.full((64, 128), 255, np.uint8))
     (tmp_path / "images" / "3.png").write_bytes((tmp_path / "images" / "1.png").read_bytes())
-    panoramas, layers, lines = without_copies(*panoramas_in_folder(tmp_path))
-    assert [panorama.name for panorama in panoramas] == ["0.png", "1.png", "2.png"]
-    assert [mask is not None for mask in layers["masks"]] == [True, False, True]
+    rows, lines = without_copies(rows_of(*panoramas_in_folder(tmp_path)))
+    assert [row.panorama.name for row in rows] == ["0.png", "1.png", "2.png"]
+    assert [row.layers["masks"] is not None for row in rows] == [True, False, True]
     assert lines == ["3.png: is a copy of 1.png, left out"]
 
 
