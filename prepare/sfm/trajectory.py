@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.world.similarity import Similarity
+from panolog.prepare.world.tracks import number_of
 from panolog.scene.errors import SceneError
 
 Array = NDArray[np.float64]
@@ -98,7 +99,7 @@ def places_of(trajectory: Trajectory, names: Sequence[str], times: Sequence[floa
                 f"{np.ptp(times):,.1f}; give its times in seconds, not in parts of them"
             )
         start = trajectory.times[0] if times is not None else 0.0
-        wanted = np.array(list(times) if times is not None else [_number(stem) for stem in stems]) + start
+        wanted = np.array(list(times) if times is not None else [number_of(stem) for stem in stems]) + start
         inside = (wanted >= trajectory.times[0] - 0.5) & (wanted <= trajectory.times[-1] + 0.5)
         for axis in range(3):
             found[inside, axis] = np.interp(wanted[inside], trajectory.times, trajectory.places[:, axis])
@@ -199,14 +200,7 @@ def _timed(path: Path, table: Array) -> Trajectory:
 
 
 def _numbers(path: Path, number: int, cells: Sequence[str], count: int) -> list[float]:
-    values = [_number(cell) for cell in cells]
+    values = [number_of(cell) for cell in cells]
     if len(values) != count or not np.isfinite(values).all():
         raise SceneError(f"{path}: line {number}: is not {count} numbers; give t x y z qx qy qz qw, or CSV")
     return values
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return np.nan

@@ -129,7 +129,9 @@ def read_telemetry(path: Path) -> tuple[Telemetry | None, list[str]]:
                 "others, so it was not used to find up"
             )
             ups = ups.only(np.zeros(0, np.intp))
-    telemetry = Telemetry(found.places(), ups, found.window, found.above_0("shutter"), found.above_0("iso"))
+    telemetry = Telemetry(
+        found.places(), ups, found.window, found.above_0("shutter"), found.above_0("sensitivity")
+    )
     if (file := find_track(path)) is not None:
         begin = None if started is None else started.timestamp()
         recorded, line = _recorded(file, begin, lasts)
@@ -187,11 +189,8 @@ class _Collected:
         self.count += 1
         if packet.startswith(b"DEVC"):
             samples = gpmf.parse_payload(packet)
-            self._spread("places", start, duration, samples.places)
-            self._spread("gravity", start, duration, samples.gravity)
-            self._spread("acceleration", start, duration, samples.acceleration)
-            self._spread("shutter", start, duration, samples.shutter)
-            self._spread("iso", start, duration, samples.sensitivity)
+            for name, values in vars(samples).items():
+                self._spread(name, start, duration, values)
         elif camm.is_packet(packet):
             place, felt = camm.place(packet), camm.acceleration(packet)
             if place is not None:

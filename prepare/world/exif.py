@@ -12,6 +12,8 @@ All of this is optional: anything missing, damaged or impossible is left out.
 import io
 import math
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -134,8 +136,7 @@ def read_exif(path: Path) -> Exif:
     """
     if not path.is_file():
         raise SceneError(f"{path}: there is no such image")
-    with Bounded(io.FileIO(path)) as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with _opened(path) as file:
         try:
             exif, xmp = read_blocks(file)
         except OSError:
@@ -157,8 +158,7 @@ def essential_exif(path: Path) -> bytes | None:
 
     None if there is none, or it is damaged. Raises as `read_exif` does.
     """
-    with Bounded(io.FileIO(path)) as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with _opened(path) as file:
         try:
             tags, reduced = _tags(read_blocks(file)[0]), Image.Exif()
             details, gps = tags.get_ifd(ExifTags.IFD.Exif), tags.get_ifd(ExifTags.IFD.GPSInfo)
@@ -175,8 +175,7 @@ def essential_exif(path: Path) -> bytes | None:
 
 def camera_of(path: Path) -> str:
     """Make, model and serial number of the camera by EXIF; empty without. Raises as `read_exif` does."""
-    with Bounded(io.FileIO(path)) as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with _opened(path) as file:
         try:
             tags = _tags(read_blocks(file)[0])
             serial = tags.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.BodySerialNumber)
@@ -184,6 +183,14 @@ def camera_of(path: Path) -> str:
         except DAMAGE:
             return ""
     return " ".join(text for it in parts if (text := str(it or "").strip("\0 ")[:80]))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Bounded]:
+    """An image file, within which Pillow does not warn of damage."""
+    with Bounded(io.FileIO(path)) as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield file
 
 
 def _tags(exif: Bounded | None) -> Image.Exif:

@@ -78,8 +78,8 @@ def _gpx(text: bytes) -> Iterator[Sample]:
         if point.tag.rpartition("}")[2] != "trkpt":
             continue
         inside = {child.tag.rpartition("}")[2]: (child.text or "").strip() for child in point}
-        time, height = _moment(inside.get("time", "")), _number(inside.get("ele", ""))
-        north, east = _number(point.get("lat", "")), _number(point.get("lon", ""))
+        time, height = _moment(inside.get("time", "")), number_of(inside.get("ele", ""))
+        north, east = number_of(point.get("lat", "")), number_of(point.get("lon", ""))
         if time is not None and np.isfinite([north, east]).all():
             yield time, north, east, height
 
@@ -98,7 +98,7 @@ def _nmea(text: bytes) -> Iterator[Sample]:
             time, place = _time_of_day(fields[0]), _angles(fields[first : first + 4])
             if kind == wanted and fields[status] != bad and time is not None and place is not None:
                 _, day, last = dated[int(np.abs(rows - row).argmin())]
-                height = _number(fields[8]) if kind == "GGA" else np.nan
+                height = number_of(fields[8]) if kind == "GGA" else np.nan
                 yield _at(day, time, last), *place, height
 
 
@@ -117,7 +117,7 @@ def _angles(fields: list[str]) -> tuple[float, float] | None:
     """Degrees north and east of 4717.112671,N,00833.914843,E."""
     found = []
     for text, direction, names in ((fields[0], fields[1], "NS"), (fields[2], fields[3], "EW")):
-        value = _number(text)
+        value = number_of(text)
         if not (value >= 0 and direction in tuple(names)):
             return None
         degrees, minutes = divmod(value, 100)
@@ -127,7 +127,7 @@ def _angles(fields: list[str]) -> tuple[float, float] | None:
 
 def _time_of_day(text: str) -> float | None:
     """Seconds of 162254.00."""
-    value = _number(text)
+    value = number_of(text)
     hours, rest = divmod(value, 10_000)
     minutes, seconds = divmod(rest, 100)
     return hours * 3600 + minutes * 60 + seconds if hours < 24 and minutes < 60 and seconds < 61 else None
@@ -176,7 +176,7 @@ def _moment(text: str) -> float | None:
     return moment.timestamp() + float(f"0{(part or '.0').replace(',', '.')}")
 
 
-def _number(text: str) -> float:
+def number_of(text: str) -> float:
     """A number; NaN for all else."""
     try:
         return float(text)
