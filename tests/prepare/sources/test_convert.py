@@ -1,6 +1,5 @@
 """HEIC and AVIF panoramas become PNG that show, and say, the same."""
 
-import os
 import shutil
 import struct
 from datetime import datetime
@@ -68,17 +67,6 @@ def test_pixels_colours_and_metadata_are_kept(kind: str, tmp_path: Path) -> None
     assert exif.fix == GpsFix(47.37, 8.54, 408.5)
     assert (exif.time, exif.orientation) == (datetime(2026, 5, 4, 3, 2, 1, 250_000), 1)
     assert exif.attitude is not None and exif.attitude.pitch == 3
-
-
-def test_what_was_converted_is_not_converted_again(tmp_path: Path) -> None:
-    panorama = _source("avif", tmp_path)
-    (found,) = as_png([panorama], tmp_path / "made")
-    made = found.path.stat().st_ino
-    assert as_png([panorama], tmp_path / "made") == (found,)
-    assert found.path.stat().st_ino == made
-    os.utime(panorama.path, ns=(1, 1))
-    as_png([panorama], tmp_path / "made")
-    assert found.path.stat().st_ino != made
 
 
 def test_others_stay_as_they_are(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """Exposure, orientation and crop of stills in every format, and how `scene sfm` takes them."""
 
 import math
-import os
 from pathlib import Path
 
 import numpy as np
@@ -76,18 +75,6 @@ def test_whole_panoramas_stay_as_they_are(tmp_path: Path) -> None:
         path = write_still(tmp_path / name, noise(FULL), panorama=panorama)
         assert completed(path, tmp_path / "whole") == path
     assert not (tmp_path / "whole").exists()
-
-
-def test_a_completed_panorama_is_made_once_for_each_state_of_its_source(tmp_path: Path) -> None:
-    path = write_still(tmp_path / "a.png", noise(PART), panorama=CROP)
-    whole = completed(path, tmp_path / "whole")
-    before = whole.stat().st_ino
-    assert completed(path, tmp_path / "whole").stat().st_ino == before
-    write_still(path, noise(PART, seed=1), panorama=CROP)
-    os.utime(path, ns=(1, 1))
-    again = completed(path, tmp_path / "whole")
-    assert again.stat().st_ino != before
-    np.testing.assert_array_equal(decode_with_alpha(again)[0][8:48, 16:112], noise(PART, seed=1))
 
 
 @pytest.mark.parametrize(
