@@ -22,7 +22,7 @@ class Frame:
     origin: Doubles = field(default_factory=lambda: np.zeros(3))  # (3,) world units
 
     @staticmethod
-    def upright(up: tuple[float, float, float] = Y_DOWN, origin: Doubles | None = None) -> "Frame":
+    def upright(up: tuple[float, float, float], origin: Doubles | None = None) -> "Frame":
         """Turns `up` (a direction of the world) to +y, by the smallest angle; if it is −y, around x.
 
         Raises ValueError if `up` has no length.

@@ -45,7 +45,7 @@ def read_model(path: Path) -> Splats:
     raise FormatError(f"{path}: is not a model; PLY, compressed PLY, SOG and SPZ are read")
 
 
-def convert_to_ply(path: Path, output: StrPath, frame: Frame, *, exact: bool = False) -> None:
+def convert_to_ply(path: Path, output: StrPath, frame: Frame, *, exact: bool) -> None:
     """Writes a model of `read_model` as a PLY, with the sky that is in a file next to it (`sky_of`).
 
     Args: frame, that of the file, which the PLY is turned back from; exact, `Gaussians.exact` where it is not

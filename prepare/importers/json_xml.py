@@ -88,7 +88,7 @@ class JsonNode:
             raise self.error(f"{_shape(shape)} finite numbers were expected")
         return array
 
-    def integer(self, limit: int = 2**63) -> int:
+    def integer(self, limit: int) -> int:
         """A whole number from 0 up to `limit`, exclusive. Raises SceneError if it is none."""
         if isinstance(self.value, bool) or not isinstance(self.value, int) or not 0 <= self.value < limit:
             raise self.error(f"a whole number from 0 to {limit - 1} was expected")

@@ -48,7 +48,7 @@ def make_layers(outputs: dict[str, Floats], manifest: DepthManifest) -> DepthLay
     return DepthLayers(encode_depth(inverse, 1 / NEAREST if metric else None), mask)
 
 
-def encode_depth(inverse: Floats, top: float | None = None) -> NDArray[np.uint16]:
+def encode_depth(inverse: Floats, top: float | None) -> NDArray[np.uint16]:
     """16-bit map of inverse depth (h, w): NaN becomes 0, all else 1 to 65535, with `top` at 65535.
 
     Without `top` it is the greatest of the map, spikes apart, and a map with negative values is shifted:

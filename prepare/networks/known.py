@@ -104,9 +104,7 @@ def list_lines() -> Iterator[str]:
     yield "and writes its manifest. None of these was run by us; docs/depth-and-masks.md says how others fit."
 
 
-def check_network(
-    model: Path, width: int, device: str = "auto", say: Callable[[str], None] = lambda _: None
-) -> CheckedNetwork:
+def check_network(model: Path, width: int, device: str, say: Callable[[str], None]) -> CheckedNetwork:
     """Checks a network, with a trial on panoramas of `width` pixels.
 
     A file of the table gets its manifest if there is none next to it, which `say` is called with.

@@ -72,7 +72,7 @@ def find_static(pictures: Sequence[PanoramaFile], progress: Progress = no_progre
     return static_region(_some(pictures, lambda picture: load_resized(picture.path, WIDTH), progress))
 
 
-def find_nadir(pictures: Sequence[PanoramaFile], progress: Progress = no_progress) -> float:
+def find_nadir(pictures: Sequence[PanoramaFile], progress: Progress) -> float:
     """The angle of `black_nadir` of the panoramas, or of MOST of them, evenly chosen.
 
     Raises SceneError: a panorama is damaged, or nothing is black in all of them.
@@ -133,7 +133,7 @@ def make_masks(
 
 
 def masks_as_json(
-    results: Sequence[MaskResult], static: StaticRegion | None, nadir: float | None = None
+    results: Sequence[MaskResult], static: StaticRegion | None, nadir: float | None
 ) -> dict[str, Any]:
     """As `panolog scene mask --json` prints it. Shares are of the sphere, `nadir` is in degrees."""
     return {

@@ -32,7 +32,7 @@ _LONGEST = 200  # characters of an error of onnxruntime
 class Network:
     """An opened network. Raises InputError if its file, its manifest and the device do not fit together."""
 
-    def __init__(self, model: Path, given: Input, outputs: Sequence[str], device: str = "auto") -> None:
+    def __init__(self, model: Path, given: Input, outputs: Sequence[str], device: str) -> None:
         """Opens it.
 
         Args: model, the ONNX file; given, its input by the manifest; outputs, the names of those that `run`

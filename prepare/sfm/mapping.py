@@ -22,7 +22,7 @@ def map_pairs(
     mapper: Mapper,
     max_error: float,
     progress: StageProgress,
-    known: pycolmap.Reconstruction | None = None,
+    known: pycolmap.Reconstruction | None,
 ) -> pycolmap.Reconstruction | None:
     """The reconstruction of most panoramas from the verified pairs of a database; None if there is none.
 

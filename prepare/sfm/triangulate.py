@@ -16,7 +16,7 @@ from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.trajectory import near_pairs
 from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.errors import SceneError
-from panolog.scene.write import PosedImage, StageProgress, no_progress
+from panolog.scene.write import PosedImage, StageProgress
 
 NEIGHBOURS = 8  # nearest panoramas that each is matched with
 LEAST = 20  # points seen by three panoramas, for poses to be accepted
@@ -24,7 +24,7 @@ SHARE = 0.25  # of all points: with wrong poses, only rays of two panoramas may 
 
 
 def triangulate(
-    where: Path, images: Sequence[PosedImage], size: tuple[int, int], progress: StageProgress = no_progress
+    where: Path, images: Sequence[PosedImage], size: tuple[int, int], progress: StageProgress
 ) -> SparseModel:
     """Points that panoramas of that size (width, height) see, in the world of their poses.
 

@@ -58,8 +58,8 @@ class Video:
         container: av.container.InputContainer,
         ahead: ThreadPoolExecutor,
         effort: Effort,
-        lenses: VideoLenses | None = None,
-        second: SecondLens | None = None,
+        lenses: VideoLenses | None,
+        second: SecondLens | None,
     ) -> None:
         """Decodes the first frame and checks how it lies on the sphere.
 

@@ -105,7 +105,7 @@ def layout_of(
     matrix: bytes | None,
     spherical: Spherical | None,
     widest: int,
-    aspect: float = 1.0,
+    aspect: float,
 ) -> Layout:
     """The layout of a video's pictures.
 
