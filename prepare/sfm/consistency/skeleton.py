@@ -118,9 +118,9 @@ def _strongest_tree(
     Without edges that share much less than others, except `weak`: where the tree falls apart, it is unknown
     what is right. Panoramas that are `given` are connected from the start.
     """
-    rank = {edge: place for place, edge in enumerate(first)}
+    rank, connected = {edge: place for place, edge in enumerate(first)}, set(given)
     order = sorted(
-        (pair for pair in pairs if not set(given).issuperset(pair.between)),
+        (pair for pair in pairs if not connected.issuperset(pair.between)),
         key=lambda it: (rank.get(it.between, len(rank)), -it.coverage, -len(it.matches), it.between),
     )
     star = [(min(given), row) for row in given if row > min(given)]
