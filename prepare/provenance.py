@@ -76,6 +76,14 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     return decode_mask(path)
 
 
+def sampled(layer: NDArray[np.bool_], where: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) the pixels of a layer (H, W) at fractions (N, 2) of its width and height."""
+    height, width = layer.shape
+    column, row = (where * (width, height)).astype(np.int64).T
+    found: NDArray[np.bool_] = layer[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return found
+
+
 def check_panorama_size(path: Path, info: ImageInfo) -> None:
     """Refuses what is not a panorama, before any memory is spent on it. Raises SceneError."""
     if info.width != 2 * info.height or not info.width:

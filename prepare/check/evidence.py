@@ -64,32 +64,20 @@ def gather_evidence(scene: Scene) -> Evidence:
     rows, pixels = _tracks(scene, views)
     decoded = [decode_with_alpha(scene.panoramas[row].image, min(scene.width, WIDEST)) for row in views]
     for row, (_, used) in zip(views, decoded, strict=True):
-        if used is not None:
-            rows, pixels = _opaque(scene, row, used, rows, pixels)
+        if used is not None:  # of what is transparent nothing is seen
+            points, size = scene.points[rows[row]], used.shape[::-1]
+            _, v, u = project_to_pixels(scene.panoramas[row], points, *size)
+            rows[row] = rows[row][used[v, u]]
+            if pixels is not None:
+                pixels[row] = pixels[row][used[v, u]]
     return Evidence(
         scene=scene,
         colors=scene.colors.astype(np.float64),
-        seen=rows,
-        pixels=pixels,
+        seen=tuple(rows),
+        pixels=None if pixels is None else tuple(pixels),
         views=views,
         pictures=tuple(picture for picture, _ in decoded),
     )
-
-
-def _opaque(
-    scene: Scene,
-    row: int,
-    used: NDArray[np.bool_],
-    seen: tuple[NDArray[np.int64], ...],
-    pixels: tuple[Array, ...] | None,
-) -> tuple[tuple[NDArray[np.int64], ...], tuple[Array, ...] | None]:
-    """What each panorama sees, of panorama `row` only where its picture is used (H, W), not transparent."""
-    _, v, u = project_to_pixels(scene.panoramas[row], scene.points[seen[row]], used.shape[1], used.shape[0])
-    shown = used[v, u]
-    rows = tuple(it[shown] if index == row else it for index, it in enumerate(seen))
-    if pixels is None:
-        return rows, None
-    return rows, tuple(it[shown] if index == row else it for index, it in enumerate(pixels))
 
 
 def _spread(scene: Scene) -> tuple[int, ...]:
@@ -99,23 +87,21 @@ def _spread(scene: Scene) -> tuple[int, ...]:
     return tuple(np.linspace(0, total - 1, min(count, total)).astype(int).tolist())
 
 
-def _tracks(
-    scene: Scene, views: Sequence[int]
-) -> tuple[tuple[NDArray[np.int64], ...], tuple[Array, ...] | None]:
+def _tracks(scene: Scene, views: Sequence[int]) -> tuple[list[NDArray[np.int64]], list[Array] | None]:
     """What each panorama sees, and where in units of the width; without tracks only `views` see any.
 
     A model whose images have no lines of observations says what each sees, but not where.
     """
     if not any(len(panorama.observed) for panorama in scene.panoramas):
         decoded, nothing = set(views), np.empty(0, np.int64)
-        return tuple(
+        return [
             likely_seen(scene.points, panorama.center) if row in decoded else nothing
             for row, panorama in enumerate(scene.panoramas)
-        ), None
+        ], None
     model = read_colmap(model_folder(scene.root))
     if not any(len(image.points) for image in model.images):
         observed = [panorama.observed for panorama in scene.panoramas]
-        return tuple(seen[_some(len(seen), row)] for row, seen in enumerate(observed)), None
+        return [seen[_some(len(seen), row)] for row, seen in enumerate(observed)], None
     images = {image.name: image for image in model.images}
     rows, pixels = [], []
     for index, panorama in enumerate(scene.panoramas):
@@ -127,7 +113,7 @@ def _tracks(
         kept = _some(len(image.points), index)
         rows.append(image.points[kept])
         pixels.append(image.pixels[kept] / image.camera.width)
-    return tuple(rows), tuple(pixels)
+    return rows, pixels
 
 
 def likely_seen(points: Array, center: Array) -> NDArray[np.int64]:

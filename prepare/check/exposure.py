@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import spsolve
-from torch import Tensor
 
 from panolog.prepare.check.evidence import Array, bilinear, in_threads, likely_seen, project
+from panolog.prepare.provenance import sampled
 from panolog.prepare.world.exif import read_exif
 from panolog.scene.errors import SceneError
 from panolog.scene.image_files import decode_panorama
@@ -147,7 +147,9 @@ def _samples(
     lower = np.minimum(level.astype(int), _LEVELS - 2)
     part, each = (level - lower)[:, None], np.arange(len(seen))
     colors = values[lower, each] * (1 - part) + values[lower + 1, each] * part
-    used = ((colors > _DARK) & (colors < _BRIGHT)).all(axis=1) & _unmasked(mask, where)
+    used = ((colors > _DARK) & (colors < _BRIGHT)).all(axis=1)
+    if mask is not None:
+        used &= sampled(mask.numpy(), where * (1, 2))
     return seen[used], CURVE * np.log(colors[used] + TOE)
 
 
@@ -161,16 +163,6 @@ def _blurred(panorama: Panorama, width: int) -> list[NDArray[np.float32]]:
         blurred = cv2.GaussianBlur(around, (0, 0), 2.0**level, borderType=cv2.BORDER_REPLICATE)
         stack.append(np.asarray(blurred[:, margin : margin + width], np.float32))
     return stack
-
-
-def _unmasked(mask: Tensor | None, where: Array) -> NDArray[np.bool_]:
-    """(M,) whether places (M, 2) in units of the width may be used."""
-    if mask is None:
-        return np.ones(len(where), bool)
-    height, width = mask.shape
-    u, v = (np.minimum((where[:, axis] * width).astype(int), width - 1) for axis in (0, 1))
-    found: NDArray[np.bool_] = mask.numpy()[np.minimum(v, height - 1), u]
-    return found
 
 
 def _expected(scene: Scene, rows: Sequence[int]) -> Array | None:

@@ -17,7 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import load_grey
-from panolog.prepare.provenance import read_mask
+from panolog.prepare.provenance import read_mask, sampled
 from panolog.prepare.sfm.faces import BAND, DOWN, UP, Faces
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.errors import RunError
@@ -103,9 +103,9 @@ def features_of(path: Path, masks: Iterable[Path]) -> Features:
     found, words = np.concatenate(pixels)[order], np.concatenate(descriptors)[order]
     kept, where = np.ones(len(found), bool), found / (faces.width, faces.width // 2)
     if used is not None:
-        kept &= _sampled(used, where)
+        kept &= sampled(used, where)
     for mask in masks:
-        kept &= _sampled(read_mask(mask), where)
+        kept &= sampled(read_mask(mask), where)
     return Features(found[kept].astype(np.float32), np.ascontiguousarray(words[kept]))
 
 
@@ -115,14 +115,6 @@ def _options(most: int) -> pycolmap.FeatureExtractionOptions:
     options.use_gpu = False
     options.sift.max_num_features = most
     return options
-
-
-def _sampled(layer: NDArray[np.bool_], where: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,) the layer's pixels at fractions (N, 2) of its width and height."""
-    height, width = layer.shape
-    column, row = (where * (width, height)).astype(np.int64).T
-    found: NDArray[np.bool_] = layer[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-    return found
 
 
 def processes_for(width: int, memory: int, panoramas: int) -> int:
