@@ -7,9 +7,7 @@ import io
 import json
 import os
 import zipfile
-from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +43,9 @@ def write_sog(path: StrPath, source: SplatSource) -> None:
                 archive.writestr(entry, data)
 
 
-@contextmanager
-def threads() -> Iterator[Executor]:
-    """A pool of as many threads as there are cores, up to `_THREADS`."""
-    with ThreadPoolExecutor(min(_THREADS, len(os.sched_getaffinity(0)))) as pool:
-        yield pool
+def threads() -> Executor:
+    """A pool of as many threads as there are cores, up to `_THREADS`, for `with`."""
+    return ThreadPoolExecutor(min(_THREADS, len(os.sched_getaffinity(0))))
 
 
 def encode(source: SplatSource, pool: Executor, *, sort: bool = True) -> dict[str, bytes]:
