@@ -56,10 +56,13 @@ class Stop:
 def on_signals() -> Iterator[Stop]:
     """A `Stop` that handles those signals while the context lasts; for the main thread.
 
-    A signal that is ignored, as Ctrl-C is by a shell's background jobs and SIGHUP by nohup, stays so.
+    A signal that is ignored, as Ctrl-C is by a shell's background jobs and SIGHUP by nohup, stays so. A
+    request that was made of an outer context counts: its KeyboardInterrupt is lost if it comes in a destructor.
     """
     stop = Stop()
     handled = [number for number in _ENDS if signal.getsignal(number) != signal.SIG_IGN]
+    outer = [getattr(signal.getsignal(number), "__self__", None) for number in handled]
+    stop.requested = any(isinstance(it, Stop) and it.requested for it in outer)
     before = {number: signal.signal(number, stop.signal) for number in handled}
     try:
         yield stop

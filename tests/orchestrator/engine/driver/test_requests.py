@@ -48,6 +48,24 @@ def test_a_second_signal_does_not_interrupt_what_clears_up_after_the_first() -> 
     assert cleared
 
 
+class Lost:
+    """What is interrupted while it is freed: Python prints the exception, and continues."""
+
+    def __del__(self) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_request_counts_whose_interrupt_is_lost() -> None:
+    """A run that was requested to stop while it began trained to its end."""
+    with interruptible():
+        Lost()
+        with on_signals() as stop:
+            assert stop.requested
+    with on_signals() as stop:
+        assert not stop.requested
+
+
 def test_what_can_be_thrown_away_is_interrupted_at_once() -> None:
     stop = Stop()
     with pytest.raises(KeyboardInterrupt), stop.at_once():
