@@ -95,7 +95,7 @@ def watch(scene: Path, root: Path, options: argparse.Namespace) -> None:
         page.goto(url)
         if page.locator("#runs a").count():
             page.locator("#runs a").first.click()
-        page.locator("#map-plot .heatmaplayer image").first.wait_for(state="attached")
+        page.locator("#map-plot .points").wait_for(state="attached")
         say("points and cameras on the map")
         shot(page, options.shots, "map")
         page.locator("#stage .compare:visible, #stage canvas:visible, #stage img:visible").first.wait_for()

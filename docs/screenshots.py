@@ -106,7 +106,7 @@ def open_page(browser: Browser, url: str, width: int, height: int, theme: Litera
 
 def show_everything(page: Page) -> None:
     """Chooses a block and waits until map, charts and pictures are drawn."""
-    expect(page.locator("#map-plot .heatmaplayer image").first).to_be_attached(timeout=60_000)
+    expect(page.locator("#map-plot .points")).to_be_attached(timeout=60_000)
     expect(page.locator("#charts .scatterlayer .trace").first).to_be_attached(timeout=60_000)
     page.locator("#block-table tr[data-block='0'] button").click()
     page.mouse.move(0, 0)

@@ -98,7 +98,7 @@ def _listed(page: Page) -> None:
 
 def _drawn(page: Page) -> None:
     """Waits for the parts of the page of a run that come last."""
-    expect(page.locator("#map-plot .scatterlayer").first).to_be_attached()
+    expect(page.locator("#map-plot .points")).to_be_attached()
     _charts(page)
 
 
@@ -108,7 +108,7 @@ def _prepared(page: Page) -> None:
     for image in page.locator("#prepared-pictures img").all():
         image.scroll_into_view_if_needed()
         expect(image).to_have_js_property("complete", True)
-    expect(page.locator("#map-plot .scatterlayer").first).to_be_attached()
+    expect(page.locator("#map-plot .points")).to_be_attached()
     expect(page.locator("#events li").first).to_be_visible()
 
 

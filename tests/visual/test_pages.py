@@ -28,7 +28,7 @@ _STYLE = """(rules) => {
 # By what it is in, a fault of the page of a finished run that a reader would see.
 _SEEN = {
     "#charts figure:nth-child(3)": "figure:nth-child(3) .scatterlayer .trace:first-child { display: none; }",
-    "#map-plot": "#map-plot .svg-container { clip-path: inset(0 40% 0 0); }",
+    "#map-plot": "#map-plot > svg { clip-path: inset(0 40% 0 0); }",
     "#status": "#status { color: var(--failed); }",
     "#events": "#events li > * { margin-left: -40px; }",
 }

@@ -36,7 +36,7 @@ class Page:
     title: str  # until its script knows better
     script: str
     styles: tuple[str, ...]
-    charts: bool = True  # whether plotly is needed at once
+    charts: bool = False  # whether plotly is needed at once
 
     @property
     def scripts(self) -> list[str]:
@@ -45,13 +45,14 @@ class Page:
         return [path.relative_to(STATIC).as_posix() for path in found]
 
 
-RUNS = Page("runs", "Runs", "runs/runs.js", ("shared/base.css", "runs/runs.css"), charts=False)
+RUNS = Page("runs", "Runs", "runs/runs.js", ("shared/base.css", "runs/runs.css"))
 RUN = Page("run", "Run", "run/run.js", ("shared/base.css", "shared/compare.css", "run/run.css"))
 COMPARISON = Page(
     "compare",
     "Comparison",
     "compare/page.js",
     ("shared/base.css", "shared/compare.css", "compare/comparison.css"),
+    charts=True,
 )
 
 

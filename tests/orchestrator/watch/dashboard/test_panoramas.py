@@ -157,7 +157,7 @@ def test_an_outline_that_a_run_brings_along_fetches_nothing(
 @pytest.mark.system
 def test_a_camera_shows_its_picture_and_a_block_its_cameras(browser: Browser, served: Served) -> None:
     with opened(browser, f"{served.url}/runs/{served.id('run')}", width=PHONE) as page:
-        expect(page.locator("#map-plot .heatmaplayer image").first).to_be_attached()
+        expect(page.locator("#map-plot .points")).to_be_attached()
         page.locator("#block-table tr[data-block='1'] button").click()
         panel = page.locator("#selected")
         expect(panel.locator("summary")).to_have_text("3 cameras: 1 by gradient, 2 by geometry and gradient")

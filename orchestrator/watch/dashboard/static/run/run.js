@@ -17,7 +17,6 @@ import { views } from "panolog/run/views.js";
 import { connectionLine, get, messageOf, snapshot, statusOf, stream } from "panolog/shared/api.js";
 import { byId, setMessage } from "panolog/shared/dom.js";
 import { shellWord } from "panolog/shared/format.js";
-import { plotly } from "panolog/shared/plot.js";
 
 const id = snapshot ? "report" : encodeURIComponent(location.pathname.split("/").filter(Boolean).pop() ?? "");
 const path = `runs/${id}`;
@@ -144,7 +143,6 @@ const line = connectionLine((time) => {
   lost = time;
   if (known) show(known);
 }, lastState);
-plotly().catch(() => {}); // now, as a run may only begin; what draws first says what is wrong
 stream(
   `?run=${id}&changes=1`,
   () => {

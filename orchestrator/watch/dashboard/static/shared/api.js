@@ -49,7 +49,7 @@ async function answer(response) {
   throw new ApiError(content.error ?? `the server answered ${response.status}`, response.status);
 }
 
-const RETRY = 500; // milliseconds until a refused stream is opened again
+const RETRY = 250; // milliseconds until a refused stream is opened again
 const HIDDEN = 60_000; // after which a page in the background closes its stream
 const QUIET = 1500; // without a connection before the page says so
 

@@ -23,6 +23,15 @@ export function el(tag, properties = {}, ...children) {
   return node;
 }
 
+/** An element of a drawing; what is undefined or false is left out. @param {string} tag @param {Record<string, string | number | false | undefined>} attributes @param {...(Node | string)} children */
+export function svg(tag, attributes, ...children) {
+  const node = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, value] of Object.entries(attributes))
+    if (value !== undefined && value !== false) node.setAttribute(name, String(value));
+  node.append(...children);
+  return node;
+}
+
 /** The element of the page with an id. @type {<T extends HTMLElement = HTMLElement>(id: string, kind?: new () => T) => T} */
 export const byId = (id) => /** @type {any} */ (document.getElementById(id));
 

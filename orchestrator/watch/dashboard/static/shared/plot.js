@@ -1,6 +1,6 @@
 // plotly, loaded when it is first needed, in the colours of the page. A report holds plotly.
 
-/** @import { Axis, Layout, Packed, Plotly } from "./plotly.js" */
+/** @import { Axis, Layout, Plotly } from "./plotly.js" */
 import { token } from "panolog/shared/dom.js";
 
 const CONFIG = { displayModeBar: false, responsive: true, doubleClick: "reset", showTips: false };
@@ -72,14 +72,4 @@ export function themed(layout) {
     xaxis: axis(layout.xaxis),
     yaxis: axis(layout.yaxis),
   };
-}
-
-const ARRAYS = { u1: Uint8Array, i1: Int8Array, i2: Int16Array, i4: Int32Array };
-
-/** A packed array as its rows. @param {Packed} packed */
-export function unpack({ dtype, bdata, shape }) {
-  const [rows, columns] = shape.split(",").map(Number);
-  const raw = Uint8Array.from(atob(bdata), (character) => character.charCodeAt(0));
-  const flat = new ARRAYS[dtype](raw.buffer);
-  return Array.from({ length: rows }, (_, i) => [...flat.subarray(i * columns, (i + 1) * columns)]);
 }

@@ -2,8 +2,6 @@
 
 export interface Plotly {
   react(node: HTMLElement, data: object[], layout: object, config: object): Promise<void>;
-  relayout(node: HTMLElement, changes: object): Promise<void>;
-  Plots: { resize(node: HTMLElement): Promise<void> };
 }
 
 export type Axis = Record<string, any>;
@@ -13,14 +11,6 @@ export interface Layout {
   yaxis: Axis;
   font?: object;
   [name: string]: any;
-}
-
-/** An element with a chart. */
-export interface Chart extends HTMLElement {
-  layout?: Layout;
-  _dragging?: boolean;
-  on(event: string, listener: (event: { points: Array<{ data: Trace; customdata: number }> }) => void): void;
-  removeAllListeners?(event: string): void;
 }
 
 export interface Trace {

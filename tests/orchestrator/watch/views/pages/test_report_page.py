@@ -123,8 +123,9 @@ def test_the_dashboard_shows_it_in_a_sandbox(browser: Browser, report: Path, tmp
     with serving(tmp_path) as served:
         url = f"{served.url}/api/runs/{served.id('run')}/report.html"
         with opened(browser, url) as page:
-            expect(page.locator("#map-plot .imagelayer image")).to_have_count(1)
             expect(page.locator("#quality tbody tr")).to_have_count(2)
+            _unfold(page)
+            expect(page.locator("#map-plot .blocks")).to_have_count(1)
             assert page.evaluate("self.origin") == "null"
 
 
@@ -137,11 +138,11 @@ def unfolded(browser: Browser, report: Path) -> Iterator[Page]:
 
 
 def test_the_map_is_that_of_the_dashboard(unfolded: Page) -> None:
-    expect(unfolded.locator("#map-plot .imagelayer image")).to_have_count(1)
+    expect(unfolded.locator("#map-plot .blocks")).to_have_count(1)
     expect(unfolded.locator("#map-plot")).to_have_attribute(
         "aria-label", "The partition from above: 2 blocks (1 kept, 1 failed), 50% done"
     )
-    face = unfolded.locator('#map-plot path.js-line[style*="stroke-width: 4.5px"]')
+    face = unfolded.locator("#map-plot .seams")
     red, green, blue = (int(SEAM_GRADES["some"][1][i : i + 2], 16) for i in (1, 3, 5))
     expect(face).to_have_css("stroke", f"rgb({red}, {green}, {blue})")
     expect(unfolded.locator("#legend")).to_contain_text("seam 1.5 to 3")
