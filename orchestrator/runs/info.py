@@ -31,7 +31,7 @@ _PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
 _ROOT = Path(__file__).parents[2]  # of the package, or of its checkout
 _SUFFIXES = (".py", ".cpp", ".h", ".cu", ".cuh")  # of sources
 PENDING = ""  # fingerprint of a scene that the run has still to make
-_FORERUNNERS = ("lock", "prepare", "store")  # what a driver or its mirror makes before run.json
+_FORERUNNERS = ("lock", "outline", "prepare", "store")  # what a driver or its mirror makes before run.json
 
 
 class SceneRef(BaseModel):

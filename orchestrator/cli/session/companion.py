@@ -10,8 +10,7 @@ from subprocess import DEVNULL, PIPE
 from threading import Thread
 
 from panolog.orchestrator.runs.machines.children import send_line, start_companion
-from panolog.orchestrator.watch.follower.follower import END, LAST_S
-from panolog.orchestrator.watch.follower.plan import FollowerPlan, to_json
+from panolog.orchestrator.watch.follower.plan import END, LAST_S, FollowerPlan, to_json
 
 _TIMEOUT_S = 8.0  # for the process to send its pages the last state of the run, and to end
 _FOLLOWER_S = LAST_S + 5.0  # for the follower to end

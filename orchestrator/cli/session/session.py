@@ -90,7 +90,8 @@ def start(
             run_info.write_info(folder, info)
         # what a driver has left that was killed during its preflight
         run_info.clear(folder, keep_info=new.settings is not None)
-        if new.settings is None:
+        if new.scene is not None:
+            write_outline(folder, new.scene, info.config)  # first: who sees the run sees the place
             run_info.write_info(folder, info)
         with closing(Database(folder.database)) as database:
             begin = _Beginning(folder, Journal(database, on_change), address, pool, nice, new.scene)

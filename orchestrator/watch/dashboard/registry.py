@@ -114,6 +114,10 @@ class RunRegistry:
         """Does work that reads files, in a thread."""
         return await asyncio.get_running_loop().run_in_executor(self._pool, work, *arguments)
 
+    def start(self, work: Callable[..., object], *arguments: Any) -> None:
+        """Does in a thread what will soon be requested; an error is shown to who requests it."""
+        self._pool.submit(work, *arguments)
+
     def end(self) -> None:
         """Ends the threads when they have done what they are at; `call` is not possible any more."""
         self._pool.shutdown(wait=False, cancel_futures=True)

@@ -5,6 +5,7 @@ import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from http import HTTPStatus
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from panolog.orchestrator.watch.dashboard.api import router
+from panolog.orchestrator.watch.dashboard.api import encoded_map, router
 from panolog.orchestrator.watch.dashboard.guard import Access, Guard
 from panolog.orchestrator.watch.dashboard.models.downloads import Downloads
 from panolog.orchestrator.watch.dashboard.models.pages import ModelPages
@@ -44,6 +45,7 @@ def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        registry.start(import_module, "scipy.sparse")  # which the first map waits for
         yield
         registry.close()
         await pages.close()
@@ -76,7 +78,9 @@ def _index() -> HTMLResponse:
 async def _run(request: Request, id: str) -> HTMLResponse:
     registry: RunRegistry = request.app.state.registry
     if found := await registry.run(id):
-        found[1].start_refresh()  # the page requests the run as soon as its scripts are loaded
+        watch, topic = found
+        topic.start_refresh()  # the page requests the run as soon as its scripts are loaded
+        registry.start(encoded_map, watch.entry.folder)  # and then this
     return _page(RUN)
 
 

@@ -11,8 +11,8 @@ import sys
 import threading
 from contextlib import suppress
 
-from panolog.orchestrator.watch.follower.follower import END, Follower
-from panolog.orchestrator.watch.follower.plan import from_json
+from panolog.orchestrator.watch.follower.follower import Follower
+from panolog.orchestrator.watch.follower.plan import END, from_json
 
 
 def main() -> None:

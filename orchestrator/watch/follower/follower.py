@@ -12,13 +12,11 @@ from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.watch.follower.board import Board
 from panolog.orchestrator.watch.follower.couriers import Courier
 from panolog.orchestrator.watch.follower.loggers import Logger
-from panolog.orchestrator.watch.follower.plan import FollowerPlan, SinkChoice
+from panolog.orchestrator.watch.follower.plan import LAST_S, FollowerPlan, SinkChoice
 from panolog.orchestrator.watch.follower.sinks.interface import Sink
 from panolog.orchestrator.watch.follower.watcher import Watcher
 
 POLL_S = 1.0  # between two looks at the database
-END = "end"  # what a run's command writes to its follower when it ends; one that is killed does not
-LAST_S = 30.0  # for which the last news are delivered, and tried again
 _ORPHAN_S = 60.0  # that a driver without its supervisor gets to write its last checkpoints
 
 

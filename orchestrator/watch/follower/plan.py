@@ -14,6 +14,8 @@ from panolog.orchestrator.watch.follower.references import References
 from panolog.orchestrator.watch.follower.targets import Target, check_elsewhere, read_targets
 from panolog.scene.errors import ConfigError
 
+END = "end"  # what a run's command writes to its follower when it ends; one that is killed does not
+LAST_S = 30.0  # for which the last news are delivered, and tried again
 STALLED = "PANOLOG_NOTIFY_STALLED"  # minutes without a record after which a run counts as stalled
 _STALLED_MIN = 30.0
 _PACKAGES = {

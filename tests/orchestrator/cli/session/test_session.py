@@ -21,7 +21,7 @@ from panolog.orchestrator.cli.session import preparing, session
 from panolog.orchestrator.runs import folder as run_folder
 from panolog.orchestrator.runs.config import RunConfig, load_config
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.info import own_code, read_info
+from panolog.orchestrator.runs.info import RunInfo, own_code, read_info
 from panolog.orchestrator.runs.records import (
     Noticed,
     Preparing,
@@ -32,6 +32,7 @@ from panolog.orchestrator.runs.records import (
 )
 from panolog.orchestrator.runs.state import ignore
 from panolog.orchestrator.runs.store import read_records
+from panolog.orchestrator.watch.views.plan_map import read_points
 from panolog.scene.errors import ClusterLostError, InputError, RunError, SceneError
 from panolog.scene.read import read_scene
 from panolog.workers.calibration import CalibrateSpec
@@ -100,6 +101,25 @@ def test_status_shows_a_run_before_its_preflight_is_over(scene: Path, tmp_path: 
     first = next(record for record in records if isinstance(record, Preparing | PreviewSaved))
     assert isinstance(first, PreviewSaved) and (first.task, first.iteration) == (COARSE, 0)
     assert (root / first.path).is_file()
+
+
+def test_who_sees_a_run_of_a_scene_sees_the_place(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the driver was killed just before run.json was there."""
+    written: list[bool] = []
+    folder, write_info = RunFolder(tmp_path / "run"), session.run_info.write_info
+
+    def write(folder: RunFolder, info: RunInfo) -> None:
+        written.append(folder.outline.exists())
+        write_info(folder, info)
+
+    folder.outline.parent.mkdir(parents=True)
+    folder.outline_points.write_text("half")
+    monkeypatch.setattr(session.run_info, "write_info", write)
+    start(scene, folder.root)
+    assert written and all(written)
+    assert len(read_points(folder.outline_points))
 
 
 def test_a_run_killed_in_its_preflight_resumes_to_the_same_bytes(killed: Path, calm: Path) -> None:

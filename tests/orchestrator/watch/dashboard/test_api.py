@@ -18,6 +18,7 @@ from panolog.orchestrator.runs.config import RunConfig, change, load_config
 from panolog.orchestrator.runs.folder import write_json
 from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.orchestrator.runs.records import Noticed, Outcome, Record, RunBegan, RunEnded, ViewEvaluated
+from panolog.orchestrator.watch.dashboard import server
 from panolog.orchestrator.watch.views import queries
 from panolog.orchestrator.watch.views.comparison.compare import compare
 from panolog.orchestrator.watch.views.comparison.reading import read_runs
@@ -37,6 +38,7 @@ from tests.orchestrator.watch.dashboard.served import (
     write_whole_run,
 )
 from tests.orchestrator.watch.views.comparison.runs import metrics, write, write_picture
+from tests.ray_head import wait_until
 from tests.visual.compare import expand
 from tests.workers.small import small_scene
 
@@ -111,6 +113,19 @@ def test_the_map_and_the_cameras_are_there_before_there_is_a_plan(tmp_path: Path
         assert np.frombuffer(base64.b64decode(points["z"]["bdata"]), np.uint8).any()
         write_plan(folder, plan(), SCORES)
         assert served.get(f"{path}/map")["blocks"]["planned"]
+
+
+def test_the_map_is_being_made_when_the_page_is_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[object] = []
+    monkeypatch.setattr(server, "import_module", begun.append)
+    monkeypatch.setattr(server, "encoded_map", begun.append)
+    folder = write_run(tmp_path / "run")
+    with serving(tmp_path) as served:
+        wait_until(lambda: begun == ["scipy.sparse"], "what maps need to be loaded")
+        served.client.get(f"/runs/{served.id('run')}")
+        wait_until(lambda: begun[1:] == [folder], "the map to be begun")
 
 
 def test_every_record_has_words_in_the_log() -> None:
