@@ -31,7 +31,7 @@ _PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
 _ROOT = Path(__file__).parents[2]  # of the package, or of its checkout
 _SUFFIXES = (".py", ".cpp", ".h", ".cu", ".cuh")  # of sources
 PENDING = ""  # fingerprint of a scene that the run has still to make
-_FORERUNNERS = ("lock", "outline", "prepare", "store")  # what a driver or its mirror makes before run.json
+_FORERUNNERS = ("lock", "prepare", "store")  # what a driver or its mirror makes before run.json
 
 
 class SceneRef(BaseModel):
@@ -86,8 +86,9 @@ def _check_existing(folder: RunFolder, fingerprint: str) -> None:
         raise RunFolderError(
             f"{folder.root}: holds a run of this scene; use `{command_line('resume', folder.root)}`"
         )
+    outline = (folder.outline.parent.name,) if folder.lock.exists() else ()  # else it is not a driver's
     for entry in folder.root.iterdir():
-        if entry.name not in _FORERUNNERS and not entry.name.endswith(SUFFIX):
+        if entry.name not in (*_FORERUNNERS, *outline) and not entry.name.endswith(SUFFIX):
             raise RunFolderError(f"{folder.root}: is not empty and not a run; choose another output folder")
 
 

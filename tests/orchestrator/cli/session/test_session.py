@@ -19,6 +19,7 @@ import pytest
 
 from panolog.orchestrator.cli.session import preparing, session
 from panolog.orchestrator.runs import folder as run_folder
+from panolog.orchestrator.runs import info as run_info
 from panolog.orchestrator.runs.config import RunConfig, load_config
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import RunInfo, own_code, read_info
@@ -108,7 +109,7 @@ def test_who_sees_a_run_of_a_scene_sees_the_place(
 ) -> None:
     """Also where the driver was killed just before run.json was there."""
     written: list[bool] = []
-    folder, write_info = RunFolder(tmp_path / "run"), session.run_info.write_info
+    folder, write_info = RunFolder(tmp_path / "run"), run_info.write_info
 
     def write(folder: RunFolder, info: RunInfo) -> None:
         written.append(folder.outline.exists())
@@ -116,7 +117,10 @@ def test_who_sees_a_run_of_a_scene_sees_the_place(
 
     folder.outline.parent.mkdir(parents=True)
     folder.outline_points.write_text("half")
-    monkeypatch.setattr(session.run_info, "write_info", write)
+    with pytest.raises(InputError, match="is not empty and not a run"):
+        start(scene, folder.root)
+    folder.lock.touch()
+    monkeypatch.setattr(run_info, "write_info", write)
     start(scene, folder.root)
     assert written and all(written)
     assert len(read_points(folder.outline_points))

@@ -191,8 +191,10 @@ def test_the_map_is_drawn_moved_and_zoomed_without_plotly(browser: Browser, show
     """A run that begins shows its points before anything of a curve is loaded."""
 
     def pixels() -> NDArray[np.int16]:
-        picture = np.frombuffer(plot.screenshot(animations="disabled"), np.uint8)
-        return cv2.imdecode(picture, cv2.IMREAD_COLOR).astype(np.int16)
+        raw = np.frombuffer(plot.screenshot(animations="disabled"), np.uint8)
+        picture = cv2.imdecode(raw, cv2.IMREAD_COLOR)
+        assert picture is not None
+        return picture.astype(np.int16)
 
     def moved() -> tuple[float, float]:
         """How far two cameras are from each other, in pixels."""

@@ -13,7 +13,9 @@ const ARRAYS = { u1: Uint8Array, i1: Int8Array, i2: Int16Array, i4: Int32Array }
 /** A packed array as its rows. @param {Packed} packed */
 export function unpack({ dtype, bdata, shape }) {
   const [rows, columns] = shape.split(",").map(Number);
-  const raw = Uint8Array.from(atob(bdata), (character) => character.charCodeAt(0));
+  const text = atob(bdata);
+  const raw = new Uint8Array(text.length);
+  for (let i = 0; i < raw.length; i += 1) raw[i] = text.charCodeAt(i);
   const flat = new ARRAYS[dtype](raw.buffer);
   return Array.from({ length: rows }, (_, i) => flat.subarray(i * columns, (i + 1) * columns));
 }
@@ -25,7 +27,7 @@ export const pixel = (color) => new Uint32Array(Uint8ClampedArray.from(color).bu
 export function painted(rows, color) {
   const [height, width] = [rows.length, rows[0].length];
   const canvas = Object.assign(document.createElement("canvas"), { width, height });
-  const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+  const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d", { willReadFrequently: true }));
   const image = context.createImageData(width, height);
   const pixels = new Uint32Array(image.data.buffer);
   for (const [i, row] of rows.entries())

@@ -104,7 +104,7 @@ export function planMap(path, choose) {
       return;
     }
     const { layers, layer, colors } = figure.blocks;
-    cells = unpack(trace("blocks").z);
+    cells = figure.blocks.planned ? unpack(trace("blocks").z) : [];
     levels = levelsOf(cells);
     density = unpack(trace("points").z);
     points = shade(density);
