@@ -27,6 +27,11 @@ SMALL = """() => [...document.querySelectorAll("a, button, input, select, summar
   const {width, height} = node.getBoundingClientRect(), small = Math.min(width, height) < 24;
   return small && node.checkVisibility({visibilityProperty: true}) && !node.closest(".skip");
 }).map((node) => node.outerHTML.slice(0, 80))"""
+# Where a camera of the map is on the screen.
+PLACE = """(at) => {
+  const discs = document.querySelectorAll("#map-plot .cameras"), box = discs[at].getBoundingClientRect();
+  return [box.x + box.width / 2, box.y + box.height / 2];
+}"""
 KEYBOARD = Path(__file__).with_name("keyboard.js").read_text()
 
 

@@ -10,11 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from playwright.sync_api import APIResponse, Browser, Page, Route, expect
 from scipy.sparse import csr_array
 
-from panolog.orchestrator.engine.stages.outline import write_sketch
 from panolog.orchestrator.engine.stages.partitioning import plan_records, write_plan
 from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs.control import Action, ControlRequest
@@ -35,7 +33,15 @@ from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from tests.orchestrator.history import append
-from tests.orchestrator.watch.dashboard.browser import DESK, PATIENCE_MS, PHONE, SMALL, opened, unreachable
+from tests.orchestrator.watch.dashboard.browser import (
+    DESK,
+    PATIENCE_MS,
+    PHONE,
+    PLACE,
+    SMALL,
+    opened,
+    unreachable,
+)
 from tests.orchestrator.watch.dashboard.served import (
     EVIL,
     Served,
@@ -49,11 +55,6 @@ from tests.visual import legible
 
 pytestmark = pytest.mark.system
 
-# Where a camera of the map is on the screen.
-PLACE = """(at) => {
-  const discs = document.querySelectorAll("#map-plot .cameras"), box = discs[at].getBoundingClientRect();
-  return [box.x + box.width / 2, box.y + box.height / 2];
-}"""
 # Widths of the drawn map, of its card inside, and by how much the page is wider than the window.
 WIDTHS = """() => [
   document.querySelector("#map-plot > svg").getBoundingClientRect().width,
@@ -67,8 +68,6 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A run with everything, whose renders differ from the ground truth, and one with hostile names."""
     folder = tmp_path_factory.mktemp("folder")
     whole = write_whole_run(folder / "town")
-    points = np.random.default_rng(0).normal(size=(300, 3)) * [5, 3, 1]
-    write_sketch(whole, ["0.jpg", "1.jpg"], points[:2], points, points[:3])
     picture = np.zeros((256, 256, 3), np.uint8)
     picture[:128, :, 2] = np.linspace(0, 255, 256)  # the render: red, more to the right
     picture[128:, :, 0] = 255  # the ground truth: blue
@@ -185,56 +184,6 @@ def test_the_map_says_why_a_camera_trains_its_blocks(town: Page) -> None:
     expect(panel).to_contain_text("Not possible now: no driver is at work")
     pause.click(force=True)
     expect(town.locator("#confirm")).to_be_hidden()
-
-
-def test_the_map_is_drawn_moved_and_zoomed_without_plotly(browser: Browser, shown: Served) -> None:
-    """A run that begins shows its points before anything of a curve is loaded."""
-
-    def pixels() -> NDArray[np.int16]:
-        raw = np.frombuffer(plot.screenshot(animations="disabled"), np.uint8)
-        picture = cv2.imdecode(raw, cv2.IMREAD_COLOR)
-        assert picture is not None
-        return picture.astype(np.int16)
-
-    def moved() -> tuple[float, float]:
-        """How far two cameras are from each other, in pixels."""
-        (left, top), (right, bottom) = page.evaluate(PLACE, 0), page.evaluate(PLACE, 1)
-        return right - left, bottom - top
-
-    url = f"{shown.url}/runs/{shown.id('town')}"
-    missed = re.compile("ERR_FAILED|the charts could not be loaded")
-    with opened(browser, url, tolerate=missed.search) as page:
-        plot = page.locator("#map-plot")
-        page.route("**/vendor/*", lambda route: route.abort())
-        page.reload()
-        expect(plot.locator(".points")).to_be_attached()
-        page.mouse.move(0, 0)
-        x, y = page.evaluate(PLACE, 0)
-        box = plot.bounding_box()
-        assert box is not None
-        color = str(plot.locator(".cameras").first.get_attribute("fill"))
-        camera = [int(color[i : i + 2], 16) for i in (5, 3, 1)]
-        before = pixels()
-        assert abs(before[int(y - box["y"]), int(x - box["x"])] - camera).max() < 12
-        for part, least in ((".fixes", 30), (".points", 100), (".blocks", 10_000)):
-            page.add_style_tag(content=f"#map-plot {part} {{ visibility: hidden }}")
-            assert (abs(pixels() - before).max(axis=2) > 12).sum() > least, part
-        page.mouse.move(*page.evaluate(PLACE, 0))  # it may have been scrolled
-        expect(plot.locator(".tip")).to_contain_text("0.jpg")
-        expect(plot.locator(".tip")).to_contain_text("trains block")
-        across, down = moved()
-        page.get_by_role("button", name="Zoom in").click()
-        expect(plot.locator(".tip")).to_be_hidden()
-        assert moved() == pytest.approx((1.6 * across, 1.6 * down), abs=0.1)
-        x, y = page.evaluate(PLACE, 0)
-        page.mouse.move(x + 60, y + 60)
-        page.mouse.down()
-        page.mouse.move(x + 100, y + 85)
-        page.mouse.up()
-        assert page.evaluate(PLACE, 0) == pytest.approx([x + 40, y + 25], abs=0.1)
-        expect(page.locator("#selected h3")).to_have_count(0)  # the end of a drag is no click
-        page.get_by_role("button", name="All").click()
-        assert moved() == pytest.approx((across, down), abs=0.1)
 
 
 def test_blocks_are_filtered_and_sorted(town: Page) -> None:

@@ -95,10 +95,10 @@ export const placesOf = ({ x = [], y = [] }, { across, down }) =>
 /** The numbers of the axes, and what they count. @param {Frame} frame @param {MapFigure["layout"]} layout */
 export function axes({ x, y, width, height, titled, rows, columns, across, down }, { xaxis, yaxis }) {
   const below = columns.map(({ value, text }) => svg("text", { x: x + across(value), y: y + height + 15 }, text));
-  const beside = rows.map(({ value, text }) => svg("text", { class: "row", x: x - 5, y: y + down(value) + 4 }, text));
+  const left = rows.map(({ value, text }) => svg("text", { class: "row", x: x - 5, y: y + down(value) + 4 }, text));
   const names = [
     svg("text", { x: x + width / 2, y: y + height + 34 }, xaxis.title.text),
     svg("text", { transform: `translate(13 ${y + height / 2}) rotate(-90)` }, yaxis.title.text),
   ];
-  return svg("g", { class: "axes" }, ...below, ...beside, ...(titled ? names : []));
+  return svg("g", { class: "axes" }, ...below, ...left, ...(titled ? names : []));
 }
