@@ -229,27 +229,23 @@ def test_a_resumed_run_that_is_refused_says_why(killed: Path) -> None:
     assert status(killed)["status"] == "done"
 
 
-def test_a_scene_far_from_its_origin_and_a_gpu_that_torch_cannot_use_are_noticed(
+def test_an_odd_scene_and_a_gpu_that_torch_cannot_use_are_noticed(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    moved = replace(read_scene(scene), offset=(465_000.0, 5_250_000.0, 408.0))
+    """It is far from its origin, and its sky masks are inverted."""
+    odd = copytree(scene, tmp_path / "scene")
+    (odd / "skymasks").mkdir()
+    for image in (odd / "images").iterdir():
+        cv2.imwrite(str(odd / "skymasks" / f"{image.stem}.png"), np.zeros((32, 64), np.uint8))
+    moved = replace(read_scene(odd), offset=(465_000.0, 5_250_000.0, 408.0))
     monkeypatch.setattr(preparing, "read_scene", lambda _: moved)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     monkeypatch.setattr("panolog.renderer.process.unused_gpu", lambda: "RTX 4090 is not used: its driver")
     start(scene, tmp_path / "run")
-    messages = [notice["message"] for notice in status(tmp_path / "run")["notices"]]
+    messages = notices(tmp_path / "run")
     assert any(str(moved.offset) in message for message in messages)
+    assert any("black is sky; invert them" in message for message in messages)
     assert "RTX 4090 is not used: its driver; the CPU is used" in messages
-
-
-def test_a_run_says_that_its_sky_masks_are_inverted(scene: Path, tmp_path: Path) -> None:
-    inverted = copytree(scene, tmp_path / "scene")
-    for image in (inverted / "images").iterdir():
-        path = inverted / "skymasks" / f"{image.stem}.png"
-        path.parent.mkdir(exist_ok=True)
-        cv2.imwrite(str(path), np.zeros((32, 64), np.uint8))
-    start(inverted, tmp_path / "run")
-    assert any("black is sky; invert them" in message for message in notices(tmp_path / "run"))
 
 
 def test_two_drivers_of_one_folder(scene: Path, tmp_path: Path) -> None:
