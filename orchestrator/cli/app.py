@@ -3,9 +3,7 @@
 Commands import what they need when they run, so that `--help` and `status` import neither torch nor Ray.
 """
 
-import os
 import sys
-from contextlib import suppress
 from typing import Annotated, Any, TextIO, cast
 
 import typer
@@ -26,8 +24,6 @@ from panolog.orchestrator.cli.usage import Command, Group, flag
 from panolog.orchestrator.runs import log
 from panolog.scene.errors import InputError, PanologError, explained, in_one_line
 
-INTERRUPTED = 130  # exit code, as of a shell
-
 
 class ExitCodes(Group):
     """Turns the errors that are meant for the user into one line on stderr and an exit code."""
@@ -43,7 +39,7 @@ class ExitCodes(Group):
                 raise
             message, code = str(missing), 2
         except KeyboardInterrupt:
-            message, code = "interrupted", INTERRUPTED
+            message, code = "interrupted", 130
         except BrokenPipeError as error:  # the reader of stdout has gone, as in `panolog events RUN | head`
             raise typer.Exit(0) from error
         except OSError as error:  # a file or folder that the user named cannot be read or written
@@ -120,12 +116,4 @@ def _program(
 def main() -> None:
     """Runs the program."""
     sys.stderr = cast(TextIO, Lasting(sys.stderr))
-    try:
-        app(prog_name="panolog")
-    except SystemExit as end:
-        if end.code == INTERRUPTED:  # while Ray starts: then its threads may crash a Python that ends
-            with suppress(OSError):
-                sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(INTERRUPTED)
-        raise
+    app(prog_name="panolog")

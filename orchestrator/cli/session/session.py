@@ -11,13 +11,14 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from panolog.orchestrator.cli.session import preparing
 from panolog.orchestrator.engine.driver.ending import end_recorded
 from panolog.orchestrator.engine.driver.journal import Journal, Patience
-from panolog.orchestrator.engine.driver.requests import interruptible
+from panolog.orchestrator.engine.driver.requests import interruptible, uninterrupted
 from panolog.orchestrator.engine.stages.outline import write_outline
 from panolog.orchestrator.engine.stages.scenes import scene_of
 from panolog.orchestrator.runs import control, lock
@@ -197,9 +198,9 @@ class _Beginning:
     @property
     def driving(self) -> "Driving":
         """What the run does with its scene."""
-        from panolog.orchestrator.cli.session.driving import Driving
-
-        return Driving(self.folder, self.journal, self.scene, local=self.address is None)
+        driving = uninterrupted(import_module, "panolog.orchestrator.cli.session.driving")
+        made: Driving = driving.Driving(self.folder, self.journal, self.scene, local=self.address is None)
+        return made
 
     def prepare(self, info: RunInfo, settings: Settings | None) -> RunInfo:
         """Makes the scene of a run that was given none, and returns run.json with it. Raises as `make`."""

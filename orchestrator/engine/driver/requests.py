@@ -9,9 +9,11 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from types import FrameType
+from typing import TypeVar
 
 from panolog.orchestrator.engine.driver.journal import Journal
 from panolog.orchestrator.runs import control
@@ -19,6 +21,7 @@ from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Noticed
 
 _ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+T = TypeVar("T")
 _ONE_S = 1.0  # signals within it are one request: a terminal or job system and a supervisor may both send it
 
 
@@ -57,7 +60,7 @@ def on_signals() -> Iterator[Stop]:
     """A `Stop` that handles those signals while the context lasts; for the main thread.
 
     A signal that is ignored, as Ctrl-C is by a shell's background jobs and SIGHUP by nohup, stays so. A
-    request that was made of an outer context counts: its KeyboardInterrupt is lost if it comes in a destructor.
+    request of an outer context counts: its KeyboardInterrupt is lost if it comes in a destructor.
     """
     stop = Stop()
     handled = [number for number in _ENDS if signal.getsignal(number) != signal.SIG_IGN]
@@ -83,6 +86,15 @@ def interruptible() -> Iterator[None]:
     """Each of those signals raises KeyboardInterrupt while the context lasts, once for each request."""
     with on_signals() as stop, stop.at_once():
         yield
+
+
+def uninterrupted(work: Callable[..., T], *arguments: object) -> T:
+    """Calls a function in a thread, where no signal interrupts it; the caller is interrupted when it is over.
+
+    An import of torch that has ended halfway crashes the process at the next one.
+    """
+    with ThreadPoolExecutor(1, "uninterrupted") as thread:
+        return thread.submit(work, *arguments).result()
 
 
 class Requests:

@@ -1,11 +1,14 @@
 import os
 import signal
+import sys
 from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
 
 import pytest
 
 from panolog.orchestrator.engine.driver import requests
-from panolog.orchestrator.engine.driver.requests import Stop, interruptible, on_signals
+from panolog.orchestrator.engine.driver.requests import Stop, interruptible, on_signals, uninterrupted
 from tests.orchestrator.fakes import SetClock
 
 ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -64,6 +67,19 @@ def test_a_request_counts_whose_interrupt_is_lost() -> None:
             assert stop.requested
     with on_signals() as stop:
         assert not stop.requested
+
+
+def test_an_import_is_whole_when_its_caller_is_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is imported a second time may crash, as torch does."""
+    (tmp_path / "halfway.py").write_text(
+        "import os, signal\nos.kill(os.getpid(), signal.SIGTERM)\nwhole = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        uninterrupted(import_module, "halfway")
+    assert sys.modules.pop("halfway").whole
 
 
 def test_what_can_be_thrown_away_is_interrupted_at_once() -> None:
