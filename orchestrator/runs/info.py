@@ -104,19 +104,19 @@ def read_history(folder: RunFolder) -> list[Stored]:
     Raises InputError as `read_milestones` and `require_history`.
     """
     records = read_milestones(folder.database) if folder.database.exists() else []
-    require_history(folder, records)
+    require_history(folder, empty=not records)
     return records
 
 
-def require_history(folder: RunFolder, records: Sequence[Stored]) -> None:
+def require_history(folder: RunFolder, *, empty: bool) -> None:
     """Raises RunFolderError if run.db is lost, or empty, of a run that has begun to train.
 
     A driver that took it for a new one would train again, over the files of what is finished.
 
-    Args: records, what run.db holds.
+    Args: empty, whether run.db has no record.
     """
     made = (folder.point_cloud, folder.of(COARSE), folder.preflight)
-    there = [] if records else [path for path in made if path.exists()]
+    there = [path for path in made if path.exists()] if empty else []
     if there:
         raise RunFolderError(
             f"{folder.database}: is missing or holds nothing, but the run has made"

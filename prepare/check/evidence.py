@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from panolog.scene.colmap import read_colmap
 from panolog.scene.image_files import decode_with_alpha
-from panolog.scene.model import Scene, of_one_color
+from panolog.scene.model import Panorama, Scene, of_one_color
 from panolog.scene.projection import project_to_fractions, project_to_pixels
 from panolog.scene.read import model_folder
 
@@ -129,6 +129,15 @@ def likely_seen(points: Array, center: Array) -> NDArray[np.int64]:
     _, first, of = np.unique(cell, return_index=True, return_inverse=True)
     clear = distance[rows] <= _BEHIND * distance[rows[first[of]]]
     return np.sort(rows[clear][:POINTS]).astype(np.int64)
+
+
+def points_seen(scene: Scene, panorama: Panorama, most: int) -> NDArray[np.int64]:
+    """(M,) rows of points that a panorama has seen, thinned to about `most`; at least one.
+
+    For a panorama without tracks those that it is likely to see.
+    """
+    seen = panorama.observed if len(panorama.observed) else likely_seen(scene.points, panorama.center)
+    return seen[:: max(1, len(seen) // most)]
 
 
 def _some(count: int, seed: int) -> NDArray[np.int64]:

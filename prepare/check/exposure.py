@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 
-from panolog.prepare.check.evidence import Array, bilinear, in_threads, likely_seen, project
+from panolog.prepare.check.evidence import Array, bilinear, in_threads, points_seen, project
 from panolog.prepare.provenance import sampled
 from panolog.prepare.world.exif import read_exif
 from panolog.scene.errors import SceneError
@@ -87,10 +87,10 @@ def measure_exposures(scene: Scene, rows: Sequence[int], width: int = WIDTH) -> 
     """
     width = min(width, scene.width)
     views, points, values = list[NDArray[np.int64]](), list[NDArray[np.int64]](), list[Array]()
-    seen = [_seen(scene, row) for row in rows]
+    seen = [points_seen(scene, scene.panoramas[row], POINTS) for row in rows]
     far = _farthest(scene, seen, rows)
-    sampled = in_threads(lambda row, some: _samples(scene, row, some, far, width), rows, seen)
-    for number, (found, colors) in enumerate(sampled):
+    samples = in_threads(lambda row, some: _samples(scene, row, some, far, width), rows, seen)
+    for number, (found, colors) in enumerate(samples):
         views.append(np.full(len(found), number))
         points.append(found)
         values.append(colors)
@@ -117,13 +117,6 @@ def _farthest(scene: Scene, seen: Sequence[NDArray[np.int64]], rows: Sequence[in
         away = np.linalg.norm(scene.points[points] - scene.panoramas[row].center, axis=1)
         np.maximum.at(far, points, away)
     return far
-
-
-def _seen(scene: Scene, row: int) -> NDArray[np.int64]:
-    """(M,) rows of points that a panorama has seen; without tracks those that it is likely to see."""
-    panorama = scene.panoramas[row]
-    seen = panorama.observed if len(panorama.observed) else likely_seen(scene.points, panorama.center)
-    return seen[:: max(1, len(seen) // POINTS)]
 
 
 def _samples(

@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.check.evidence import POINTS, likely_seen
+from panolog.prepare.check.evidence import POINTS, points_seen
 from panolog.prepare.networks.masks import share_of_sphere
 from panolog.prepare.panorama_files import find_image_files
 from panolog.prepare.provenance import read_mask
@@ -73,22 +73,21 @@ def _sky(scene: Scene) -> tuple[list[str], list[str]]:
     if not having:
         return [], []
     looked_at = [_sky_of(scene, panorama) for panorama in _some(having, _SKY_LOOKED_AT)]
-    share, points = (float(np.nanmedian([*found, np.nan])) for found in zip(*looked_at, strict=True))
+    share, points = (float(np.median(found)) for found in zip(*looked_at, strict=True))
     lines = [f"sky masks: {len(having)} of {len(scene.panoramas)} panoramas have one, and {share:.1%} is sky"]
     wrong = f"sky masks: {points:.0%} of what the panoramas see lies on their sky: black is sky; invert them"
     return lines, [wrong] if points > _MOST else []
 
 
 def _sky_of(scene: Scene, panorama: Panorama) -> tuple[float, float]:
-    """The share of the sphere, and of the points that a panorama sees, that are sky; NaN without points."""
+    """The share of the sphere, and of the points that a panorama sees, that are sky."""
     alone = replace(panorama, mask=None, depth=None, movers=None, transparent=False)
     sky = load_layers(alone, 0, min(_SKY_WIDTH, scene.width)).sky
     assert sky is not None
-    rows = panorama.observed if len(panorama.observed) else likely_seen(scene.points, panorama.center)
-    seen = scene.points[rows[:: len(rows) // POINTS + 1]]
+    seen = scene.points[points_seen(scene, panorama, POINTS)]
     _, v, u = project_to_pixels(panorama, seen, *sky.shape[::-1])
     on = sky.numpy()
-    return share_of_sphere(on), float(on[v, u].mean()) if len(seen) else np.nan
+    return share_of_sphere(on), float(on[v, u].mean())
 
 
 def _some(items: Sequence[T], most: int) -> list[T]:

@@ -71,7 +71,7 @@ def _mix(first: Floats, second: Floats, share: Floats) -> Floats:
 
 @contextmanager
 def named(output: str) -> Iterator[None]:
-    """Within it, a ValueError becomes a ConfigError that names an output."""
+    """Within the context, a ValueError becomes a ConfigError that names an output."""
     try:
         yield
     except ValueError as error:

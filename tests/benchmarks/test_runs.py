@@ -21,7 +21,7 @@ pytestmark = pytest.mark.system
 
 
 def test_a_run_trains_no_coarse_model_again_that_another_has(tmp_path: Path) -> None:
-    """Its database has the records of that model, but of no driver: that is not one that is lost."""
+    """A database with the records of a model, but of no driver, is not taken for one that is lost."""
     scene, donor, root = write_scene(tmp_path / "scene"), tmp_path / "donor", tmp_path / "run"
     config = load_config(flags={"width": 64, "iterations": 2, "blocks": "2x1x1", "sky.count": 2})
     pool = FakePool(lambda spec: says(spec) if isinstance(spec, CalibrateSpec) else well(spec), [MACHINE])

@@ -128,15 +128,14 @@ def resume(
     info = run_info.read_info(folder)
     with lock.hold(folder.lock), closing(_opened(folder, info.config)) as database:
         journal = Journal(database, on_change)
-        records = database.milestones()
-        run_info.require_history(folder, records)
+        run_info.require_history(folder, empty=journal.state.latest is None)
         budget = (wanted or Wanted()).budget(journal.state)
         if _is_over(journal.state, budget):
             done = journal.state.outcome == Outcome.DONE
             return _retained(folder, journal, info.config) if done else journal.state
         changes: Sequence[str] = ()
         if prepared := journal.state.prepared:
-            changes = run_info.changes(folder, info.config, records, accept=accept_changes)
+            changes = run_info.changes(folder, info.config, database.milestones(), accept=accept_changes)
         settings = read_settings(folder) if info.scene.fingerprint == run_info.PENDING else None
         scene = None if settings else scene_of(info, folder)
         remove_partial(root)

@@ -41,7 +41,7 @@ class Results:
 
     @cached_property
     def specs(self) -> Specs:
-        """Those of the stages after Stage I."""
+        """The specs of the stages after Stage I."""
         return Specs(self._job.learnt, self._pool)
 
     def maker(self, task: TaskId, state: RunState) -> Callable[[], list[Record]] | None:

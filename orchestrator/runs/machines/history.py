@@ -81,7 +81,7 @@ def by_host(nodes: Iterable[NodeState]) -> tuple[NodeState, ...]:
 
 
 def leave_of(nodes: Nodes, id: str) -> Leave | None:
-    """That a node leaves, or has left as it had announced; None of any other. Args: id, Node.id."""
+    """What a node that leaves, or has left, has announced; None of any other node. Args: id, Node.id."""
     known = nodes.get(id)
     return known.leave if known else None
 

@@ -232,7 +232,7 @@ def test_a_resumed_run_that_is_refused_says_why(killed: Path) -> None:
 def test_an_odd_scene_and_a_gpu_that_torch_cannot_use_are_noticed(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is far from its origin, and its sky masks are inverted."""
+    """The scene is far from its origin, and its sky masks are inverted."""
     odd = copytree(scene, tmp_path / "scene")
     (odd / "skymasks").mkdir()
     for image in (odd / "images").iterdir():
