@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
 
@@ -162,6 +164,23 @@ class InMemory:
             yield self.splats.select(slice(start, start + ROWS))
 
 
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What is within a distance of the nearest of some cameras."""
+
+    cameras: NDArray[np.float64]  # (C, 3) positions in the model's coordinates
+    distance: float  # units of the model
+
+    @cached_property
+    def _tree(self) -> scipy.spatial.KDTree:
+        return scipy.spatial.KDTree(self.cameras)
+
+    def contain(self, means: Floats) -> NDArray[np.bool_]:
+        """(N,) whether places (N, 3) are so near."""
+        distances, _ = self._tree.query(means, distance_upper_bound=self.distance)
+        return np.asarray(np.isfinite(distances))
+
+
 @dataclass(frozen=True)
 class Selection:
     """Which Gaussians of a model are exported, and how much of them."""
@@ -172,6 +191,7 @@ class Selection:
     max_size: float | None = None  # units of the model, of the longest standard deviation; nor to this
     # lower and upper corner in the model's coordinates, of what is scene; None = everything
     crop: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    near: Surroundings | None = None  # likewise
 
     def keeps(self, piece: Splats, scene: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(N,) which of these are exported; what is not finite never is, because no format can hold it.
@@ -187,6 +207,8 @@ class Selection:
         if self.crop is not None:
             lower, upper = np.array(self.crop, np.float32)
             keep &= ~scene | ((piece.means >= lower) & (piece.means < upper)).all(1)
+        if self.near is not None:
+            keep &= ~scene | self.near.contain(piece.means)
         return np.asarray(keep & {"scene": scene, "sky": ~scene, "all": True}[self.part])
 
 

@@ -26,6 +26,10 @@ MaxSize = Annotated[
     float | None,
     _choice("U", "Leave out what is larger: its longest standard deviation, in the model's units.", min=1e-9),
 ]
+MaxDistance = Annotated[
+    float | None,
+    _choice("U", "Leave out what is farther from all of a run's cameras, in the model's units.", min=1e-9),
+]
 Levels = Annotated[
     int | None,
     _choice("N", "Levels of detail of --web and --3dtiles. Default: as many as it takes.", min=1, max=8),
@@ -60,6 +64,7 @@ def export(
     sh: Annotated[int, _choice("0..3", "Degree of spherical harmonics.", min=0, max=3)] = 3,
     min_opacity: Annotated[float, _choice("0..1", "Leave out what is fainter.", min=0, max=0.999)] = 0.0,
     max_size: MaxSize = None,
+    max_distance: MaxDistance = None,
     crop: Crop = None,
     levels: Levels = None,
     spz_version: Annotated[int, _choice("3|4", "Version of SPZ.", min=3, max=4)] = 3,
@@ -85,6 +90,7 @@ def export(
         spec = ExportSpec(
             formats=tuple(name for name, given in wanted.items() if given),
             selection=Selection(degree=sh, min_opacity=min_opacity, max_size=max_size, crop=box or None),
+            max_distance=max_distance,
             sky=not without_sky,
             levels=levels,
             spz=4 if spz_version == 4 else 3,

@@ -1,36 +1,27 @@
 // What of the model is shown, as `panolog export` takes it: a box, whose axes are those of the model, and what is neither
-// too faint nor too large to be of a surface.
+// too faint nor too large to be of a surface, nor too far from all cameras.
 
 import { at } from "./dom.js";
 import { shifted } from "./flight.js";
 import { line, visible } from "./overlay.js";
-import { around, corners, placed, shown } from "./world.js";
+import { Surroundings } from "./shaders.js";
+import { around, corners, into, placed, shown } from "./world.js";
 
 /** @typedef {import("./page.js").Point} Point @typedef {import("./world.js").Box} Box */
 
 const MARGIN = 20; // steps around the cameras within which the box is moved
 const PARTS = 1000; // of a slider
-const FAINTEST = 0.9; // opacity at the end of its slider
-const LARGEST = 20; // steps: size at the end of its slider, where nothing is left out
-const RANGE = 1000; // times the size at its beginning
 const NEAR = 0.1; // of a step: what is nearer is behind the view; lines far outside of the picture take long
 const FAR = 1e9; // of a side that was not moved: it is no limit, as the page need not show all of the model
 const FINE = 3; // digits of a side after those of a step
+const FAINTEST = 0.9; // opacity at the end of its slider
+const LARGEST = 20; // steps: size at the end of its slider, where nothing is left out
+const SIZES = 1000; // times the size at its beginning
+const FARTHEST = 200; // steps: distance at the end of its slider, likewise
+const DISTANCES = 200; // times the distance at its beginning
 const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((from) =>
   [1, 2, 4].filter((bit) => !(from & bit)).map((bit) => /** @type {const} */ ([from, from | bit])),
 );
-
-/** @param {Box} box @param {import("./page.js").Frame} frame  The matrix by which the page's points are in [0, 1] inside. */
-export function into(box, { rotation, origin }) {
-  const matrix = new Float32Array(16);
-  matrix[15] = 1;
-  for (const i of [0, 1, 2]) {
-    const length = box.upper[i] - box.lower[i];
-    for (const j of [0, 1, 2]) matrix[4 * j + i] = rotation[j][i] / length;
-    matrix[12 + i] = (origin[i] - box.lower[i]) / length;
-  }
-  return matrix;
-}
 
 /** @param {number} value  Of a side, for the command line. */
 const written = (value) => (Math.abs(value) < FAR ? String(value) : value.toExponential());
@@ -131,27 +122,32 @@ export class Crop {
 }
 
 export class Floaters {
-  /** @param {import("./stage.js").Stage} stage  with its model @param {number} step  world units */
-  constructor(stage, step) {
+  /** @param {import("./stage.js").Stage} stage  with its model @param {Point[]} cameras  of the page @param {number} step  world units */
+  constructor(stage, cameras, step) {
     this._stage = stage;
-    this._largest = LARGEST * step;
+    this._step = step;
+    this._surroundings = new Surroundings(stage, cameras);
     /** Called after each change. */
     this.onChanged = () => {};
     this._faint = this._slider("fainter", 0);
     this._large = this._slider("larger", PARTS);
+    this._far = this._slider("farther", PARTS);
+    at("far").hidden = !cameras.length;
     this._changed();
   }
 
   /** For the command line, "" if nothing is left out. */
   get option() {
-    const given = [this.opacity && `--min-opacity=${this.opacity}`, this.size && `--max-size=${this.size}`];
-    return given.filter(Boolean).join(" ");
+    const given = { "min-opacity": this.opacity, "max-size": this.size, "max-distance": this.distance };
+    return Object.entries(given)
+      .flatMap(([name, value]) => (value ? `--${name}=${value}` : []))
+      .join(" ");
   }
 
   /** Shows all of the model again. */
   reset() {
     this._faint.value = "0";
-    this._large.value = String(PARTS);
+    this._large.value = this._far.value = String(PARTS);
     this._changed();
   }
 
@@ -164,13 +160,21 @@ export class Floaters {
     return slider;
   }
 
+  /** @param {HTMLInputElement} slider @param {number} most  steps @param {number} range  World units; 0 at its end, for no limit. */
+  _limit(slider, most, range) {
+    const part = Number(slider.value) / PARTS;
+    return part < 1 ? rounded(most * this._step * range ** (part - 1)) : 0;
+  }
+
   _changed() {
-    const part = Number(this._large.value) / PARTS;
     /** What is fainter is left out. */
     this.opacity = rounded((FAINTEST * Number(this._faint.value)) / PARTS);
     /** World units: that of which the longest standard deviation is more is left out; 0 for none. */
-    this.size = part < 1 ? rounded(this._largest * RANGE ** (part - 1)) : 0;
+    this.size = this._limit(this._large, LARGEST, SIZES);
+    /** World units: what is farther from all cameras is left out; 0 for none. */
+    this.distance = this._limit(this._far, FARTHEST, DISTANCES);
     this._stage.limit(this.opacity, this.size);
+    this._surroundings.keep(this.distance);
     this.onChanged();
   }
 }

@@ -41,7 +41,7 @@ export class Color {
 export class GraphicsDevice {
   maxPixelRatio: number;
   readonly maxTextureSize: number;
-  readonly scope: { resolve(name: string): { setValue(value: number[] | Float32Array): void } };
+  readonly scope: { resolve(name: string): { setValue(value: number[] | Float32Array | Texture): void } };
   setResolution(width: number, height: number): void;
 }
 
@@ -178,6 +178,7 @@ export const BLEND_NORMAL: number;
 export const LAYERID_WORLD: number;
 export const LAYERID_IMMEDIATE: number;
 export const PIXELFORMAT_RGBA8: number;
+export const PIXELFORMAT_R8: number;
 export const SHADERLANGUAGE_GLSL: string;
 export const FILTER_LINEAR: number;
 export const ADDRESS_REPEAT: number;

@@ -2,7 +2,7 @@
 // can do.
 
 import * as pc from "./engine.js";
-import { ALL, DEPTH, KEPT } from "./shaders.js";
+import { ALL, DEPTH, KEPT, volume } from "./shaders.js";
 
 const FOV = 85; // degrees along the longer side of the window
 const BUDGET = matchMedia("(pointer: coarse)").matches ? 800_000 : 2_000_000; // Gaussians that are drawn of a streamed model
@@ -63,6 +63,9 @@ export class Stage {
     this._kept.setValue(ALL);
     this._limits = device.scope.resolve("uLimits");
     this._limits.setValue([0, 0]);
+    this._near = device.scope.resolve("uNear");
+    this._field = device.scope.resolve("uField");
+    this.everywhere = volume(device, 1, new Uint8Array([255]));
     this._step = 1;
     /** What is around the view, and not of the model. @type {pc.Entity[]} */
     this.backdrops = [];
@@ -83,6 +86,7 @@ export class Stage {
       for (const call of this.onDrawn) call();
     });
     app.systems.gsplat.on("frame:request", () => this.draw());
+    this.keepNear(ALL, this.everywhere);
     app.start();
     this.fit();
   }
@@ -250,6 +254,13 @@ export class Stage {
   /** @param {number} opacity  what is fainter is left out @param {number} size  and what is larger; 0 for none */
   limit(opacity, size) {
     this._limits.setValue([opacity, size]);
+    this.draw();
+  }
+
+  /** @param {Float32Array} matrix  from the world to [0, 1] of a field @param {pc.Texture} texture  of it: less than a half is left out */
+  keepNear(matrix, texture) {
+    this._near.setValue(matrix);
+    this._field.setValue(texture);
     this.draw();
   }
 

@@ -49,7 +49,7 @@ export function offerTools(stage, flight, page) {
   if (!page.frame) return null;
   const cameras = page.cameras.map(({ position }) => position);
   const crop = new Crop(stage, page.frame, cameras, flight.step),
-    floaters = new Floaters(stage, flight.step);
+    floaters = new Floaters(stage, cameras, flight.step);
   offerOption([crop, floaters]);
   return { crop, floaters, path: new Path(flight, page.frame) };
 }

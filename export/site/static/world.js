@@ -30,3 +30,15 @@ export const corners = ({ lower, upper }) =>
   [0, 1, 2, 3, 4, 5, 6, 7].map(
     (number) => /** @type {Point} */ (AXES.map((i) => (number & (1 << i) ? upper : lower)[i])),
   );
+
+/** @param {Box} box @param {Frame} frame  The matrix by which the page's points are in [0, 1] inside. */
+export function into(box, { rotation, origin }) {
+  const matrix = new Float32Array(16);
+  matrix[15] = 1;
+  for (const i of [0, 1, 2]) {
+    const length = box.upper[i] - box.lower[i];
+    for (const j of [0, 1, 2]) matrix[4 * j + i] = rotation[j][i] / length;
+    matrix[12 + i] = (origin[i] - box.lower[i]) / length;
+  }
+  return matrix;
+}

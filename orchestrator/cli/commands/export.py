@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from panolog.export.formats import ChosenModel, write_format
@@ -12,7 +13,7 @@ from panolog.export.frame import Frame
 from panolog.export.georeference import Georeference, georeference_of
 from panolog.export.gltf.tiles import TILESET
 from panolog.export.site.write import DESCRIPTION
-from panolog.export.splats import Selection
+from panolog.export.splats import Selection, Surroundings
 from panolog.export.spz import Version
 from panolog.orchestrator.cli.commands.models import say_unmerged
 from panolog.orchestrator.cli.session.delivery import provenance
@@ -26,6 +27,7 @@ from panolog.orchestrator.watch.views.site.build import (
     write_folder,
     written_place,
 )
+from panolog.orchestrator.watch.views.site.viewpoints import read_viewpoints
 from panolog.scene.errors import ConfigError, InputError
 from panolog.scene.ply import describe_faults
 from panolog.scene.write import StageProgress
@@ -50,6 +52,7 @@ class ExportSpec:
 
     formats: tuple[str, ...]  # of FORMATS; none = by the ending of the output
     selection: Selection = field(default_factory=Selection)  # its part is that of each format
+    max_distance: float | None = None  # units of the model, from the nearest camera of the run
     sky: bool = True  # whether files that can hold it have the sky
     levels: int | None = None  # of detail, of streamed formats; None = as many as it takes
     spz: Version = 3
@@ -90,6 +93,8 @@ def export_model(
     _spare_runs(output, [path for _, path in jobs])
     for _, path in jobs:
         path.parent.mkdir(parents=True, exist_ok=True)
+    if spec.max_distance is not None:
+        spec = replace(spec, selection=replace(spec.selection, near=_surroundings(model, spec.max_distance)))
     chosen = ChosenModel(model.ply, model.place, spec.selection, spec.sky, spec.levels, spec.spz)
     written: list[Path] = []
     for done, (kind, path) in enumerate(jobs):
@@ -138,6 +143,14 @@ def _model(source: Path, spec: ExportSpec) -> _Model:
     _frame(place)
     _ = place.unit  # that it fits is known before anything is written
     return _Model(folder, ply, name, place, made_of)
+
+
+def _surroundings(model: _Model, distance: float) -> Surroundings:
+    """What is so near to a camera of the run. Raises InputError if no cameras are known."""
+    viewpoints = read_viewpoints(model.run, None) if model.run else None
+    if viewpoints is None:
+        raise InputError(f"--max-distance: {model.ply} has no cameras; give the run that has made it")
+    return Surroundings(np.stack([camera.position for camera in viewpoints.cameras.values()]), distance)
 
 
 def _doubts(place: Georeference, formats: tuple[str, ...]) -> list[str]:

@@ -18,6 +18,7 @@ from panolog.export.georeference import Georeference
 from panolog.export.reading import read_model
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.storage import fetch
+from panolog.orchestrator.watch.views.site.viewpoints import read_viewpoints
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import read_ply, write_ply
 from panolog.scene.read import read_scene
@@ -152,6 +153,21 @@ def test_choices(run: RunFolder, tmp_path: Path, kind: str) -> None:
     assert kind == "ply" or read_model(file).degree == 0
     nothing = ("--without-sky", "--min-opacity", 0.95)
     assert panolog("export", run.point_cloud, "-o", file, *nothing).exit_code == 2
+
+
+def test_what_is_far_from_all_cameras_is_left_out(run: RunFolder, tmp_path: Path) -> None:
+    viewpoints = read_viewpoints(run, None)
+    assert viewpoints is not None
+    cameras = np.stack([camera.position for camera in viewpoints.cameras.values()])
+    whole, file = read_ply(run.point_cloud), tmp_path / "model.ply"
+    scene = whole.means[: len(whole) - whole.sky].numpy()
+    nearest = np.linalg.norm(scene[:, None] - cameras, axis=2).min(axis=1)
+    export(run.root, "-o", file, "--max-distance", np.median(nearest) * 1.0001)
+    found = read_ply(file)
+    assert (len(found) - found.sky, found.sky) == ((len(scene) + 1) // 2, whole.sky)
+    alone = panolog("export", run.point_cloud, "-o", file, "--max-distance", 1)
+    assert alone.exit_code == 2
+    assert "has no cameras; give the run" in one_line(alone)
 
 
 def test_choices_of_a_plain_ply(run: RunFolder, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from playwright.sync_api import Browser, Page
 
-from panolog.export.splats import Selection, Splats
+from panolog.export.splats import Selection, Splats, Surroundings
 from panolog.renderer.poses import read_poses
 from tests.orchestrator.watch.dashboard.browser import opened
 from tests.orchestrator.watch.views.sites import SIZE, page_of_layers, psnr, rendered, shown
@@ -70,18 +70,21 @@ def test_views_are_saved_cropped_and_rendered_from(browser: Browser, tmp_path: P
 def test_floaters_are_hidden_as_export_leaves_them_out(browser: Browser, tmp_path: Path) -> None:
     order = torch.randperm(60, generator=torch.Generator().manual_seed(2))
     file, model, viewpoints = page_of_layers(tmp_path, torch.linspace(-2, 4, 60)[order])
+    cameras = np.stack([camera.position for camera in viewpoints.cameras.values()])
     with opened(browser, file.as_uri(), width=SIZE[0], height=SIZE[1]) as page:
         whole = shown(page)
-        for faint, large in ((500, 1000), (0, 500), (500, 500)):
+        for faint, large, far in ((500, 1000, 1000), (0, 500, 1000), (0, 1000, 250), (500, 500, 300)):
             move(page, "fainter", faint)
             move(page, "larger", large)
+            move(page, "farther", far)
             text = page.evaluate("document.getElementById('option').textContent")
             option = {name: float(value) for name, value in (word.split("=") for word in text.split())}
-            assert option.keys() == {
-                name for name, given in (("--min-opacity", faint > 0), ("--max-size", large < 1000)) if given
-            }
+            given = {"--min-opacity": faint > 0, "--max-size": large < 1000, "--max-distance": far < 1000}
+            assert option.keys() == {name for name, limits in given.items() if limits}
             selection = Selection(
-                min_opacity=option.get("--min-opacity", 0.0), max_size=option.get("--max-size")
+                min_opacity=option.get("--min-opacity", 0.0),
+                max_size=option.get("--max-size"),
+                near=Surroundings(cameras, option.get("--max-distance", np.inf)),
             )
             kept = selection.keeps(Splats.of(model), np.ones(len(model), bool))
             assert 5 < kept.sum() < len(model) - 5
