@@ -40,6 +40,8 @@ def take_pictures(url: str, name: str | None) -> None:
     with chromium() as browser:
         page = open_page(browser, url, DESK, 560, "light")
         expect(page.locator("#runs tbody tr")).to_have_count(len(runs))
+        for cover in page.locator("#runs .cover:visible").all():
+            expect(cover).not_to_have_js_property("naturalWidth", 0)
         page.screenshot(path=HERE / "dashboard-runs.png")
         page = open_page(browser, f"{url}/runs/{run['id']}", DESK, 1640, "light")
         show_everything(page)

@@ -106,7 +106,8 @@ function made({ width, iterations, blocks, seconds }) {
     seconds === null ? "" : duration(seconds),
   ]
     .filter(Boolean)
-    .join(" · ");
+    .map((part) => part.replaceAll(" ", "\u00a0")) // lines end between parts
+    .join("\u00a0· ");
 }
 
 /** Which runs are compared, in the order in which they were chosen. @param {string} id @param {boolean} on */
