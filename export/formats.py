@@ -12,11 +12,13 @@ from panolog.export.gltf.tiles import write_tiles
 from panolog.export.reading import sky_of
 from panolog.export.sky import render_sky, write_sky_image
 from panolog.export.sog.write import write_sog
-from panolog.export.splats import ModelSource, Part, Selection
+from panolog.export.splats import ModelSource, Part, Selection, Surroundings
 from panolog.export.spz import LARGEST, REACH, Version, write_spz
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_exact, read_sky, write_ply_parts
+
+_FEW = 0.01  # of a scene's Gaussians, at most, that are left out because they are too far
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +31,7 @@ class ChosenModel:
     sky: bool = True  # whether files that can hold it have the sky
     levels: int | None = None  # of detail of 3D Tiles; None = as many as it takes
     spz: Version = 3
+    say: Callable[[str], None] = lambda _: None  # is called with what a format cannot hold of it
 
 
 def write_format(kind: str, model: ChosenModel, path: Path) -> list[Path]:
@@ -56,13 +59,30 @@ def _for_viewers(model: ChosenModel) -> ModelSource:
     return _source(model, "all", upside_down).with_near_sky()
 
 
+def _in_reach(model: ChosenModel, scene: ModelSource) -> ModelSource:
+    """A scene without the few Gaussians that are farther than SPZ holds: some of a flight are at the horizon.
+
+    Of a scene that is larger than that it is all, which SPZ refuses.
+    """
+    middle, selection = Surroundings(scene.frame.origin[None], REACH / scene.scale), scene.selection
+    near = replace(scene, selection=replace(selection, near=(*selection.near, middle)))
+    left = scene.count - near.count
+    if not 0 < left <= _FEW * scene.count:
+        return scene
+    model.say(
+        f"{left:,} of {scene.count:,} Gaussians are more than {REACH:.0f} units from the origin of exports, "
+        "which SPZ, glTF and 3D Tiles do not hold; left out"
+    )
+    return near
+
+
 def _tiles(model: ChosenModel, path: Path) -> None:
     write_tiles(path, _in_metres(model), to_ecef=model.place.tiles_to_ecef(), levels=model.levels)
 
 
 def _spz(model: ChosenModel, path: Path) -> list[Path]:
     """The sky, whose size SPZ may not hold, is a file of its own: pulled in, so that it looks the same."""
-    write_spz(path, _source(model, "scene"), model.spz)
+    write_spz(path, _in_reach(model, _source(model, "scene")), model.spz)
     sky = sky_of(path)
     if not model.sky or not len(read_sky(model.ply)):
         sky.unlink(missing_ok=True)  # of an earlier export, which readers of the scene would take for its own
@@ -92,7 +112,7 @@ def _ply(model: ChosenModel, path: Path) -> None:
 
 def _in_metres(model: ChosenModel) -> ModelSource:
     """The scene in the unit of glTF and 3D Tiles, where it is known how large one of the model's is."""
-    return _source(model, "scene", scale=model.place.unit or 1.0)
+    return _in_reach(model, _source(model, "scene", scale=model.place.unit or 1.0))
 
 
 def _sky_image(model: ChosenModel, path: Path) -> list[Path]:

@@ -166,14 +166,14 @@ class InMemory:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What is within a distance of the nearest of some cameras."""
+    """What is within a distance of the nearest of some places, such as cameras."""
 
-    cameras: NDArray[np.float64]  # (C, 3) positions in the model's coordinates
+    places: NDArray[np.float64]  # (C, 3) in the model's coordinates
     distance: float  # units of the model
 
     @cached_property
     def _tree(self) -> scipy.spatial.KDTree:
-        return scipy.spatial.KDTree(self.cameras)
+        return scipy.spatial.KDTree(self.places)
 
     def contain(self, means: Floats) -> NDArray[np.bool_]:
         """(N,) whether places (N, 3) are so near."""
@@ -191,7 +191,7 @@ class Selection:
     max_size: float | None = None  # units of the model, of the longest standard deviation; nor to this
     # lower and upper corner in the model's coordinates, of what is scene; None = everything
     crop: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
-    near: Surroundings | None = None  # likewise
+    near: tuple[Surroundings, ...] = ()  # likewise, what is in all of them
 
     def keeps(self, piece: Splats, scene: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(N,) which of these are exported; what is not finite never is, because no format can hold it.
@@ -207,8 +207,8 @@ class Selection:
         if self.crop is not None:
             lower, upper = np.array(self.crop, np.float32)
             keep &= ~scene | ((piece.means >= lower) & (piece.means < upper)).all(1)
-        if self.near is not None:
-            keep &= ~scene | self.near.contain(piece.means)
+        for surroundings in self.near:
+            keep &= ~scene | surroundings.contain(piece.means)
         return np.asarray(keep & {"scene": scene, "sky": ~scene, "all": True}[self.part])
 
 

@@ -80,7 +80,7 @@ def encode(file: BinaryIO, source: SplatSource, version: Version = 3) -> None:
     if not np.isfinite(extent) or most_bits(extent) < _BITS[0]:
         raise FormatError(
             f"a Gaussian is {extent:.0f} units from the origin, and SPZ holds ±{REACH:.0f}; "
-            f"export without the sky, or crop the model"
+            f"crop the model, or leave out what is far with --max-distance"
         )
     order = morton_order(means)
     streams = _packed(source, order)

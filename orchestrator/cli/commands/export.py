@@ -94,8 +94,9 @@ def export_model(
     for _, path in jobs:
         path.parent.mkdir(parents=True, exist_ok=True)
     if spec.max_distance is not None:
-        spec = replace(spec, selection=replace(spec.selection, near=_surroundings(model, spec.max_distance)))
-    chosen = ChosenModel(model.ply, model.place, spec.selection, spec.sky, spec.levels, spec.spz)
+        near = _surroundings(model, spec.max_distance)
+        spec = replace(spec, selection=replace(spec.selection, near=(near,)))
+    chosen = ChosenModel(model.ply, model.place, spec.selection, spec.sky, spec.levels, spec.spz, say)
     written: list[Path] = []
     for done, (kind, path) in enumerate(jobs):
         progress(f"writing {path.name}", done, len(jobs))

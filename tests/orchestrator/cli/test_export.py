@@ -336,6 +336,22 @@ def test_a_sky_that_spz_cannot_hold_is_pulled_in(run: RunFolder, tmp_path: Path)
     assert len(read_model(tmp_path / "far.spz")) == len(whole) - whole.sky
 
 
+@pytest.mark.parametrize("kind", ["spz", "glb", "3dtiles"])
+def test_few_gaussians_that_are_too_far_are_left_out(run: RunFolder, tmp_path: Path, kind: str) -> None:
+    whole = read_ply(run.point_cloud)
+    scene, means = len(whole) - whole.sky, whole.means.clone()
+    for count in (2, scene // 20):
+        means[:count, 1] = 5000
+        write_ply(tmp_path / "far.ply", whole.with_tensors(whole.tensors() | {"means": means}))
+        done = panolog("export", tmp_path / "far.ply", f"--{kind}", "-o", tmp_path / f"{count}")
+        if count == 2:
+            assert done.exit_code == 0
+            left = f"2 of {scene} Gaussians are more than 2048 units from the origin of exports"
+            assert left in done.stderr
+    assert done.exit_code == 2
+    assert "SPZ holds ±2048; crop the model, or leave out what is far with --max-distance" in one_line(done)
+
+
 def test_a_sky_of_an_earlier_spz_goes_with_it(run: RunFolder, tmp_path: Path) -> None:
     """Read with the scene that was exported without one, it came back."""
     for options, files in ((), {"a.spz", "a-sky.spz"}), (("--without-sky",), {"a.spz"}):

@@ -84,7 +84,7 @@ def test_floaters_are_hidden_as_export_leaves_them_out(browser: Browser, tmp_pat
             selection = Selection(
                 min_opacity=option.get("--min-opacity", 0.0),
                 max_size=option.get("--max-size"),
-                near=Surroundings(cameras, option.get("--max-distance", np.inf)),
+                near=(Surroundings(cameras, option.get("--max-distance", np.inf)),),
             )
             kept = selection.keeps(Splats.of(model), np.ones(len(model), bool))
             assert 5 < kept.sum() < len(model) - 5
