@@ -84,6 +84,7 @@ class Video:
         self._container = container
         self._lenses, self._second = lenses, second
         self._stream = _video_stream(path, container, effort, lenses)
+        self._by_time = self._stream.codec_context.skip_frame != "DEFAULT"
         self._converter = Converter()
         self._frames = self._decode()
         first = next(self._frames, None)
@@ -142,16 +143,35 @@ class Video:
         for wanted in times:
             begin = max((key for key in keys if key <= wanted), default=0.0)
             if begin > self.time or wanted < self.time:
-                self._container.seek(round(begin / (self._stream.time_base or 1)), stream=self._stream)
-                if self._second is not None:
-                    self._second.seek(begin)
-                self._frames, self.time = self._decode(), -1.0
+                self._seek(begin)
             while self.time < wanted and (frame := next(self._frames, None)) is not None:
                 self._frame = frame
                 self._show(frame)
             if self.time != wanted:
                 return
             yield wanted
+
+    def between(self, begin: float, end: float) -> Iterator[int]:
+        """The numbers, by their times, of the frames between two times, in seconds; each call is later.
+
+        Where seeking does not find the first of them, the video is not plain.
+
+        Args: begin, that of a frame from which decoding can begin.
+        """
+        self._by_time = True
+        if not self.decoded:
+            self._show(self._frame)
+        self._seek(begin)
+        found = False
+        for frame in self._frames:
+            if round(self._time(frame), 6) >= end:
+                break
+            self._frame = frame
+            self._show(frame)
+            found |= self.time == begin
+            if self.time > begin:
+                yield self.passed - 1
+        self.is_plain &= found
 
     def picture(self) -> NDArray[np.uint8] | None:
         """(height, width, 3) BGR; None if it is damaged or unlike the first one."""
@@ -184,6 +204,13 @@ class Video:
         if self.passed == MAX_FRAMES:
             lines.append(f"{self.path}: only its first {MAX_FRAMES:,} frames were used; cut it")
         return lines
+
+    def _seek(self, begin: float) -> None:
+        """The next frame is that at a time in seconds, from which decoding can begin, or an earlier one."""
+        self._container.seek(round(begin / (self._stream.time_base or 1)), stream=self._stream)
+        if self._second is not None:
+            self._second.seek(begin)
+        self._frames, self.time = self._decode(), -1.0
 
     def _decode(self) -> Iterator[av.VideoFrame]:
         """The frames that can be decoded, with those of the second lens next to them if it has its own."""
@@ -232,7 +259,7 @@ class Video:
         self.is_plain &= frame.pts is not None and (self.decoded == 0 or time > self.time)
         self.time, self.first = time, self.first if self.decoded else time
         self.decoded, self.passed = self.decoded + 1, self.passed + 1
-        if self._stream.codec_context.skip_frame != "DEFAULT":
+        if self._by_time:
             due = round((time - self.first) * float(self._stream.average_rate or 0)) + 1
             self.passed = max(self.passed, min(due, MAX_FRAMES))
         if frame.key_frame:
@@ -259,7 +286,8 @@ def open_video(path: Path, effort: Effort = "exact", up: Up | None = None) -> It
 
     Args: effort, "exact" decodes all frames in one thread, so that damaged ones are the same each time.
         "chosen" decodes in several threads, and of large videos no frames that no others refer to, most of
-        which are coded worst. "draft" also leaves out what smooths the borders of blocks in large ones.
+        which are coded worst. "draft" also leaves out what smooths the borders of blocks in large ones, and
+        "keys" all frames but those from which decoding can begin.
         up, of a video that is to be stitched, where up is in its first circle; None: up.
     Raises SceneError: it is missing, cannot be opened, is no panorama, or its width is out of bounds.
     """

@@ -1,6 +1,8 @@
 """Extracts the frames of a 360° video for a reconstruction: sharp ones, an even baseline apart."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -26,6 +28,9 @@ from panolog.scene.write import Progress, no_progress
 PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
 _QUALITY = 95
 _DENSE = 0.5  # degrees of parallax between two frames of a large video that are looked at, at most
+_COARSE = (
+    1.5 * PARALLAX
+)  # degrees between two frames from which decoding can begin: then others are not needed
 _WIDEST = 45.0  # degrees of parallax from which no features match
 
 
@@ -70,7 +75,7 @@ def extract_frames(
     if most is not None and most < 2:
         raise ConfigError(f"most {most}: give at least 2 frames; one panorama has no parallax")
     frames = _Frames(video, folder)
-    found = _video_motion(video, frames.motion, progress, up)
+    found = _video_motion(video, frames.motion, progress, up, fine=parallax < PARALLAX)
     telemetry, left_out = read_telemetry(video)
     if note is not None:
         for line in (*found.notes, *left_out):
@@ -139,46 +144,94 @@ class _Frames:
                 file.unlink()
 
 
-def _video_motion(video: Path, file: Path, progress: Progress, up: Up | None) -> VideoMotion:
+def _video_motion(video: Path, file: Path, progress: Progress, up: Up | None, *, fine: bool) -> VideoMotion:
     """The motion, from the file of an earlier call or from the video. Raises SceneError."""
     key = video_digest(video) + ("" if up is None else f"-{up}")
     known = load_motion(file)
-    if known is None:
-        return _search(video, key, progress, up)
-    if known.digest != key:
+    if known is not None and known.digest != key:
         raise SceneError(
             f"{file}: is about another video of the name {video.stem}, or of another --up; remove it and "
             "its frames, or give another folder"
         )
+    if known is None or (fine and known.coarse):
+        found = _search(video, key, progress, up, fine=fine)
+        return found if known is None else replace(found, chosen=known.chosen, track=known.track)
     return known
 
 
-def _search(video: Path, key: str, progress: Progress, up: Up | None = None) -> VideoMotion:
+def _search(video: Path, key: str, progress: Progress, up: Up | None, *, fine: bool) -> VideoMotion:
     """The first pass, again with care if the video turns out to be damaged. Raises SceneError."""
-    found = _followed(video, key, progress, "draft", up) or _followed(video, key, progress, "exact", up)
+    found = None if fine else _coarsely_followed(video, key, progress, up)
+    found = found or _followed(video, key, progress, "draft", up)
+    found = found or _followed(video, key, progress, "exact", up)
     if found is None or not found.pieces:
         raise SceneError(f"{video}: is damaged, or shows nothing that can be tracked; no frame can be used")
     return found
 
 
-def _followed(video: Path, key: str, progress: Progress, effort: Effort, up: Up | None) -> VideoMotion | None:
-    """The motion; None of a draft of a video that is not plain. Raises SceneError."""
-    with open_video(video, effort, up) as source:
-        motion, coming = MotionTracker(source.width), 0
-        for number in source.frames():
-            if effort == "draft" and not source.is_plain:
-                return None
+def _coarsely_followed(video: Path, key: str, progress: Progress, up: Up | None) -> VideoMotion | None:
+    """The motion by the frames from which decoding can begin, and by all others where these are far apart.
+
+    None of a video that is small or not plain. Raises SceneError.
+    """
+    with open_video(video, "keys", up) as keys, open_video(video, "draft", up) as source:
+        if source.often == 1:
+            return None
+        motion, last, coming = MotionTracker(source.width), -1.0, 0
+        for number in keys.frames():
             if number < coming:
                 continue
+            grey = keys.grey(SHARP_WIDTH)
+            if grey is None or not keys.is_plain:
+                return None
+            if not motion.add_near(number, keys.time, grey, _COARSE):
+                if last >= 0 and not _follow(source, source.between(last, keys.time), motion, progress):
+                    return None
+                _add(motion, keys, number, grey)
+            last, coming = keys.time, number + motion.frames_within(_DENSE, source.often)
+            progress(keys.passed, 2 * max(keys.promised, keys.passed))
+        if not _follow(source, source.between(last, math.inf), motion, progress):
+            return None
+        decoded = max(keys.passed, source.passed)
+        return VideoMotion(key, decoded, keys.keys, coarse=True, pieces=motion.finish(), notes=source.notes())
+
+
+def _followed(video: Path, key: str, progress: Progress, effort: Effort, up: Up | None) -> VideoMotion | None:
+    """The motion; None of a draft of a video that is not plain. Raises SceneError."""
+    draft = effort == "draft"
+    with open_video(video, effort, up) as source:
+        motion = MotionTracker(source.width)
+        if not _follow(source, source.frames(), motion, progress, draft=draft):
+            return None
+        keys = source.keys if draft else []
+        return VideoMotion(key, source.passed, keys, pieces=motion.finish(), notes=source.notes())
+
+
+def _follow(
+    source: Video, numbers: Iterator[int], motion: MotionTracker, progress: Progress, *, draft: bool = True
+) -> bool:
+    """Adds frames to the motion, of a draft fewer where the camera is slow.
+
+    Returns whether a draft's video is plain. Raises SceneError.
+    """
+    coming = 0
+    for number in numbers:
+        if draft and not source.is_plain:
+            return False
+        if number >= coming:
             grey = source.grey(SHARP_WIDTH)
-            coming = number + (motion.frames_within(_DENSE, source.often) if effort == "draft" else 1)
+            coming = number + (motion.frames_within(_DENSE, source.often) if draft else 1)
             if grey is not None:
-                if not motion.pieces and (what := describe_picture(grey)) is not None:
-                    raise SceneError(f"{video}: its frames are {what}")
-                motion.add(number, source.time, grey)
+                _add(motion, source, number, grey)
             progress(source.passed, 2 * max(source.promised, source.passed))
-        keys = source.keys if effort == "draft" else []
-        return VideoMotion(key, source.passed, keys, motion.finish(), source.notes())
+    return source.is_plain or not draft
+
+
+def _add(motion: MotionTracker, source: Video, number: int, grey: NDArray[np.uint8]) -> None:
+    """Raises SceneError if the first frame is no panorama."""
+    if not motion.pieces and (what := describe_picture(grey)) is not None:
+        raise SceneError(f"{source.path}: its frames are {what}")
+    motion.add(number, source.time, grey)
 
 
 def _write(

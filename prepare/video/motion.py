@@ -5,6 +5,7 @@ The result is kept as JSON next to the frames, because the search takes long.
 
 import json
 from collections import deque
+from copy import copy
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -54,6 +55,7 @@ class VideoMotion:
     digest: str  # of the video
     decoded: FrameNumber = 0  # frames
     keys: list[FiniteFloat] = field(default_factory=list)  # seconds, where a search can begin; none: in order
+    coarse: bool = False  # whether only those were looked at where the camera moves slowly
     pieces: list[Piece] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     chosen: list[FrameNumber] = field(default_factory=list)  # frames that are, or will be, files
@@ -115,6 +117,24 @@ class MotionTracker:
             if self._stray is not None:
                 self._begin(self._stray)
             self._stray = None if self._stray is not None and self._measure(frame) else frame
+
+    def add_near(self, number: int, time: float, grey: NDArray[np.uint8], farthest: float) -> bool:
+        """Adds a frame as `add`, some time after the last one, if it is sharp and as near as degrees say.
+
+        Otherwise nothing is changed, and what lies between is needed.
+        """
+        if self._anchor is None and self._stray is not None:  # the first frame
+            self._begin(self._stray)
+            self._stray = None
+        if self._anchor is None or self._stray is not None:
+            return False
+        frame = self._frame(number, time, grey)
+        self._recent.pop()
+        moved = copy(self._anchor).measure(frame.grey) if frame.clear else None
+        if moved is None or abs(self._base + moved.parallax - self.pieces[-1].positions[-1]) > farthest:
+            return False
+        self.add(number, time, grey)
+        return True
 
     def frames_within(self, parallax: float, most: int) -> int:
         """How many frames the camera takes for so many degrees at its present pace, from 1 to `most`."""

@@ -124,13 +124,40 @@ def test_of_a_large_video_that_moves_slowly_few_frames_are_looked_at(
     slow = write_video(tmp_path / "slow.avi", [render(shot) for shot in walk([0.004] * 30)])
     for video in (short, slow):
         monkeypatch.setattr(streams, "_LARGE", WIDTH + 1)
-        every = module._search(video, "", no_progress)
+        every = module._search(video, "", no_progress, None, fine=True)
         monkeypatch.setattr(streams, "_LARGE", WIDTH)
-        some = module._search(video, "", no_progress)
+        some = module._search(video, "", no_progress, None, fine=True)
         (all_, few) = (sum(len(piece.frames) for piece in it.pieces) for it in (every, some))
         assert few == all_ if video == short else few < 0.5 * all_
         ends = [max(piece.positions[-1] for piece in it.pieces) for it in (every, some)]
         assert ends[1] == pytest.approx(ends[0], abs=0.3)
+
+
+def test_of_a_large_video_frames_between_those_to_seek_are_decoded_where_these_are_far_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Decoding can begin at each twelfth frame; the camera is slow, for 24 frames fast, and slow again."""
+    shots = walk([0.03] * 36 + [0.3] * 24 + [0.03] * 40)
+    video = write_video(tmp_path / "walk.mp4", [render(shot) for shot in shots], fourcc="mp4v")
+    monkeypatch.setattr(streams, "_LARGE", WIDTH)
+    few, every = (module._search(video, "", no_progress, None, fine=fine) for fine in (False, True))
+    assert (few.coarse, every.coarse) == (True, False)
+    (coarse,), (whole,) = few.pieces, every.pieces
+    assert [number for number in coarse.frames if number <= 36 or 60 <= number < 96] == [
+        *range(0, 37, 12),
+        *range(60, 96, 12),
+    ]
+    assert len([number for number in coarse.frames if 36 < number < 60]) > 12
+    assert coarse.frames[-1] == whole.frames[-1] == 99
+    for number, position in zip(coarse.frames, coarse.positions, strict=True):
+        if number in whole.frames:
+            assert position == pytest.approx(whole.positions[whole.frames.index(number)], rel=0.1, abs=0.5)
+    out = tmp_path / "out"
+    files = extract_frames(video, out)
+    steps = np.diff([shots[number].along for number in numbers(files)])
+    assert steps.max() < 1.3, steps
+    assert len(extract_frames(video, out, parallax=1.0)) > 2 * len(files)  # which requires another search
+    assert not (known := load_motion(out / "walk.motion.json")) or not known.coarse
 
 
 def test_another_choice_replaces_the_first(short: Path, extracted: Path, tmp_path: Path) -> None:
