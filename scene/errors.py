@@ -5,6 +5,7 @@ Each error takes that line as its only argument, so it survives pickling across 
 Modules import the packages of an extra as any other; where one is missing, `explained` says what to install.
 """
 
+import re
 from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import Any
@@ -22,6 +23,17 @@ PACKAGES = {  # a module: its name for people, and the extra of pyproject.toml
     "pyproj": ("pyproj", "export"),
     "pi_heif": ("pi-heif", "formats"),
 }
+
+_SHORTAGE = re.compile(  # what says so in words only: torch of the CPU, the driver, CUDA's libraries, OpenCV
+    "out[ _]of[ _]memory|alloc(ation)?_failed|defaultcpuallocator|insufficient memory|cannot allocate memory"
+    "|bad_alloc|memoryallocation",
+    re.IGNORECASE,
+)
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an error, of whatever class, says that memory of the host or of a GPU was not enough."""
+    return isinstance(error, MemoryError) or _SHORTAGE.search(str(error)) is not None
 
 
 def in_one_line(error: BaseException, most: int | None = None) -> str:

@@ -5,7 +5,6 @@ plain processes of this one.
 """
 
 import logging
-import re
 from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from panolog.orchestrator.engine.scheduling.scaling import NO_GROWTH, Growth
 from panolog.orchestrator.runs.machines.nodes import Node, Placement
 from panolog.orchestrator.runs.machines.usage import Usage
 from panolog.orchestrator.runs.records import Failure
-from panolog.scene.errors import DeviceError, InputError, PanologError, RunError, first_line
+from panolog.scene.errors import DeviceError, InputError, PanologError, RunError, first_line, out_of_memory
 from panolog.scene.files import Locate, here
 from panolog.workers.device_memory import CONTEXT
 from panolog.workers.events import Calibration, Event
@@ -28,11 +27,6 @@ from panolog.workers.tasks import CALIBRATE, TaskId
 
 T = TypeVar("T")
 NONE: Set[TaskId] = frozenset()
-_SHORTAGE = re.compile(  # what says so in words only: torch of the CPU, the driver, CUDA's libraries, OpenCV
-    "out[ _]of[ _]memory|alloc(ation)?_failed|defaultcpuallocator|insufficient memory|cannot allocate memory"
-    "|bad_alloc|memoryallocation",
-    re.IGNORECASE,
-)
 _LOG = logging.getLogger(__name__)
 
 
@@ -65,7 +59,7 @@ class Failed:
         text = first_line(str(error))
         if isinstance(error, InputError):
             return Failed(text, Failure.INPUT)
-        if isinstance(error, MemoryError | torch.OutOfMemoryError) or _SHORTAGE.search(str(error)):
+        if isinstance(error, torch.OutOfMemoryError) or out_of_memory(error):
             return Failed(f"out of memory: {text or 'on the CPU'}", Failure.MEMORY, detail)
         if isinstance(error, PanologError):
             return Failed(text)
