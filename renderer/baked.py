@@ -9,12 +9,11 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from panolog.renderer import _core, ops
+from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians
 
 TILE = 16  # pixels, kTile in csrc/footprint.h
-_CLEAR = (1, 0, 0, 0, 0)  # a pixel of a layer in which there is nothing
 _SPLAT = 16  # floats, sizeof(Splat) in csrc/formulas.h
 SLACK = 0.05  # of a distance, which own Gaussians may move without compositing in a wrong order
 FAINT = 1 / 255  # summed weight in a tile's pixels, up to which a splat is not composited among own Gaussians
@@ -66,58 +65,55 @@ class Baked:
 def bake(
     gaussians: Gaussians, own: int, camera: Camera, *, near: float, unit: float, sh_degree: int = 3
 ) -> Baked:
-    """What one camera sees of all but the first `own` Gaussians.
+    """What one camera sees of all but the first `own` Gaussians, on the device that these are on.
 
-    Args: gaussians on the CPU; near in world units; unit in world units, about the least distance of what is
-    seen: inverse depths are stored times it.
+    Args: camera on the CPU; near in world units; unit in world units, about the least distance of what is
+    seen: inverse depths are stored times it. A GPU keeps the host waiting four times: for how many pairs of
+    splats and tiles there are, active tiles, tiles with something in front, and splats among the own ones.
+
+    Raises RunError on a GPU where there are more than 2³¹ pairs.
     """
-    height, width = camera.height, camera.width
-    layers = [
-        [torch.zeros(height, width, 3), torch.zeros(height, width), torch.zeros(height, width)] for _ in "fb"
-    ]
-    front, back = ([tensor.numpy() for tensor in layer] for layer in layers)
-    spans, among, splats, rays = _core.bake(
-        **{name: tensor.detach().contiguous().numpy() for name, tensor in gaussians.tensors().items()},
-        screen=torch.zeros(len(gaussians), 2).numpy(),
+    *images, span, among, splats, rays = ops.bake(
+        **{name: tensor.detach() for name, tensor in gaussians.tensors().items()},
+        rotation=camera.rotation,
+        translation=camera.translation,
         own=own,
-        rotation=camera.rotation.numpy(),
-        translation=camera.translation.numpy(),
-        width=width,
-        height=height,
+        width=camera.width,
+        height=camera.height,
         sh_degree=sh_degree,
         near=near,
         exact=gaussians.exact,
         slack=SLACK,
         faint=FAINT,
-        threads=ops.threads(),
-        **dict(zip(("front_color", "front_alpha", "front_inverse_depth"), front, strict=True)),
-        **dict(zip(("back_color", "back_alpha", "back_inverse_depth"), back, strict=True)),
     )
-    rows = torch.from_numpy(among).nonzero()[:, 0]
-    chosen = [torch.from_numpy(array).view(-1, _SPLAT) for array in (splats, rays)]
-    span = torch.from_numpy(spans).view(-1, 2)
     active = span[:, 0] <= span[:, 1]
-    chosen = [array[rows].flatten() if len(array) else array.flatten() for array in chosen]
-    before = _tiles(layers[0], active, unit)
-    fronts = (before != before.new_tensor(_CLEAR).view(5, 1, 1)).flatten(1).any(1).nonzero()[:, 0]
+    tiles, rows = active.nonzero()[:, 0], among.nonzero()[:, 0]
+    front, back = (_tiles(images[first : first + 3], tiles, unit) for first in (0, 3))
+    fronts = ((front[:, :1] != 1) | (front[:, 1:] != 0).any(1, keepdim=True)).flatten(1).any(1)
+    fronts = fronts.nonzero()[:, 0]
     return Baked(
-        splats=chosen[0],
-        rays=chosen[1],
+        splats=_rows(splats, rows),
+        rays=_rows(rays, rows) if gaussians.exact else rays,
         places=torch.where(active, active.cumsum(0) - 1, -1).to(torch.int32),
         spans=span,
         fronts=fronts,
-        front=before[fronts],
-        back=_tiles(layers[1], active, unit),
+        front=front[fronts],
+        back=back,
         unit=unit,
     )
 
 
-def _tiles(layer: list[Tensor], active: Tensor, unit: float) -> Tensor:
-    """Color, alpha and inverse depth of an image as the layer (A, 5, 16, 16) of its active tiles."""
+def _rows(splats: Tensor, rows: Tensor) -> Tensor:
+    """Some of the splats (16 N,) or their rays."""
+    return splats.view(-1, _SPLAT)[rows].flatten()
+
+
+def _tiles(layer: list[Tensor], chosen: Tensor, unit: float) -> Tensor:
+    """Color, alpha and inverse depth of an image as a layer (A, 5, 16, 16) of A chosen tiles."""
     color, alpha, inverse_depth = layer
     height, width = alpha.shape
     planes = torch.stack([1 - alpha, *color.unbind(2), inverse_depth * unit])
     padded = torch.nn.functional.pad(planes, (0, -width % TILE, 0, -height % TILE))
     rows, columns = padded.shape[1] // TILE, padded.shape[2] // TILE
     tiles = padded.view(5, rows, TILE, columns, TILE).permute(1, 3, 0, 2, 4)
-    return tiles.reshape(rows * columns, 5, TILE, TILE)[active].half()
+    return tiles.reshape(rows * columns, 5, TILE, TILE)[chosen].half()

@@ -189,6 +189,55 @@ def backward_into(given: Mapping[str, Any], frame: Sequence[Tensor], **results: 
     return _core.rasterize_backward(**arguments, exterior=around, threads=threads())
 
 
+@_op
+def bake(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    rotation: Tensor,
+    translation: Tensor,
+    own: int,
+    width: int,
+    height: int,
+    sh_degree: int,
+    near: float,
+    exact: bool,
+    slack: float,
+    faint: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """All but the first `own` of N Gaussians as a camera sees them, before and behind those (csrc/bake.h).
+
+    Returns color (H, W, 3), alpha (H, W) and inverse depth (H, W) of what is before, then of what is behind;
+    spans (T, 2); among (N,) uint8, which splats composite among the own ones; splats (16 N,) and rays
+    likewise or, without `exact`, (0,). Images are undefined in tiles whose span is empty.
+    """
+    images = [torch.zeros(shape) for shape in ((height, width, 3), (height, width), (height, width)) * 2]
+    names = (f"{layer}_{image}" for layer in ("front", "back") for image in _IMAGES)
+    found = _core.bake(
+        **_arrays(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN),
+        **_arrays(screen=torch.zeros(len(means), 2), rotation=rotation, translation=translation),
+        own=own,
+        width=width,
+        height=height,
+        sh_degree=sh_degree,
+        near=near,
+        exact=exact,
+        slack=slack,
+        faint=faint,
+        threads=threads(),
+        **_arrays(**dict(zip(names, images, strict=True))),
+    )
+    spans, among, splats, rays = (torch.from_numpy(array) for array in found)
+    front, front_alpha, front_depth, back, back_alpha, back_depth = images
+    return (
+        *(front, front_alpha, front_depth, back, back_alpha, back_depth),
+        *(spans.view(-1, 2), among, splats, rays),
+    )
+
+
 _TENSORS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen", "rotation", "translation")
 _SETTINGS = ("width", "height", "sh_degree", "near", "exact")
 _EXTERIOR = "exterior"

@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from panolog.renderer.cuda.baking import surroundings
 from panolog.renderer.cuda.losses import absolute_sum, photometric_sums
 from panolog.renderer.cuda.motion import motion_sums, room_for
 from panolog.renderer.cuda.parts import (
@@ -81,6 +82,23 @@ def rasterize_backward(launch: Launch, **given: Any) -> tuple[Tensor, ...]:
         out["screen"] = torch.cat([out["screen"], out.pop("absolute")], 1)
     found = means.new_empty(0, dtype=torch.float64) if motion is None else motion_sums(launch, motion)
     return *out.values(), found
+
+
+def bake(launch: Launch, **given: Any) -> tuple[Tensor, ...]:
+    """`ops.bake`: images before and behind the own splats, spans, which splats are among, splats and rays.
+
+    Raises:
+        RunError: more than 2³¹ pairs of splats and tiles.
+    """
+    parameters, camera, _ = _problem(given | {"exterior": []})
+    size, means = (given["width"], given["height"]), parameters["means"]
+    screen = means.new_zeros(len(means), 2)
+    angles = half_pixels(*size, means.device) if given["exact"] else None
+    projected = project(launch, parameters, screen, camera, given["sh_degree"], angles)
+    pairs = list_pairs(launch, projected, *size)
+    found = surroundings(launch, projected, pairs, *size, given["own"], given["slack"], given["faint"])
+    rays = screen.new_empty(0) if projected.rays is None else projected.rays.rays
+    return *found, projected.splats, rays
 
 
 def photometric(launch: Launch, **given: Any) -> tuple[Tensor, Tensor, Tensor]:

@@ -120,3 +120,11 @@ def decided(gaussians: Gaussians, at: Camera, near: float) -> Tensor:
     close = ((alpha - floor).abs() < floor * 1e-3).any(0)
     left = torch.cumprod(1 - torch.where(alpha >= floor, alpha, 0), 0)
     return ~(close | ((left - limit).abs() < limit * 1e-3).any(0))
+
+
+def wall(at: Camera, distance: float, size: float, opacity: float) -> Gaussians:
+    """72 in a circle around the camera."""
+    made = placed(
+        72, directions(torch.linspace(-3.1, 3.1, 24).repeat(3), torch.zeros(72), distance), at, size
+    )
+    return made.with_tensors(made.tensors() | {"opacities": torch.full((72,), opacity)})

@@ -11,8 +11,9 @@ from panolog.renderer.baked import SLACK, Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians, concatenate
-from tests.renderer.agreement import IMAGES, NEAR, random_weights
-from tests.renderer.hard_scenes import as_leaves, camera, cloud, directions, hard_scenes, placed
+from tests.on_device import needs_a_card
+from tests.renderer.agreement import IMAGES, NEAR, certain, random_weights
+from tests.renderer.hard_scenes import as_leaves, camera, cloud, directions, hard_scenes, placed, wall
 from tests.renderer.reference import rows_of
 
 HALF = 1e-3  # rounding of a layer to float16, of values up to 1
@@ -24,14 +25,6 @@ def baked(scene: Gaussians, own: int, at: Camera) -> Baked:
 
 def first(scene: Gaussians, own: int) -> Gaussians:
     return rows_of(scene, torch.arange(own))
-
-
-def wall(at: Camera, distance: float, size: float, opacity: float) -> Gaussians:
-    """72 in a circle around the camera."""
-    made = placed(
-        72, directions(torch.linspace(-3.1, 3.1, 24).repeat(3), torch.zeros(72), distance), at, size
-    )
-    return made.with_tensors(made.tensors() | {"opacities": torch.full((72,), opacity)})
 
 
 def active(found: Baked, at: Camera) -> Tensor:
@@ -170,3 +163,18 @@ def test_an_exterior_of_another_size_is_refused() -> None:
         render(first(scene, 10), camera(128), near=NEAR, exterior=exterior)
     with pytest.raises(ValueError, match="exterior"):
         render(replace(first(scene, 10), exact=True), camera(64), near=NEAR, exterior=exterior)
+
+
+@needs_a_card
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_card_bakes_what_the_cpu_does(exact: bool) -> None:
+    """Nothing of it is on the host."""
+    scene, at, own = replace(cloud(500), exact=exact), camera(202), 150
+    expected, found = baked(scene, own, at), baked(scene.to("cuda"), own, at)
+    assert {tensor.device.type for tensor in found.tensors().values()} == {"cuda"}
+    here = found.to("cpu")
+    assert torch.equal(here.places, expected.places)
+    assert torch.allclose(here.spans, expected.spans, rtol=1e-5)
+    assert len(here.splats) == len(expected.splats) > 0
+    theirs, ours = (render(first(scene, own), at, near=NEAR, exterior=it).color for it in (expected, here))
+    assert float((ours - theirs)[certain(scene, at)].abs().max()) < HALF

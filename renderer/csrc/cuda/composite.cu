@@ -9,6 +9,8 @@
 namespace panolog {
 namespace {
 
+constexpr float kWeightUnits = 1 << 22;  // in a weight of 1: 256 of them, those of a tile, are within 32 bits
+
 template <class Local>
 struct Batch {
   Local splats[kTilePixels];
@@ -21,9 +23,10 @@ __device__ __forceinline__ Tile tile_of_block(const int32_t* entries, const int3
           int(width), int(height)};
 }
 
-// Calls visit(splat, pair) for the splats of a batch that may reach the warp's patch. kWrap: some have two images.
+// Calls visit(splat, pair, entry) for the splats of a batch that may reach the warp's patch. kWrap: some have two
+// images.
 template <bool kWrap, class View, class Local, class Visit>
-__device__ __forceinline__ void each_of_batch(const View& view, const Batch<Local>& batch, int count,
+__device__ __forceinline__ void each_of_batch(const View& view, const Batch<Local>& batch, int begin, int count,
                                               const float& transmittance, Visit visit) {
   const int lane = int(threadIdx.x % kWarp);
   for (int first = 0; first < count; first += kWarp) {
@@ -31,14 +34,16 @@ __device__ __forceinline__ void each_of_batch(const View& view, const Batch<Loca
     const Local& own = batch.splats[first + lane];
     const bool mine = first + lane < count && ((kWrap && own.row < 0) || view.meets(own));
     for (uint32_t met = __ballot_sync(kAllLanes, mine); met; met &= met - 1) {
-      Local s = batch.splats[first + __ffs(int(met)) - 1];
+      const int place = first + __ffs(int(met)) - 1;
+      Local s = batch.splats[place];
       if (kWrap) s.row = max(s.row, ~s.row);
-      visit(s, view.template evaluate<kWrap>(s, transmittance));
+      visit(s, view.template evaluate<kWrap>(s, transmittance), begin + place);
     }
   }
 }
 
-// Calls visit(splat, pair) nearest first, a whole warp at a time, until the pixels that `visit` darkens are opaque.
+// Calls visit(splat, pair, entry) nearest first, a whole warp at a time, until the pixels that `visit` darkens are
+// opaque. entry: the place of the splat in the tile's list.
 template <class View, class Local, class Visit>
 __device__ __forceinline__ void each_splat(const View& view, Batch<Local>& batch, const float& transmittance,
                                            Visit visit) {
@@ -46,17 +51,17 @@ __device__ __forceinline__ void each_splat(const View& view, Batch<Local>& batch
   const int thread = int(threadIdx.x);
   for (int left = tile.end - tile.first; left > 0; left -= kTilePixels) {
     if (!__syncthreads_or(transmittance >= kTransmittanceMin)) return;
-    const int count = min(left, kTilePixels);
-    const bool wrapping = thread < count && view.localise(tile.entries[tile.end - left + thread], batch.splats[thread]);
+    const int count = min(left, kTilePixels), begin = tile.end - left;
+    const bool wrapping = thread < count && view.localise(tile.entries[begin + thread], batch.splats[thread]);
     if constexpr (!View::kWraps) {
       __syncthreads();
-      each_of_batch<false>(view, batch, count, transmittance, visit);
+      each_of_batch<false>(view, batch, begin, count, transmittance, visit);
     }
     // the vote is for the compiler: it takes no barrier's result for the same in all lanes
     else if (__any_sync(kAllLanes, __syncthreads_or(wrapping)))
-      each_of_batch<true>(view, batch, count, transmittance, visit);
+      each_of_batch<true>(view, batch, begin, count, transmittance, visit);
     else
-      each_of_batch<false>(view, batch, count, transmittance, visit);
+      each_of_batch<false>(view, batch, begin, count, transmittance, visit);
   }
 }
 
@@ -124,7 +129,7 @@ __device__ __forceinline__ void forward(const View& view, Batch<Local>& batch, c
   const Light front = light_of(layers.front, layers.places, pixel);
   float t = pixel.at >= 0 ? front.transmittance : 0.0f, r = front.r, g = front.g, b = front.b;
   float depth = front.inverse_depth;
-  each_splat(view, batch, t, [&](const Local& s, const typename View::Pair& pair) {
+  each_splat(view, batch, t, [&](const Local& s, const typename View::Pair& pair, int) {
     const float weight = pair.alpha * t;
     r += weight * s.color[0], g += weight * s.color[1], b += weight * s.color[2];
     depth += weight * s.inverse_depth;
@@ -153,7 +158,7 @@ __device__ __forceinline__ void backward(const View& view, Batch<Local>& batch, 
              gb * (in.color[3 * at + 2] - front.b) + ga * (in.alpha[at] - (1 - t)) +
              gd * (in.inverse_depth[at] - front.inverse_depth);
   }
-  each_splat(view, batch, t, [&](const Local& s, const typename View::Pair& pair) {
+  each_splat(view, batch, t, [&](const Local& s, const typename View::Pair& pair, int) {
     if (!__any_sync(kAllLanes, pair.alpha > 0)) return;
     const float value = gr * s.color[0] + gg * s.color[1] + gb * s.color[2] + gd * s.inverse_depth + ga;
     const float weight = pair.alpha * t;
@@ -168,6 +173,23 @@ __device__ __forceinline__ void backward(const View& view, Batch<Local>& batch, 
     values[kLight] = weight * gr, values[kLight + 1] = weight * gg, values[kLight + 2] = weight * gb;
     values[kLight + 3] = weight * gd;
     add_sums<kSums>(values, sums + int64_t(kSums) * s.row);
+  });
+}
+
+// Adds up the weights of each entry of the tile's list in its pixels: as integers, whose sum has the same bits in any
+// order. Nothing where the span of own splats is empty.
+template <class View, class Local>
+__device__ __forceinline__ void weigh(const View& view, Batch<Local>& batch, const float* spans, uint32_t* weights) {
+  const float* const span = spans + 2 * int64_t(blockIdx.y * gridDim.x + blockIdx.x);
+  if (span[0] > span[1]) return;
+  float t = view.pixel.at >= 0 ? 1.0f : 0.0f;
+  each_splat(view, batch, t, [&](const Local&, const typename View::Pair& pair, int entry) {
+    if (!__any_sync(kAllLanes, pair.alpha > 0)) return;
+    float weight = pair.alpha * t;
+    t = fmaf(-pair.alpha, t, t);
+    for (int step = kWarp / 2; step; step /= 2) weight += __shfl_down_sync(kAllLanes, weight, step);
+    const uint32_t units = uint32_t(weight * kWeightUnits + 0.5f);
+    if (threadIdx.x % kWarp == 0) atomicAdd(weights + entry, units);
   });
 }
 
@@ -239,4 +261,25 @@ extern "C" __global__ void __launch_bounds__(256)
   const RayView view = ray_view(rays, azimuths, elevations, tile_of_block(entries, starts, width, height));
   backward(view, batch, {places, front, nullptr},
            {color, alpha, inverse_depth, grad_color, grad_alpha, grad_inverse_depth}, own, sums);
+}
+
+// The weights by which bake.h decides what is composited among own splats. weights (E): zeros, to which those of each
+// entry are added. spans (T × 2): of own splats.
+extern "C" __global__ void __launch_bounds__(256)
+    composite_weights(const panolog::Splat* splats, const int32_t* entries, const int32_t* starts, int64_t width,
+                      int64_t height, const float* spans, uint32_t* weights) {
+  using namespace panolog;
+  __shared__ Batch<AffineView::Local> batch;
+  weigh(affine_view(splats, tile_of_block(entries, starts, width, height)), batch, spans, weights);
+}
+
+// The same with exact projection.
+extern "C" __global__ void __launch_bounds__(256)
+    composite_ray_weights(const panolog::RaySplat* rays, const panolog::Angle* azimuths,
+                          const panolog::Angle* elevations, const int32_t* entries, const int32_t* starts,
+                          int64_t width, int64_t height, const float* spans, uint32_t* weights) {
+  using namespace panolog;
+  __shared__ Batch<RayView::Local> batch;
+  const RayView view = ray_view(rays, azimuths, elevations, tile_of_block(entries, starts, width, height));
+  weigh(view, batch, spans, weights);
 }

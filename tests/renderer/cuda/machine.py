@@ -1,5 +1,6 @@
 """Where kernels run, and what their results must be: those of the CPU."""
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -11,14 +12,15 @@ from torch import Tensor
 
 from panolog.renderer import ops
 from panolog.renderer.adam import BETAS, Moving
-from panolog.renderer.baked import Baked, bake
+from panolog.renderer.baked import FAINT, SLACK, Baked, bake
 from panolog.renderer.camera import Camera
-from panolog.renderer.cuda import launches
+from panolog.renderer.cuda import launches, parts
+from panolog.renderer.cuda.baking import WEIGHT_UNITS, weights_of
 from panolog.renderer.cuda.iteration import REPORT, Problem, Status, take
 from panolog.renderer.cuda.motion import motion_sums
 from panolog.renderer.cuda.parts import Launch
 from panolog.renderer.motion import MOTION, MOTION_SUMS, Motion
-from panolog.scene.gaussians import PARAMETERS, Gaussians
+from panolog.scene.gaussians import PARAMETERS, SH_C0, Gaussians
 from tests.renderer.agreement import IMAGES, NEAR, certain, check_gradients, check_images, random_weights
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.test_adam import by_autograd, clones, defined, grads, moving_of, problem_of
@@ -69,13 +71,56 @@ def results(forward: Sequence[Tensor], weights: list[Tensor]) -> dict[str, Any]:
 
 def surrounded(scene: Gaussians, at: Camera, own: Tensor) -> tuple[Gaussians, Baked]:
     """Some rows of a scene, and what a camera sees of the others."""
-    rows = torch.arange(len(scene))
-    ordered = torch.cat([own, rows[~torch.isin(rows, own)]])
-    block, whole = (
-        scene.with_tensors({name: tensor[chosen] for name, tensor in scene.tensors().items()})
-        for chosen in (own, ordered)
-    )
+    whole = own_first(scene, own)
+    block = whole.with_tensors({name: tensor[: len(own)] for name, tensor in whole.tensors().items()})
     return block, bake(whole, len(own), at, near=NEAR, unit=1.0)
+
+
+def own_first(scene: Gaussians, own: Tensor) -> Gaussians:
+    """Those rows of a scene, and then the others."""
+    rows = torch.arange(len(scene))
+    order = torch.cat([own, rows[~torch.isin(rows, own)]])
+    return scene.with_tensors({name: tensor[order] for name, tensor in scene.tensors().items()})
+
+
+def check_baked(machine: Machine, scene: Gaussians, at: Camera, own: Tensor) -> None:
+    """What is before, among and behind some rows of a scene."""
+    whole = own_first(scene, own)
+    given = {**whole.tensors(), **vars(at), "own": len(own), "sh_degree": 3, "near": NEAR}
+    given |= {"exact": scene.exact, "slack": SLACK, "faint": FAINT}
+    *truth, spans, among, splats, rays = ops.bake(**given)
+    *ours, our_spans, our_among, our_splats, our_rays = machine.run(launches.bake, **given)
+    assert torch.allclose(our_spans, spans, rtol=1e-5, atol=0)
+    assert torch.equal(our_among, among)
+    assert (our_splats.shape, our_rays.shape) == (splats.shape, rays.shape)
+    active = bake(whole, len(own), at, near=NEAR, unit=1.0).active(at.width, at.height)
+    for first in (0, 3) if active.any() else ():
+        check_images(ours[first : first + 3], truth[first : first + 3], certain(whole, at) & active)
+
+
+def check_weights(machine: Machine, scene: Gaussians, at: Camera) -> None:
+    """Those of each splat in all tiles: the gradient of the sum of an image's red by the red of the splat."""
+    tensors, size = scene.tensors() | {"sh0": torch.ones_like(scene.sh0)}, (at.width, at.height)
+    given = arguments(scene.with_tensors(tensors), at, 0)
+    truth = ops.rasterize(**given)
+    red = [torch.zeros_like(image) for image in truth[:3]]
+    red[0][..., 0] = 1
+    expected = (
+        ops.rasterize_backward(**given, **results(truth, red))[PARAMETERS.index("sh0")][:, 0, 0] / SH_C0
+    )
+    camera = parts.camera_struct(at.rotation, at.translation, *size, NEAR, scene.exact)
+    there = {name: machine.moved(tensor) for name, tensor in tensors.items()}
+    angles = parts.half_pixels(*size, there["means"].device) if scene.exact else None
+    spans = machine.moved(torch.tensor([0.0, 1.0]).repeat(math.prod(parts.tiles_of(*size)), 1))
+    with machine.watching():
+        screen = there["means"].new_zeros(len(scene), 2)
+        projected = parts.project(machine.launch, there, screen, camera, 0, angles)
+        pairs = parts.list_pairs(machine.launch, projected, *size)
+        weights = weights_of(machine.launch, projected, pairs, *size, spans).double() / WEIGHT_UNITS
+        found = weights.new_zeros(len(scene)).index_add(0, pairs.entries, weights)
+        spans[:, 1] = -1
+        assert not weights_of(machine.launch, projected, pairs, *size, spans).any()
+    assert expected.any() and torch.allclose(found.cpu().float(), expected, rtol=1e-3, atol=1e-2)
 
 
 def check_against_cpu(

@@ -126,6 +126,10 @@ PATTERNS = (
     Pattern("no back", r"t \* back\.\w+", "t"),
     Pattern("another layer", r"int64_t\(place\) \*", "int64_t(0) *"),
     Pattern("another plane", r"at\[4 \* kTilePixels\]", "at[3 * kTilePixels]"),
+    # weights
+    Pattern("an entry of the first batch", r"begin \+ place\)", "place)"),
+    Pattern("weights where no span is", r"if \(span\[0\] > span\[1\]\) return;", ""),
+    Pattern("weights outside of the image", r"view\.pixel\.at >= 0 \? 1\.0f : 0\.0f", "1.0f"),
     # losses
     Pattern("a halo too narrow", r"(?<=kSide = kTile \+ 2 \* kRadius)", " - 1", VALUES),
     Pattern("one past a loop", r"i < (kHalo|kLine)\b", r"i <= \1", "out of bounds"),

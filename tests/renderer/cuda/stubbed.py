@@ -14,7 +14,7 @@ from panolog.renderer.cuda import launches
 from panolog.renderer.cuda.parts import Argument, Launch
 
 _ZEROS = ("tile_counts", "report", "gradient", "partials")
-OPS = ("rasterize", "rasterize_backward", "photometric", "absolute_difference")
+OPS = ("rasterize", "rasterize_backward", "bake", "photometric", "absolute_difference")
 
 
 def no_launch(kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:

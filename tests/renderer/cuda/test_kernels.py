@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from panolog.renderer import ops
+from panolog.renderer.baked import bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
 from panolog.renderer.motion import MOTION_SUMS
@@ -22,16 +23,19 @@ from tests.renderer.cuda.machine import (
     arguments,
     check_absolute_difference,
     check_against_cpu,
+    check_baked,
     check_motion_sums,
     check_photometric,
     check_step,
     check_tiles,
+    check_weights,
     emulated,
     results,
     surrounded,
 )
 from tests.renderer.cuda.ptx import PROGRAMS, emulated_ptx
-from tests.renderer.hard_scenes import camera, cloud, directions, placed, scenes
+from tests.renderer.cuda.waits import counted
+from tests.renderer.hard_scenes import camera, cloud, directions, placed, scenes, wall
 
 pytestmark = pytest.mark.system
 
@@ -106,6 +110,56 @@ def test_an_exterior(name: str, exact: bool, width: int, own: str, machine: Mach
     scene = scenes(at, exact)[name]
     block, exterior = surrounded(scene, at, OWN[own](by_distance(scene, at)))
     check_against_cpu(machine, block, at, 3, certain(scene, at), exterior)
+
+
+@pytest.mark.parametrize(
+    ("width", "own"),
+    [
+        (18, "any"),
+        (64, "in the cell"),
+        (202, "in front of the cell"),
+        pytest.param(202, "any", marks=NIGHTLY),
+    ],
+)
+@pytest.mark.parametrize(("name", "exact"), SCENES, ids=NAMES)
+def test_what_is_baked(name: str, exact: bool, width: int, own: str, machine: Machine) -> None:
+    """At 18 pixels the second of two tiles across has two columns, and both are neighbours on both sides."""
+    at = camera(width)
+    scene = scenes(at, exact)[name]
+    check_baked(machine, scene, at, OWN[own](by_distance(scene, at)))
+
+
+@both
+def test_what_is_baked_where_walls_hide_own_gaussians(exact: bool, machine: Machine) -> None:
+    """In many tiles nothing behind the walls can be seen; and without own Gaussians nothing is active."""
+    at = Camera(torch.eye(3), torch.zeros(3), 130, 70)
+    walls = wall(at, 2.0, 0.5, 12.0)
+    behind = placed(90, directions(torch.linspace(-3, 3, 90), torch.linspace(-1.3, 1.3, 90), 8.0), at, 0.5)
+    scene = replace(concatenate(walls, behind), exact=exact)
+    own = torch.arange(len(walls), len(scene), 2)
+    around = surrounded(scene, at, own)[1]
+    active = around.places >= 0
+    assert active.any() and (~active & (around.spans[:, 1] > 0)).any()
+    check_baked(machine, scene, at, own)
+    check_baked(machine, scene, at, own[:0])
+    check_baked(machine, scene, at, torch.arange(len(scene)))
+
+
+@both
+def test_a_view_is_baked_with_four_waits(exact: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the docstring of `bake` has them."""
+    scene, at, launch = replace(cloud(100), exact=exact), camera(), EmulatedLaunch()
+    monkeypatch.setattr(ops, "bake", functools.partial(launches.bake, launch))
+    with counted((at.rotation, at.translation)) as found:
+        baked = bake(scene, 30, at, near=NEAR, unit=1.0)
+    assert found == {"aten::_local_scalar_dense": 1, "aten::nonzero": 3}
+    assert len(baked.back) and len(baked.splats)
+
+
+@both
+def test_weights(exact: bool, machine: Machine) -> None:
+    """Of several batches in some tiles."""
+    check_weights(machine, replace(cloud(1500), exact=exact), camera(52))
 
 
 @both
@@ -183,6 +237,7 @@ def test_int16_counts_the_tiles_of_4096_by_2048_pixels(
 @both
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_gaussians(count: int, exact: bool, machine: Machine) -> None:
+    check_baked(machine, replace(cloud(count), exact=exact), camera(), torch.arange(count))
     given = arguments(replace(cloud(count), exact=exact), camera())
     ours = machine.run(launches.rasterize, **given)
     check_images(ours, ops.rasterize(**given), torch.ones(32, 64, dtype=torch.bool))

@@ -24,11 +24,12 @@ from tests.renderer.cuda.machine import (
     check_photometric,
     check_step,
     check_tiles,
+    check_weights,
     emulated,
     surrounded,
 )
 from tests.renderer.cuda.mutants import PATTERNS, mutants
-from tests.renderer.hard_scenes import camera, directions, placed, scenes
+from tests.renderer.hard_scenes import camera, cloud, directions, placed, scenes
 from tests.renderer.test_adam import moving_of
 
 pytestmark = pytest.mark.system
@@ -80,6 +81,8 @@ def one_projection(launch: EmulatedLaunch, exact: bool) -> None:
     check_against_cpu(emulated(launch), gaussians, at, 0, keep)
     own, exterior, here, sure = block(exact)
     check_against_cpu(emulated(launch), own, here, 3, sure, exterior)
+    check_weights(emulated(launch), gaussians, at)
+    check_weights(emulated(launch), replace(cloud(60), exact=exact), at)  # up to the rims of the image
     with launch.watching():
         parameters = {name: it.clone() for name, it in gaussians.tensors().items()}  # kernels may move them
         pose = parts.camera_struct(at.rotation, at.translation, at.width, at.height, NEAR, exact)

@@ -16,9 +16,9 @@ pytest.importorskip("cuda.core", reason="CUDA: no cuda-core")
 LIMITS = {
     32: "loss_absolute iteration_statistics",
     40: "project_exterior iteration_guard iteration_end",
-    48: "composite_forward composite_backward composite_absolute_backward",
+    48: "composite_forward composite_backward composite_absolute_backward composite_weights",
     64: "project_ray_exterior project_motion bin_narrow bin_wide bin_ray_narrow bin_ray_wide"
-    " composite_ray_forward composite_ray_backward loss_similarity loss_gradient",
+    " composite_ray_forward composite_ray_backward composite_ray_weights loss_similarity loss_gradient",
     96: "project_forward project_ray_forward",
     120: "project_backward project_absolute_backward project_ray_backward"
     " project_step project_absolute_step project_ray_step",

@@ -18,6 +18,7 @@ WAITS: dict[str, Callable[[torch.Tensor], object]] = {
     "to the CPU": lambda tensor: tensor.cpu(),
     "rows by mask": lambda tensor: tensor[tensor > 1],
     "nonzero": lambda tensor: tensor.nonzero(),
+    "repeated": lambda tensor: torch.repeat_interleave(tensor.long()),
     "comparison": lambda tensor: torch.equal(tensor, tensor),
     "blocking copy": lambda tensor: torch.empty(3).copy_(tensor),
     "to a device": lambda tensor: tensor.to("cpu"),
@@ -40,6 +41,7 @@ def test_waits_are_counted(name: str) -> None:
         into[torch.tensor([0, 1])].double().sort()
         into.to(torch.float64).to("cpu", non_blocking=True)
         torch.zeros(3, device="cpu")
+        torch.repeat_interleave(torch.tensor([2, 1]), output_size=3)
         with ThreadPoolExecutor(1) as other:
             other.submit(into.to, "cpu").result()
         assert not found
