@@ -1,9 +1,11 @@
 """What surrounds a block: its cameras see it, but the block does not keep it (eq. 12)."""
 
+import logging
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -14,7 +16,7 @@ from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.process import release_memory
 from panolog.renderer.render import render
-from panolog.scene.errors import RunError
+from panolog.scene.errors import RunError, out_of_memory
 from panolog.scene.files import read_at, write_all
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import view_bytes
@@ -22,6 +24,9 @@ from panolog.scene.model import Panorama
 from panolog.scene.tensors.transfer import Mover, Moving, pack, packed_bytes
 from panolog.workers.training.pipeline import AHEAD
 from panolog.workers.training.task_config import CacheConfig
+
+T = TypeVar("T")
+_LOG = logging.getLogger(__name__)
 
 _RELEASE = 8  # views: what baking one leaves free is not what the next one needs
 CHECKED = 4  # views, at most, on which what is baked is compared with the full render
@@ -153,13 +158,16 @@ class BakedViews:
 
 
 class Exterior:
-    """A block's frozen exterior, baked for each of its cameras when it is first needed."""
+    """A block's frozen exterior, baked for each of its cameras when it is first needed.
+
+    That is on the device of the block, or on the CPU from when a GPU has no room for the whole model.
+    """
 
     def __init__(self, model: Gaussians, near: float, unit: float, room: int, device: torch.device) -> None:
-        """Args: model of `exterior_last`, on the CPU; near in world units; unit of `bake`; room as above."""
+        """Args: model of `exterior_last`; near in world units; unit of `bake`; room and device as above."""
         self.model: Gaussians | None = model  # None once all cameras are baked
         self.views = BakedViews(room, device)
-        self._near, self._unit = near, unit
+        self._near, self._unit, self._device = near, unit, device
 
     @staticmethod
     def own(model: Gaussians) -> Gaussians:
@@ -175,18 +183,17 @@ class Exterior:
         if row not in self.views:
             if self.model is None:
                 raise KeyError(row)
-            own = self.model.scene.stop
-            self.views.add(row, bake(self.model, own, camera, near=self._near, unit=self._unit))
+            self.views.add(row, self._where_there_is_room(lambda model: self._bake(model, camera)))
             if len(self.views) % _RELEASE == 0:
                 release_memory()
         return self.views.get(row)
 
     def finish(self, cameras: Mapping[int, Camera]) -> str:
         """Drops the model: all of these cameras, by row, are baked. Returns what that took, for the log."""
-        model = self.model
-        assert model is not None, "a second time"
+        differences = self._where_there_is_room(
+            lambda model: self.differences(self.own(model), model, cameras)
+        )
         self.model = None
-        differences = self.differences(self.own(model), model, cameras)
         release_memory()
         mebibytes = self.views.nbytes / 2**20
         what = f"what surrounds the block for {len(cameras)} panoramas, {mebibytes:.0f} MiB"
@@ -195,14 +202,32 @@ class Exterior:
     def differences(self, own: Gaussians, whole: Gaussians, cameras: Mapping[int, Camera]) -> str:
         """How far what is baked is from the full render on some of the cameras, for the log.
 
-        Args: own, what the block trains, as it is by now; whole, the same with all that was baked.
+        Args: own, what the block trains, as it is by now; whole, the same with all that was baked, on the
+        same device, which renders.
         """
-        rows, found = list(cameras), [torch.zeros(1)]
+        device = whole.means.device
+        rows, found = list(cameras), [torch.zeros(1, device=device)]
         for row in rows[:: -(-len(rows) // CHECKED)]:
-            camera, baked = cameras[row], self.views.get(row).to("cpu")
+            camera, baked = cameras[row], self.views.get(row).to(device)
             full = render(whole, camera, near=self._near).color
             parts = render(own, camera, near=self._near, exterior=baked).color
             found.append((full - parts).abs().amax(2)[baked.active(camera.width, camera.height)])
         all_of = torch.cat(found)
         most, mean = float(all_of.max()), float(all_of.mean())
         return f"differ from the full render by at most {most:.4f}, {mean:.5f} on average"
+
+    def _bake(self, model: Gaussians, camera: Camera) -> Baked:
+        return bake(model, model.scene.stop, camera, near=self._near, unit=self._unit)
+
+    def _where_there_is_room(self, compute: Callable[[Gaussians], T]) -> T:
+        """What is computed of the model: on a GPU, unless that runs out of memory, now or before."""
+        assert self.model is not None, "it is dropped"
+        try:
+            self.model = self.model.to(self._device)
+            return compute(self.model)
+        except (RuntimeError, RunError) as error:
+            if self._device.type == "cpu" or not out_of_memory(error):
+                raise
+        self._device = torch.device("cpu")  # not in the clause above: its error holds what has been computed
+        _LOG.info("the GPU has no room to bake what surrounds the block: the CPU bakes it")
+        return self._where_there_is_room(compute)

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from panolog.renderer.baked import Baked
+from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.iteration import loss_of
@@ -28,7 +28,7 @@ from panolog.workers.events import Checkpoint, Preview
 from panolog.workers.specs import Value
 from panolog.workers.training import pipeline
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.exterior import BAKED, Exterior, Rooms, exterior_last, inside
+from panolog.workers.training.exterior import BAKED, BakedViews, Exterior, Rooms, exterior_last, inside
 from panolog.workers.training.loss import Loss
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.task_config import CacheConfig
@@ -173,22 +173,57 @@ def test_on_a_gpu_the_thread_that_reads_begins_the_copy_and_only_the_device_wait
     model, rows = exterior_last(initial, block(scene, initial).cell), (0, 1, 2)
     whole, fake = around_of(model), Torch()
     monkeypatch.setattr(transfer, "torch", fake)
-    exterior = Exterior(model, 0.01, 1.0, 0, torch.device("cuda"))
+    views = BakedViews(0, torch.device("cuda"))
     for row in rows:
-        exterior.of(row, camera(scene, row))
+        views.add(row, whole.of(row, camera(scene, row)))
     fake.log.clear()
     for row in rows:
-        exterior.views.prefetch(rows[row:])
-        assert exterior.views.get(row) is exterior.views.get(row)
+        views.prefetch(rows[row:])
+        assert views.get(row) is views.get(row)
         for name, tensor in whole.of(row, camera(scene, row)).tensors().items():
-            assert torch.equal(exterior.views.get(row).tensors()[name], tensor), name
-    exterior.views.close()
+            assert torch.equal(views.get(row).tensors()[name], tensor), name
+    views.close()
     log = [entry.split("(")[0] for entry in fake.log]
     taken = ["training waits", "memory used by namespace"]
     assert [entry for entry in log if entry in taken] == taken * len(rows)
     one = ["stream uploads", "copy", "event on uploads", "baked_0 waits"]  # before it fills its buffer again
-    assert [entry for entry in log if entry not in taken] == ["baked_0 waits", *one * len(rows)][:-1]
+    assert [entry for entry in log if entry not in taken] == (one * len(rows))[:-1]
     assert len(fake.pinned) <= len(rows)  # one buffer of one thread, which grows
+
+
+def test_a_gpu_without_room_for_the_whole_model_leaves_it_to_the_cpu(
+    scene: Scene, initial: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has room for one view. Any other error of it is one of the task."""
+    where: list[str] = []
+    message = "CUDA driver error: out of memory"
+
+    def to(model: Gaussians, device: torch.device) -> Gaussians:
+        where.append(device.type)
+        return model
+
+    def on_device(*arguments: Any, **named: Any) -> Baked:
+        if where[1:] and where[-1] == "cuda":
+            raise RuntimeError(message)
+        return bake(*arguments, **named)
+
+    model = exterior_last(initial, block(scene, initial).cell)
+    expected = around_of(model)
+    views = {row: expected.of(row, camera(scene, row)) for row in (0, 1, 2)}
+    monkeypatch.setattr(transfer, "torch", Torch())
+    monkeypatch.setattr(Gaussians, "to", to)
+    monkeypatch.setattr("panolog.workers.training.exterior.bake", on_device)
+    exterior = Exterior(model, 0.01, 1.0, 0, torch.device("cuda"))
+    for row, view in views.items():
+        found = exterior.of(row, camera(scene, row)).tensors()
+        assert all(torch.equal(found[name], tensor) for name, tensor in view.tensors().items())
+    assert where == ["cuda", "cuda", "cpu", "cpu"]
+    exterior.views.close()
+    message, where[:] = "the launch failed", ["cuda"]
+    exterior = Exterior(model, 0.01, 1.0, 0, torch.device("cuda"))
+    with pytest.raises(RuntimeError, match="the launch failed"):
+        exterior.of(0, camera(scene, 0))
+    exterior.views.close()
 
 
 def test_a_full_disk_says_what_to_do(
