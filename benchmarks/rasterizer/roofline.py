@@ -25,6 +25,7 @@ from benchmarks import report
 from benchmarks.rasterizer.cases import Case, CaseSpec
 from benchmarks.rasterizer.iteration import TrainingStep, stages
 from panolog.renderer import ops
+from panolog.renderer.baked import bake
 from panolog.renderer.cuda.parts import Argument, Launch
 from panolog.renderer.iteration import forward
 from tests.renderer.cuda.ptx import ptx_of
@@ -247,6 +248,16 @@ def measured(case: Case, repeats: int) -> dict[str, float]:
         for _ in range(repeats):
             step.iteration()
     return {name: median(took) * 1e3 for name, took in timed.seconds.items()}
+
+
+def baking(case: Case, repeats: int) -> float:
+    """Milliseconds of baking a view around an eighth of the Gaussians: the median after a warm-up."""
+    step, took = TrainingStep(case, case.views[0]), list[float]()
+    for _ in range(1 + repeats):
+        start = step.now()
+        bake(case.gaussians, len(case.gaussians) // 8, step.view.camera, near=case.near, unit=1.0)
+        took.append(step.now() - start)
+    return median(took[1:]) * 1e3
 
 
 def comparison(took: Mapping[str, float], expected: Mapping[str, float]) -> str:

@@ -110,6 +110,7 @@ def test_kernels_are_timed_one_by_one_and_compared() -> None:
     case = CaseSpec(32, 60).make()
     with stubbed(EmulatedLaunch()):
         took = roofline.measured(case, 2)
+        assert roofline.baking(case, 2) > 0
     work = Work(60, 512, 2, 70, 2.0, 16.0, 99.0)
     assert set(launched(work)) - set(took) == {
         "iteration_statistics"
