@@ -130,7 +130,7 @@ def launched(work: Work) -> dict[str, Launched]:
         "bin_narrow": Launched("bin", n / 4, (2, 0, 1), n * 84 + 6 * work.pairs),
         "composite_forward": Launched("composite", warps, tested, lists + 20 * px),
         "loss_similarity": Launched("loss", warps, (*[0.0] * 5, 3, *halo, *[0.0] * 4, 6), 51 * px),
-        "loss_gradient": Launched("loss", warps, (3, *(*halo, 6.0) * 3), 63 * px),
+        "loss_gradient": Launched("loss", warps, (*[0.0] * 9, 3, 6, 6, 6), 63 * px),
         "composite_backward": Launched("composite", warps, tested, lists + 40 * px + 80 * n),
         "project_step": Launched(
             "project", each, (*copy, 3, 3, 11, 1, 0, 0, *copy), n * (116 + 59 * 24 + 180)

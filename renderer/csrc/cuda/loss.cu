@@ -13,6 +13,7 @@ constexpr int kRadius = 5;  // of the SSIM window, as on the CPU
 constexpr int kTaps = 2 * kRadius + 1;
 constexpr int kSide = kTile + 2 * kRadius;
 constexpr int kHalo = kSide * kSide, kLine = kSide * kTile;
+constexpr int kTurns = (kHalo + kTilePixels - 1) / kTilePixels;  // of a block's threads through a halo
 constexpr int kWarps = kTilePixels / kWarp;
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
 constexpr int kNormal = 5;                                 // ExposureSums in kernels.h
@@ -211,13 +212,18 @@ extern "C" __global__ void __launch_bounds__(256)
   const Images in = {color, target, mask, exposure, int(width), int(height)};
   const int64_t pixel = own_pixel(in.width, in.height), samples = 3 * width * height;
   const float weight = (1 - lambda_ssim) / float(*count) * row_weight(rows, pixel, in.width);
+  int64_t brought[kTurns];  // the pixels of the halo that this thread brings, in all nine windows
+#pragma unroll
+  for (int turn = 0; turn < kTurns; ++turn)
+    brought[turn] = halo_pixel(int(threadIdx.x) + turn * kTilePixels, in.width, in.height);
   for (int channel = 0; channel < 3; ++channel) {
     float spread[3];
     for (int m = 0; m < 3; ++m) {
-      for (int i = int(threadIdx.x); i < kHalo; i += kTilePixels) {
-        const int64_t at = halo_pixel(i, in.width, in.height);
-        halo[i] = at < 0 ? 0.0f : by[m * samples + 3 * at + channel];
-      }
+      const float* const plane = by + m * samples + channel;
+#pragma unroll
+      for (int turn = 0; turn < kTurns; ++turn)
+        if (const int i = int(threadIdx.x) + turn * kTilePixels; i < kHalo)
+          halo[i] = brought[turn] < 0 ? 0.0f : plane[3 * brought[turn]];
       __syncthreads();
       row_means(halo, lines);
       __syncthreads();

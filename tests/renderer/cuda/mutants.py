@@ -134,6 +134,7 @@ PATTERNS = (
     Pattern("a halo too narrow", r"(?<=kSide = kTile \+ 2 \* kRadius)", " - 1", VALUES),
     Pattern("one past a loop", r"i < (kHalo|kLine)\b", r"i <= \1", "out of bounds"),
     Pattern("one less in a loop", r"i < (kHalo|kLine)\b", r"i < \1 - 1", UNSET),
+    Pattern("a turn too few", r"turn < kTurns", "turn < kTurns - 1", VALUES),
     Pattern("one less in shared memory", r"\[(kHalo|kLine)\]", r"[\1 - 1]", "out of bounds"),
     Pattern("one warp too many", r"warp < kWarps", "warp <= kWarps", "out of bounds"),
     Pattern("beyond the lower pole", r"row >= height \?", "row > height ?", LOST),
