@@ -21,7 +21,7 @@ from panolog.renderer.cuda import iteration, launches, nvrtc, parts
 from panolog.renderer.cuda.card import Kernels
 from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.cuda.parts import Argument
-from tests.renderer.cuda.machine import arguments, results, surrounded
+from tests.renderer.cuda.machine import arguments, results, surrounded, to_bake
 from tests.renderer.hard_scenes import camera, cloud
 
 STREAM = 0x5EED
@@ -85,7 +85,7 @@ def expected(argument: Argument) -> bytes:
 
 
 def every_kernel(launch: Checked) -> None:
-    """Iterations of both projections, with and without mask, depth and exterior, tiles as int16 and int32."""
+    """Both projections: with and without mask, depth and exterior, tiles as int16 and int32; baking."""
     at, scene = camera(), cloud(40)
     image = torch.zeros(at.height, at.width, 3, dtype=torch.uint8)
     mask, depth = torch.ones(at.height, at.width, dtype=torch.bool), torch.zeros(at.height, at.width)
@@ -123,6 +123,8 @@ def every_kernel(launch: Checked) -> None:
         into, more = [torch.zeros(30), torch.zeros(30)], torch.zeros(30) if absolute else None
         iteration.add_statistics(launch, found, status, problem, *into, absolute=more, angle=full)
     launches.absolute_difference(launch, depth, depth, mask)
+    for exact in (False, True):
+        launches.bake(launch, **to_bake(replace(scene, exact=exact), at, 20))
     for columns in (2, 4):  # without and with absolute gradients
         for exact in (False, True)[: 4 // columns]:
             given = arguments(replace(scene, exact=exact), at) | {"screen": torch.zeros(40, columns)}

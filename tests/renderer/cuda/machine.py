@@ -83,11 +83,16 @@ def own_first(scene: Gaussians, own: Tensor) -> Gaussians:
     return scene.with_tensors({name: tensor[order] for name, tensor in scene.tensors().items()})
 
 
+def to_bake(scene: Gaussians, at: Camera, own: int) -> dict[str, Any]:
+    """What `ops.bake` takes."""
+    settings = {"own": own, "sh_degree": 3, "near": NEAR, "exact": scene.exact}
+    return {**scene.tensors(), **vars(at), **settings, "slack": SLACK, "faint": FAINT}
+
+
 def check_baked(machine: Machine, scene: Gaussians, at: Camera, own: Tensor) -> None:
     """What is before, among and behind some rows of a scene."""
     whole = own_first(scene, own)
-    given = {**whole.tensors(), **vars(at), "own": len(own), "sh_degree": 3, "near": NEAR}
-    given |= {"exact": scene.exact, "slack": SLACK, "faint": FAINT}
+    given = to_bake(whole, at, len(own))
     *truth, spans, among, splats, rays = ops.bake(**given)
     *ours, our_spans, our_among, our_splats, our_rays = machine.run(launches.bake, **given)
     assert torch.allclose(our_spans, spans, rtol=1e-5, atol=0)
