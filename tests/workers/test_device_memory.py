@@ -17,6 +17,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from panolog.renderer import ops
+from panolog.renderer.baked import bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches
 from panolog.renderer.losses import photometric_loss
@@ -205,6 +206,18 @@ def test_a_panorama_that_is_only_rendered_or_scored(
             render_panorama(gaussians, panorama.rotation, panorama.translation, width, 0.1)
     need = (device_memory.scoring if scored else device_memory.rendering)(count, pixels)
     assert need == pytest.approx(memory.peak, rel=0.1)
+
+
+@pytest.mark.parametrize(("count", "width"), SIZES)
+def test_baking_takes_less_than_training_the_whole_model(count: int, width: int) -> None:
+    """Half of the tiles are active, and have something in front; half of the Gaussians are among own ones."""
+    pixels, camera = width * width // 2, Camera(torch.eye(3), torch.zeros(3), width, width // 2)
+    with CountedMemory(device_memory.pairs(count, pixels), 0.5) as memory:
+        whole = model(count)
+        memory.restart()
+        found = bake(whole, count // 8, camera, near=0.1, unit=1.0)
+    assert found.back.is_meta and len(found.splats) == 16 * (count // 2)
+    assert memory.peak < device_memory.training(count, pixels)
 
 
 def test_ten_million_gaussians_fit_a_gpu_of_24_gigabytes() -> None:
