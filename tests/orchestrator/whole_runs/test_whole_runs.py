@@ -1,39 +1,24 @@
 """Whole runs through Ray with killed workers, and without Ray undisturbed: the same bytes."""
 
 import json
-import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
-from contextlib import closing, nullcontext
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from subprocess import PIPE
 
 import psutil
 import pytest
 
-from panolog.orchestrator.cli.session import session
-from panolog.orchestrator.engine.cluster import connection
-from panolog.orchestrator.engine.driver.local_pool import LocalPool, local_pool
-from panolog.orchestrator.runs.config import load_config
-from panolog.orchestrator.runs.control import state_of
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.machines.nodes import Placement
-from panolog.orchestrator.runs.money.limits import Wanted
-from panolog.orchestrator.runs.money.prices import read_prices
-from panolog.orchestrator.runs.records import CheckpointSaved, RunBegan, Stored, TaskStarted
-from panolog.orchestrator.runs.state import RunState, ignore
-from panolog.orchestrator.runs.storage.layout import OBJECTS, current
-from panolog.orchestrator.runs.storage.lease import holder
+from panolog.orchestrator.runs.records import TaskStarted
 from panolog.orchestrator.runs.store import read_records
 from panolog.scene.ply import ply_header
-from panolog.scene.stores.store import open_store
 from panolog.synthetic.make import make_town
-from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
+from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.examples.test_examples import example
-from tests.orchestrator.cli.program import call, shown
-from tests.orchestrator.watch.views.pages.snapshots import snapshot_of
+from tests.orchestrator.cli.program import shown
 
 pytestmark = pytest.mark.system
 
@@ -103,17 +88,18 @@ def wait_for_workers(root: Path) -> None:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
-    """An undisturbed run without Ray, and one through Ray whose workers were killed, with what that said."""
+    """The example without Ray, and a run through Ray whose workers were killed, with what that said."""
     folder = tmp_path_factory.mktemp("recovery")
     scene = make_town(folder / "town", panoramas=9, width=64, points=300)
     calm, killed = folder / "calm", folder / "killed"
     command = [sys.executable, "-c", SCRIPT, json.dumps(ACCIDENTS), "run", str(scene), "-o", str(killed)]
     command += SETTINGS
     with subprocess.Popen(command, stdout=PIPE, stderr=PIPE, text=True, start_new_session=True) as process:
-        with local_pool() as pool:
-            session.start(scene, calm, load_config(sets=SETS), None, ignore, pool)
+        with redirect_stdout(StringIO()) as said:
+            example("run_without_ray")([str(scene), str(calm), *SETTINGS])
         stdout, stderr = process.communicate(timeout=300)
     assert (process.returncode, stdout) == (0, ""), stderr
+    assert "eval: EvaluationSaved" in said.getvalue()
     return calm, killed, stderr
 
 
@@ -141,89 +127,9 @@ def test_a_run_whose_workers_are_killed_in_each_stage_ends_with_the_same_bytes(
     starts = [record for record in records if isinstance(record, TaskStarted)]
     for task, iterations in ((COARSE, [0, 20]), (TaskId.block(0), [0, 20]), (EVAL, [0, 0])):
         assert [start.iteration for start in starts if start.task == task] == iterations
-    same_bytes(killed, calm)
-
-
-def same_bytes(ours: Path, theirs: Path) -> None:
     names = ("coarse/model.ply", "blocks/000/model.ply", "blocks/001/model.ply", "point_cloud.ply")
     for name in (*names, "partition/plan.json", "eval/seams.json", "eval/seams/000-001/merged.jpg"):
-        assert (ours / name).read_bytes() == (theirs / name).read_bytes(), name
-
-
-def test_a_limit_delivers_what_there_is_and_without_it_the_bytes_are_the_same(
-    runs: tuple[Path, Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calm, _, _ = runs
-    root, prices = tmp_path / "run", tmp_path / "prices.toml"
-    prices.write_text('currency = "EUR"\n[[machine]]\nname = "any"\nprice = 3600\nhost = "*"\n')
-
-    def interrupt(_: RunState, news: Sequence[Stored]) -> None:
-        for stored in news:
-            if isinstance(stored.record, CheckpointSaved) and stored.record.task == TaskId.block(1):
-                raise KeyboardInterrupt
-
-    with local_pool() as pool, pytest.raises(KeyboardInterrupt):
-        wanted = Wanted(prices=read_prices(prices))
-        town, config = calm.parent / "town", load_config(sets=SETS)
-        session.start(town, root, config, None, interrupt, pool, wanted=wanted)
-    cost = state_of(root).money.used.cost
-    assert cost > 0
-    with local_pool() as pool:
-        monkeypatch.setattr(connection, "connect", lambda *_: nullcontext(pool))
-        said = resumed(root, cost * 1.001)  # which is used up by what follows
-        assert "ended early: the limit of" in said
-        limited = state_of(root)
-        assert (limited.outcome, limited.status(TaskId.block(1))) == ("limited", "waiting")
-        assert limited.merged is not None
-        assert (limited.metrics or {})["psnr"] is not None
-        reported = snapshot_of(RunFolder(root).report.read_text())["stream"]["run"]["summary"]
-        assert reported["money"]["used"]["cost"] == limited.money.used.cost
-        resumed(root)
-        assert state_of(root) == limited
-        resumed(root, "none")
-    assert state_of(root).outcome == "done"
-    same_bytes(root, calm)
-
-
-def resumed(root: Path, *limit: object) -> str:
-    """What a driver says until its end. Args: limit, of cost, unless it stays as it is."""
-    words = [str(word) for it in limit for word in ("--max-cost", it)]
-    result = call("resume", root, *words)
-    assert result.exit_code == 0, result.output
-    return result.stderr
-
-
-class Interrupted(LocalPool):
-    def start(self, placement: Placement, spec: TaskSpec) -> None:
-        if spec.task.stage == Stage.BLOCK:
-            raise KeyboardInterrupt
-        super().start(placement, spec)
-
-
-def test_a_run_in_a_store_continues_in_an_empty_folder(
-    runs: tuple[Path, Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PANOLOG_STORE_CACHE", str(tmp_path / "cache"))
-    calm, run = runs[0], f"file://{tmp_path}/store"
-    first, second = tmp_path / "first", tmp_path / "second"
-    begin = ["run", (calm.parent / "town").as_uri(), "-o", run, "--local", first, *SETTINGS]
-    resume = ["resume", run, "--local", second]
-    for words, pool, code in ((begin, Interrupted(), 130), (resume, LocalPool(), 0)):
-        with closing(pool):
-            monkeypatch.setattr(connection, "connect", lambda *_, pool=pool: nullcontext(pool))
-            ended = call(*words)
-        assert ended.exit_code == code, ended.output
-        shutil.rmtree(first, ignore_errors=True)
-    records = [stored.record for stored in read_records(RunFolder(second).database)]
-    assert [record.resumed for record in records if isinstance(record, RunBegan)] == [False, True]
-    same_bytes(second, calm)
-    store = open_store(run)
-    assert store.read("point_cloud.ply") == (calm / "point_cloud.ply").read_bytes()
-    assert holder(store) == ""
-    manifest = current(store)
-    assert manifest is not None
-    assert not any(name.endswith("checkpoint.safetensors") for name in manifest.files)
-    assert set(store.list(f"{OBJECTS}/coarse/model.ply")) == {manifest.files["coarse/model.ply"].key}
+        assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
 
 
 def test_eval_reads_what_is_known_and_measures_what_is_not(runs: tuple[Path, Path, str]) -> None:
@@ -263,14 +169,3 @@ def test_a_plan_can_be_tried_without_training(runs: tuple[Path, Path, str], tmp_
     again = shown("partition", root, "--blocks", "2x1x1", "--rho", "5", "--tau", str(plan["tau_grad"]))
     assert again == plan
     assert RunFolder(root).plan.read_bytes() == before
-
-
-def test_the_example_without_ray_ends_with_the_same_bytes(
-    runs: tuple[Path, Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    calm, _, _ = runs
-    root = tmp_path / "run"
-    example("run_without_ray")([str(calm.parent / "town"), str(root), *SETTINGS])
-    assert "eval: EvaluationSaved" in capsys.readouterr().out
-    assert state_of(root).outcome == "done"
-    same_bytes(root, calm)
