@@ -1,4 +1,4 @@
-"""Runs that a command continues, with a higher limit or from a store: the same bytes. Workers are scripted."""
+"""Runs that a command continues, with a higher limit or from a store: the same bytes. Workers are fakes."""
 
 import shutil
 from collections.abc import Callable, Iterator, Sequence

@@ -9,10 +9,8 @@ import pytest
 from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.runs.config import load_config
 from panolog.orchestrator.runs.state import ignore
-from panolog.workers.calibration import CalibrateSpec
-from tests.orchestrator.calibrated import says
 from tests.orchestrator.cli.program import call, one_line
-from tests.orchestrator.fakes import MACHINE, FakePool, well
+from tests.orchestrator.cli.session.test_session import calibrating
 
 pytestmark = pytest.mark.system
 
@@ -22,8 +20,7 @@ def calm(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run."""
     root = tmp_path_factory.mktemp("runs") / "calm"
     config = load_config(flags={"width": 64, "iterations": 2, "blocks": "2x1x1", "sky.count": 2})
-    pool = FakePool(lambda spec: says(spec) if isinstance(spec, CalibrateSpec) else well(spec), [MACHINE])
-    session.start(scene, root, config, None, ignore, pool)
+    session.start(scene, root, config, None, ignore, calibrating())
     return root
 
 
@@ -35,16 +32,21 @@ def damage(database: Path, how: str) -> None:
         database.write_bytes(database.read_bytes()[:size] if how != "other" else b"no database" * 1000)
 
 
-@pytest.mark.parametrize("how", ["missing", "empty", "truncated", "other"])
-@pytest.mark.parametrize("words", [["resume"], ["status"], ["report"], ["clean"]], ids=" ".join)
+@pytest.mark.parametrize(
+    ("how", "command"),
+    [
+        *[(how, "resume") for how in ("missing", "empty", "truncated", "other")],
+        *[("missing", command) for command in ("status", "report", "clean")],
+    ],
+)
 def test_a_run_without_its_database_is_left_as_it_is(
-    how: str, words: list[str], calm: Path, tmp_path: Path
+    how: str, command: str, calm: Path, tmp_path: Path
 ) -> None:
     """A finished run was trained again, over its files."""
     root = copytree(calm, tmp_path / "run")
     damage(root / "run.db", how)
     before = {path: path.stat().st_mtime_ns for path in root.rglob("*.*") if path.name != "run.db"}
-    done = call(*words, root)
+    done = call(command, root)
     line = " ".join((done.stdout + done.stderr).split())
     assert done.exit_code == 2
     assert f"{root / 'run.db'}: " in line

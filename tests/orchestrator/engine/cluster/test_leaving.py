@@ -112,9 +112,19 @@ def test_a_provider_takes_a_node_away(spot: Spot) -> None:
     assert spot.kind() == Leaving.PREEMPTION  # known as long as the node is there
 
 
-def test_a_node_drains_while_its_task_saves_and_then_ends(spot: Spot) -> None:
+def test_an_agent_ends_where_nothing_runs_and_a_node_drains_while_its_task_saves_and_then_ends(
+    spot: Spot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(ClusterError, match=r"nodes of Ray: .*choose one with --node"):
         leave(1)
+    spot.begin()
+    spot.end()
+    with monkeypatch.context() as patch:
+        patch.setattr(agents, "_UNUSED_S", 0.0)
+        agent = agent_of_the_node()
+        spot.kind()
+        assert psutil.wait_procs([agent], timeout=300)[0]  # Ray does not start it again
+        assert spot.kind() is None
     spot.begin()
     with ThreadPoolExecutor(1) as threads:
         left = threads.submit(leave, 600, spot.node[:12])
@@ -124,16 +134,6 @@ def test_a_node_drains_while_its_task_saves_and_then_ends(spot: Spot) -> None:
         wait_until(lambda: spot.kind() is None, "its end")  # its agent has ended too, so the node has
         assert left.result(300)
     assert spot.node not in {raylet.node for raylet in raylets()}
-
-
-def test_an_agent_ends_where_nothing_runs_so_that_the_node_is_idle(
-    spot: Spot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(agents, "_UNUSED_S", 0.0)
-    spot.begin()
-    spot.end()
-    spot.kind()
-    assert leave(600, spot.node)  # nothing holds it
 
 
 def test_where_ray_does_not_run_there_is_no_node(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -91,9 +91,8 @@ def noticed(run: Harness, task: TaskId = COARSE) -> Script:
     return script
 
 
-@pytest.mark.parametrize("task", [COARSE, TaskId.block(1)], ids=str)
-def test_tasks_save_and_move_at_once(tmp_path: Path, task: TaskId) -> None:
-    run = Harness(tmp_path, (A, B), retries=0)
+def test_tasks_save_and_move_at_once(tmp_path: Path) -> None:
+    run, task = Harness(tmp_path, (A, B), retries=0), TaskId.block(1)
     assert run.drive(noticed(run, task)).outcome == Outcome.DONE
     (leaves,) = run.records(NodeLeaving)
     assert (leaves.kind, leaves.seconds) == (Leaving.PREEMPTION, 120.0)

@@ -160,7 +160,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     assert not root.exists()
 
 
-def test_options_survive_the_way_through_a_command_line(
+def test_sources_and_options_survive_the_way_through_a_command_line(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     given = Options(
@@ -173,15 +173,15 @@ def test_options_survive_the_way_through_a_command_line(
         mask_model="people.onnx",
         depth_model="m.onnx",
     )
-    seen = list[Options]()
+    seen = list[Any]()
 
     def start_nothing(*arguments: Any) -> None:
-        seen.extend(it for it in arguments if isinstance(it, Options))
+        seen.extend([arguments[0], *(it for it in arguments if isinstance(it, Options))])
         raise InputError("seen")
 
     monkeypatch.setattr(session, "start", start_nothing)
-    call("run", tmp_path, "-o", tmp_path / "run", *as_arguments(given))
-    assert seen == [given]
+    call("run", tmp_path / "a.mp4", "b", "-o", tmp_path / "run", tmp_path / "c.mp4", *as_arguments(given))
+    assert seen == [[f"{tmp_path}/a.mp4", "b", f"{tmp_path}/c.mp4"], given]
     assert not Options().given
     assert list(as_arguments(Options())) == []
 

@@ -2,14 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from onnx import helper
 
-from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.cli.session.preparing import settings_of
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.preparation import notes
@@ -204,17 +202,3 @@ def test_a_scene_and_a_url_are_run_by_themselves(tmp_path: Path) -> None:
     line = one_line(call("run", photographs, tmp_path / "none.mp4", "-o", tmp_path / "run"))
     assert "none.mp4: there is no such file or folder" in line
     assert not (tmp_path / "run").exists()
-
-
-def test_sources_survive_the_way_through_a_command_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    seen = list[Any]()
-
-    def start_nothing(*arguments: Any) -> None:
-        seen.append(arguments[0])
-        raise InputError("seen")
-
-    monkeypatch.setattr(session, "start", start_nothing)
-    call("run", tmp_path / "a.mp4", tmp_path / "b", "-o", tmp_path / "run", tmp_path / "c.mp4")
-    assert seen == [[str(tmp_path / name) for name in ("a.mp4", "b", "c.mp4")]]

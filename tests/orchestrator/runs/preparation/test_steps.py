@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from panolog.orchestrator.cli.session import making, session
-from panolog.orchestrator.cli.session.preparing import settings_of
 from panolog.orchestrator.engine.driver import purse
 from panolog.orchestrator.runs import control
 from panolog.orchestrator.runs.folder import RunFolder
@@ -202,16 +201,6 @@ def with_masks(town: Path, source: Path, count: int) -> Path:
     for image in sorted((source / "images").iterdir())[:count]:
         cv2.imwrite(str(source / "masks" / f"{image.stem}.png"), mask)
     return source
-
-
-@pytest.mark.parametrize(("count", "first"), [(1, Step.MASKS), (8, Step.MASKS), (9, Step.SFM)])
-def test_only_masks_for_all_panoramas_of_the_source_are_kept_as_they_are(
-    town: Path, tmp_path: Path, count: int, first: Step
-) -> None:
-    """The operator was trained in all panoramas that had none, as soon as one had a mask."""
-    settings = settings_of(with_masks(town, tmp_path, count), Options())
-    assert settings is not None and settings.steps()[0] == first
-    assert first == Step.SFM or (settings.nadir, settings.static) == (10, True)
 
 
 def test_masks_of_the_source_are_joined_with_what_is_wanted(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:

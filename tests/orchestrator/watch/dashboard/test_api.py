@@ -33,7 +33,6 @@ from tests.orchestrator.watch.dashboard.served import (
     plan,
     progressed,
     serving,
-    started,
     write_run,
     write_whole_run,
 )
@@ -170,16 +169,6 @@ def test_curves_are_thinned(served: Served) -> None:
     thin = served.get(f"/api/runs/{id}/series", task="block/000", points=4)
     assert thin["rate/means"]["iteration"] == [10, 20, 30, 40]
     assert served.get(f"/api/runs/{id}/series", task="block/001") == {}
-
-
-def test_a_curve_forgets_what_was_done_again(tmp_path: Path) -> None:
-    first = [progressed(COARSE, iteration, gaussians=1) for iteration in range(1, 31)]
-    again = [progressed(COARSE, iteration, gaussians=2) for iteration in range(21, 26)]
-    write_run(tmp_path / "run", [started(COARSE), *first, started(COARSE, 20), *again])
-    with serving(tmp_path) as served:
-        curve = served.get(f"/api/runs/{served.id('run')}/series", task="coarse")["gaussians"]
-    assert curve["iteration"] == list(range(1, 26))
-    assert curve["value"] == [1.0] * 20 + [2.0] * 5
 
 
 def pages(served: Served, path: str, **wanted: object) -> Iterator[dict[str, Any]]:

@@ -111,6 +111,7 @@ def test_all_is_there_without_network(browser: Browser, report: Path) -> None:
         expect(page.locator("#quality")).not_to_contain_text("LPIPS needs")  # it is of no use to a reader
         _unfold(page)
         expect(page.locator("#map-plot")).to_be_visible()
+        expect(page.locator(".chart").first.locator(".scatterlayer .trace")).to_have_count(2)
         expect(page.locator("#actions button, #selected button, #cost:visible")).to_have_count(0)
         page.wait_for_function("[...document.images].every((image) => image.naturalWidth)")
         page.locator(".face .mark").check()
@@ -151,13 +152,6 @@ def test_the_map_is_that_of_the_dashboard(unfolded: Page) -> None:
     expect(unfolded.locator("#selected")).to_contain_text("trains it: it is in this block")
     unfolded.locator("#block-table tr[data-block='0'] button").click()
     expect(unfolded.locator("#selected")).to_contain_text("cameras: ")
-
-
-def test_curves_are_chosen(unfolded: Page) -> None:
-    lines = unfolded.locator(".chart").first.locator(".scatterlayer .trace")
-    expect(lines).to_have_count(2)
-    unfolded.locator("#shown").get_by_role("button", name="Stage I").click()
-    expect(lines).to_have_count(1)
 
 
 def test_pictures_are_shown_flat_and_around(unfolded: Page) -> None:
