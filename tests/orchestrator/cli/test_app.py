@@ -43,12 +43,9 @@ def calibrated(monkeypatch: pytest.MonkeyPatch, memory: int) -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("--blocks", "0x1x1"), 'setting blocks = "0x1x1"'),
         (("--set", "sky.cuont=3"), "did you mean sky.count?"),
         (("--config", "/nowhere.yaml"), "/nowhere.yaml: cannot be read"),
         (("--width", "4096"), "the panoramas have 64 pixels"),
-        (("--device", "tpu"), 'setting device = "tpu"'),
-        (("--iterations", "0"), "setting iterations = 0"),
         (("--address", "127.0.0.1:1"), "no Ray cluster answers there"),
         (("--address", "nowhere"), "write auto or HOST:PORT"),
     ],

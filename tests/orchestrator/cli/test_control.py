@@ -53,7 +53,7 @@ def test_status_says_why_a_run_waits_where_its_database_takes_nothing(driven: Ru
 
 
 def test_what_makes_no_sense_is_one_line(driven: RunFolder) -> None:
-    """All reasons are in tests/orchestrator/runs/test_control.py."""
+    """All reasons are in tests/orchestrator/runs/test_control.py, also those without a driver."""
     line = f"panolog: {driven.root}: pause block 1: it is failed"
     assert one_line(call("pause", driven.root, 1)) == line
     assert control.take(driven) == []
@@ -72,12 +72,6 @@ def test_a_machine_in_quarantine_is_shown_and_released(driven: RunFolder) -> Non
     assert control.take(driven) == [ControlRequest(Action.RELEASE, node="gpu-07")]
     why = "release gpu-7: no such machine is in quarantine; those are gpu-07"
     assert one_line(call("release", driven.root, "gpu-7")) == f"panolog: {driven.root}: {why}"
-
-
-def test_without_a_driver_there_is_nothing_to_send_a_request_to(folder: RunFolder) -> None:
-    for action, *block in (("stop",), ("pause", 0), ("unpause", 0), ("retry", 1)):
-        assert "no driver is at work" in one_line(call(action, folder.root, *block))
-        assert call(action, folder.root.parent, *block).exit_code == 2
 
 
 def test_stop_waits_until_the_driver_has_gone(folder: RunFolder) -> None:

@@ -131,13 +131,8 @@ def test_only_the_last_progress_of_each_task_matters(
     assert replay(reduced) == replay(stored)
 
 
-def test_summary_names_stage_status_and_time_left() -> None:
-    expected = PreflightSaved("preflight.json", {"coarse": 30.0})
-    state = after(BEGAN, expected, started(COARSE), Progressed(COARSE, 25, 100, 5.0, loss=0.1))
-    shown, killed = (summarize(state, running=running, now=11.0) for running in (True, False))
-    assert (shown.label, shown.stage, shown.eta, shown.seconds) == ("running", "coarse", 24.0, 10.0)
-    assert (killed.label, killed.stage, killed.eta, killed.seconds) == ("driver lost", "coarse", None, 3)
-    assert [it.tasks[0].status for it in (shown, killed)] == [Status.RUNNING, Status.WAITING]
+def test_summary_names_stage_and_end() -> None:
+    """Times and what is killed: tests/orchestrator/watch/views/test_timing.py."""
     assert stage_of(after(model(COARSE), started(TaskId.shard(0)))) == "score"
     assert stage_of(after(model(COARSE), RunEnded(Outcome.DONE))) == "done"
     ends = [summarize(after(BEGAN, RunEnded(end)), running=False).label for end in Outcome]

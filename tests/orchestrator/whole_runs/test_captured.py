@@ -1,4 +1,4 @@
-"""A run that learns exposures, poses and movers, interrupted in both stages and in the evaluation."""
+"""A run that learns exposures, poses and movers, interrupted in both stages."""
 
 import json
 from collections.abc import Sequence
@@ -15,12 +15,12 @@ from panolog.orchestrator.runs import control
 from panolog.orchestrator.runs.config import load_config
 from panolog.orchestrator.runs.control import Action
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.records import CheckpointSaved, Stored, TaskStarted, TaskYielded, ViewEvaluated
+from panolog.orchestrator.runs.records import CheckpointSaved, Stored, TaskStarted, TaskYielded
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore
 from panolog.orchestrator.runs.store import read_records
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
-from panolog.workers.tasks import COARSE, EVAL, TaskId
+from panolog.workers.tasks import COARSE, TaskId
 from tests.scenes import copy_scene
 
 pytestmark = pytest.mark.system
@@ -34,7 +34,7 @@ CONFIG = load_config(
         *("movers.weigh=true", "movers.factor=1.2"),
     )
 )
-INTERRUPTED = [(CheckpointSaved, COARSE), (CheckpointSaved, BLOCK), (ViewEvaluated, EVAL)]
+INTERRUPTED = (COARSE, BLOCK)
 
 
 def write_walk(folder: Path) -> Path:
@@ -52,15 +52,15 @@ def write_walk(folder: Path) -> Path:
     return folder / "walk"
 
 
-def interrupt(folder: RunFolder, kind: type, task: TaskId) -> OnChange:
-    """Ends a driver at the first record of a kind.
+def interrupt(folder: RunFolder, task: TaskId) -> OnChange:
+    """Ends a driver at the first checkpoint of a task.
 
     In Stage I by a request to stop, so that its worker saves a last checkpoint wherever it is; then by force.
     """
     begun = list[TaskId]()
 
     def show(_: RunState, news: Sequence[Stored]) -> None:
-        if begun or not any(isinstance(it.record, kind) and it.record.task == task for it in news):
+        if begun or not any(isinstance(it.record, CheckpointSaved) and it.record.task == task for it in news):
             return
         begun.append(task)
         if task != COARSE:
@@ -77,8 +77,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, RunFolder
     scene, calm, disturbed = write_walk(folder), RunFolder(folder / "calm"), RunFolder(folder / "disturbed")
     with local_pool() as pool:
         session.start(scene, calm.root, CONFIG, None, ignore, pool)
-    for number, (kind, task) in enumerate(INTERRUPTED):
-        show = interrupt(disturbed, kind, task)
+    for number, task in enumerate(INTERRUPTED):
+        show = interrupt(disturbed, task)
         with local_pool() as pool, pytest.raises(KeyboardInterrupt):
             if number:
                 session.resume(disturbed.root, None, show, pool)
@@ -102,7 +102,7 @@ def test_what_was_interrupted_everywhere_ends_with_the_same_bytes(runs: tuple[Ru
     calm, disturbed = runs
     records = [stored.record for stored in read_records(disturbed.database)]
     attempts = [record.task for record in records if isinstance(record, TaskStarted)]
-    assert all(attempts.count(task) == 2 for task in (COARSE, BLOCK, EVAL))
+    assert all(attempts.count(task) == 2 for task in INTERRUPTED)
     assert TaskYielded(COARSE) in records
     ours, theirs = files_of(disturbed), files_of(calm)
     assert [name for name in theirs if ours[name] != theirs[name]] == []

@@ -1,7 +1,5 @@
-"""Whole runs under a supervisor, whose drivers are killed, lose Ray itself, or are stopped."""
+"""A whole run under a supervisor, whose drivers are killed or lose Ray itself."""
 
-import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,7 +13,7 @@ from panolog.orchestrator.engine.driver.local_pool import local_pool
 from panolog.orchestrator.runs.config import load_config
 from panolog.orchestrator.runs.control import state_of
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.records import Noticed, Outcome, RunBegan, RunEnded, TaskYielded
+from panolog.orchestrator.runs.records import Noticed, RunBegan, RunEnded
 from panolog.orchestrator.runs.state import RunState, ignore
 from panolog.orchestrator.runs.store import read_records
 from panolog.synthetic.make import make_town
@@ -27,38 +25,6 @@ pytestmark = pytest.mark.system
 
 SETTINGS = (*SETS, "iterations=120", "blocks=1x1x1", "width=64")
 OPTIONS = [word for setting in SETTINGS for word in ("--set", setting)]
-# PanoLOG whose supervisor starts drivers that have workers without Ray.
-WITHOUT_RAY = """
-import sys
-from panolog.orchestrator.cli import app
-from panolog.orchestrator.cli.session import supervise
-from panolog.orchestrator.engine.cluster import connection
-from panolog.orchestrator.engine.driver.local_pool import local_pool
-
-connection.connect = lambda *_: local_pool()
-supervise._PROGRAM = (sys.executable, __file__)
-if __name__ == "__main__":
-    app.main()
-"""
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_town(tmp_path_factory.mktemp("supervised") / "town", panoramas=9, width=64, points=300)
-
-
-def supervise(program: list[str], scene: Path, root: Path, *more: str) -> subprocess.Popen[str]:
-    command = [sys.executable, *program, "run", str(scene), "-o", str(root), *OPTIONS]
-    # A shell's background jobs ignore Ctrl-C; Ray gives a lost head a minute to come back.
-    return subprocess.Popen(
-        [*command, *more, "--supervise"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        env=environment() | {"RAY_gcs_rpc_server_reconnect_timeout_s": "2"},
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
-    )
 
 
 def driver_with(root: Path, holds: Callable[[RunState], object], but: list[int]) -> psutil.Process:
@@ -75,11 +41,20 @@ def driver_with(root: Path, holds: Callable[[RunState], object], but: list[int])
     return psutil.Process(driver.pid)
 
 
-def test_a_run_whose_driver_is_killed_and_loses_ray_ends_with_the_same_bytes(
-    scene: Path, tmp_path: Path
-) -> None:
+def test_a_run_whose_driver_is_killed_and_loses_ray_ends_with_the_same_bytes(tmp_path: Path) -> None:
     root, seen = tmp_path / "run", list[int]()
-    process = supervise(["-m", "panolog.orchestrator.cli"], scene, root)
+    scene = make_town(tmp_path / "town", panoramas=9, width=64, points=300)
+    words = ["run", str(scene), "-o", str(root), *OPTIONS, "--supervise"]
+    # Ray gives a lost head a minute to come back.
+    ours = environment() | {"RAY_gcs_rpc_server_reconnect_timeout_s": "2"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "panolog.orchestrator.cli", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=ours,
+    )
     driver_with(root, lambda state: state.task(COARSE).checkpoint, seen).kill()
     driver = driver_with(root, lambda state: "running" in {it.status for it in state.tasks.values()}, seen)
     (head,) = (child for child in driver.children(recursive=True) if child.name() == "gcs_server")
@@ -99,20 +74,3 @@ def test_a_run_whose_driver_is_killed_and_loses_ray_ends_with_the_same_bytes(
     with local_pool() as pool:
         session.start(scene, calm, load_config(sets=SETTINGS), None, ignore, pool)
     assert (root / "point_cloud.ply").read_bytes() == (calm / "point_cloud.ply").read_bytes()
-
-
-def test_ctrl_c_of_a_terminal_stops_supervisor_and_driver_after_a_fresh_checkpoint(
-    scene: Path, tmp_path: Path
-) -> None:
-    root, program = tmp_path / "run", tmp_path / "program.py"
-    program.write_text(WITHOUT_RAY)
-    process = supervise([str(program)], scene, root, "--iterations", "100000")
-    driver_with(root, lambda state: state.task(COARSE).checkpoint, [])
-    os.killpg(process.pid, signal.SIGINT)  # the driver gets it twice
-    _, stderr = process.communicate(timeout=480)
-    assert process.returncode == 130, stderr
-    assert "Traceback" not in stderr
-    records = [item.record for item in read_records(RunFolder(root).database)]
-    assert TaskYielded(COARSE) in records
-    assert records[-1] == RunEnded(Outcome.INTERRUPTED)
-    assert f"panolog: stopped; `panolog resume {root}` resumes the run" in stderr.splitlines()

@@ -1,6 +1,8 @@
-"""Runs that a command continues, with a higher limit or from a store: the same bytes. Workers are fakes."""
+"""Runs that are stopped by a limit, a signal or an empty folder, and continued. Workers are fakes."""
 
+import os
 import shutil
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -14,8 +16,15 @@ from panolog.orchestrator.runs.control import state_of
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.money.limits import Wanted
 from panolog.orchestrator.runs.money.prices import PriceList
-from panolog.orchestrator.runs.records import CheckpointSaved, RunBegan, Stored
-from panolog.orchestrator.runs.state import RunState
+from panolog.orchestrator.runs.records import (
+    CheckpointSaved,
+    Outcome,
+    RunBegan,
+    RunEnded,
+    Stored,
+    TaskYielded,
+)
+from panolog.orchestrator.runs.state import RunState, ignore
 from panolog.orchestrator.runs.storage.layout import OBJECTS, current
 from panolog.orchestrator.runs.storage.lease import holder
 from panolog.orchestrator.runs.store import read_records
@@ -23,7 +32,7 @@ from panolog.scene.stores.store import open_store
 from panolog.workers.calibration import CalibrateSpec
 from panolog.workers.events import Progress
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import Stage, TaskId
+from panolog.workers.tasks import COARSE, Stage, TaskId
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.calibrated import says
 from tests.orchestrator.cli.program import call
@@ -133,3 +142,26 @@ def test_a_run_in_a_store_continues_in_an_empty_folder(
     assert manifest is not None
     assert not any(name.endswith("checkpoint.safetensors") for name in manifest.files)
     assert set(store.list(f"{OBJECTS}/coarse/model.ply")) == {manifest.files["coarse/model.ply"].key}
+
+
+def test_ctrl_c_saves_what_is_trained(scene: Path, tmp_path: Path) -> None:
+    """A terminal sends it to the supervisor too, which passes it on: engine/driver/test_requests.py."""
+
+    class Signalled(Lasting):
+        def _work(self, spec: TaskSpec) -> Iterator[Any]:
+            if spec.task != COARSE:
+                yield from super()._work(spec)
+                return
+            os.kill(os.getpid(), signal.SIGINT)
+            while COARSE not in self.stopped:
+                yield Progress(COARSE, 1, 2, 3.0)
+            assert isinstance(spec, TrainSpec)
+            yield saved(spec, 1)
+
+    root = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        session.start(scene, root, CONFIG, None, ignore, Signalled())
+    records = [stored.record for stored in read_records(RunFolder(root).database)]
+    assert TaskYielded(COARSE) in records
+    assert records[-1] == RunEnded(Outcome.INTERRUPTED)
+    assert state_of(root).task(COARSE).checkpoint == 1

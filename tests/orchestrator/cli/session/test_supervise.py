@@ -121,10 +121,9 @@ def test_a_run_is_resumed_until_it_is_done(script: Script) -> None:
     assert script.said[0].endswith("(SIGKILL)); resume 1 of at most 3 without progress in 0 s")
 
 
-@pytest.mark.parametrize("code", [1, -9])
-def test_what_ends_a_driver_after_its_run_is_done_changes_nothing(script: Script, code: int) -> None:
+def test_what_ends_a_driver_after_its_run_is_done_changes_nothing(script: Script) -> None:
     """Ray ends a process, with exit code 1, whose cluster's head is gone when it leaves that."""
-    assert script.run(f"done {code}") == 0
+    assert script.run("done 1") == 0
     assert len(script.drivers) == 1
 
 
@@ -141,7 +140,7 @@ def test_limits_are_given_until_a_driver_has_recorded_them(script: Script) -> No
     assert third.startswith("resume") and "--max-cost" not in third
 
 
-@pytest.mark.parametrize("end", ["fails 1", "refused 2", "dies 130"])
+@pytest.mark.parametrize("end", ["fails 1", "refused 2"])
 def test_what_another_driver_cannot_help_ends(script: Script, end: str) -> None:
     assert script.run(end) == int(end.split()[1])
     assert (len(script.drivers), script.said) == (1, [])

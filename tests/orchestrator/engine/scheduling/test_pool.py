@@ -7,12 +7,12 @@ from unittest import mock
 import pytest
 import torch
 
-from panolog.orchestrator.engine.scheduling.pool import Failed, on_its_card
+from panolog.orchestrator.engine.scheduling.pool import Failed, guarded, on_its_card
 from panolog.orchestrator.runs.machines.nodes import Placement
 from panolog.orchestrator.runs.records import Failure
 from panolog.scene.errors import DeviceError, InputError, RunError
 from panolog.workers.device_memory import CONTEXT
-from tests.orchestrator.scripted import Short
+from tests.orchestrator.scripted import TASK, Fails, Short
 
 GIB = 2**30
 CUDNN = "cuDNN error: CUDNN_STATUS_"
@@ -54,12 +54,22 @@ def test_every_wording_of_a_shortage_of_memory_is_one(error: BaseException) -> N
         (torch.AcceleratorError("CUDA error: an illegal memory access was encountered"), Failure.ERROR),
         (RuntimeError("CUDA error: CUBLAS_STATUS_EXECUTION_FAILED"), Failure.ERROR),
         (RunError("loading adam failed on the GPU: CUDA_ERROR_INVALID_IMAGE"), Failure.ERROR),
+        (ValueError("no"), Failure.ERROR),
         (DeviceError("--device cuda: there is no GPU that torch can use"), Failure.INPUT),
         (InputError("out of memory.jpg: the image is truncated; copy it again"), Failure.INPUT),
     ],
 )
 def test_no_other_error_is(error: BaseException, kind: Failure) -> None:
-    assert Failed.of(error, "").kind == kind
+    failed = Failed.of(error, "its traceback")
+    expected = isinstance(error, InputError | RunError)
+    assert (failed.kind, failed.detail) == (kind, "" if expected else "its traceback")
+    assert failed.reason == (str(error) if expected else f"{type(error).__name__}: {error}")
+
+
+@pytest.mark.parametrize(("how", "raised"), [("wrong", InputError), ("read", RunError), ("device", RunError)])
+def test_what_may_be_otherwise_elsewhere_is_no_wrong_input(how: str, raised: type[Exception]) -> None:
+    with pytest.raises(raised):
+        list(guarded(TASK, Fails(how=how).run()))
 
 
 @dataclass

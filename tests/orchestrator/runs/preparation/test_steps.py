@@ -146,12 +146,18 @@ def test_a_limit_of_cost_counts_the_making_of_the_scene(
     assert shown("status", folder.root)["money"]["used"]["cost"] > made["money"]["used"]["cost"]
 
 
-def test_status_shows_how_far_the_preparation_is_and_no_other_process_joins(
+def test_status_and_map_show_how_far_the_preparation_is_and_no_other_process_joins(
     raw: Path, sfm: FakeSfm, tmp_path: Path
 ) -> None:
-    root, seen = tmp_path / "run", list[Any]()
+    """On the map GPS comes first, then the panoramas that have a pose, and at last those that train."""
+    maps, entry = list[dict[str, Any]](), RunEntry(tmp_path, "run")
+    root, folder, seen = tmp_path / "run", entry.folder, list[Any]()
 
     def look(at: str) -> None:
+        if at in ("features", "poses", "check"):
+            figure = json.loads(encoded_map(folder))
+            traces = {trace["name"]: trace for trace in figure["data"]}
+            maps.append(traces | {"names": figure["blocks"]["names"]})
         if at == "poses":
             seen.append((call("status", root).stdout, shown("status", root)))
             with pytest.raises(InputError, match="another driver is at work on it"):
@@ -160,7 +166,7 @@ def test_status_shows_how_far_the_preparation_is_and_no_other_process_joins(
                 resume(root)
 
     sfm.at = look
-    start(raw, root)
+    start(raw, root, action=lambda: look("check"))
     ((text, status),) = seen
     over = status["preparation"]["over"]
     assert text.startswith(f"preparing: poses 0 of 10 · {over:.0%}")
@@ -171,25 +177,10 @@ def test_status_shows_how_far_the_preparation_is_and_no_other_process_joins(
     assert (step["status"], step["what"], step["done"], step["total"]) == ("running", "poses", 0, 10)
     assert (masks["status"], check["status"]) == ("done", "waiting")
     assert call("pause", root, 0).exit_code == 2
-
-
-def test_the_map_grows_with_the_poses(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
-    """GPS comes first, then the panoramas that have a pose, and at last those that train."""
-    seen, entry = list[dict[str, Any]](), RunEntry(tmp_path, "run")
-
-    def look(at: str) -> None:
-        if at in ("features", "poses", "check"):
-            figure = json.loads(encoded_map(entry.folder))
-            seen.append(
-                {trace["name"]: trace for trace in figure["data"]} | {"names": figure["blocks"]["names"]}
-            )
-
-    sfm.at = look
-    start(raw, entry.folder.root, action=lambda: look("check"))
-    found = [(len(it["fixes"]["x"]), len(it["cameras"]["x"]), len(it["names"])) for it in seen]
+    found = [(len(it["fixes"]["x"]), len(it["cameras"]["x"]), len(it["names"])) for it in maps]
     assert found == [(9, 0, 0), (0, 5, 5), (0, 7, 7)]  # of nine panoramas two are held out
-    scene = read_scene(entry.folder.scene)
-    np.testing.assert_allclose(seen[2]["cameras"]["x"], scene.centers[list(scene.train), 0])
+    scene = read_scene(folder.scene)
+    np.testing.assert_allclose(maps[2]["cameras"]["x"], scene.centers[list(scene.train), 0])
 
 
 def with_masks(town: Path, source: Path, count: int) -> Path:

@@ -8,9 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder, model_of, removed_models
@@ -29,6 +27,7 @@ from panolog.orchestrator.runs.state import replay
 from panolog.orchestrator.runs.store import Database, read_milestones, read_records
 from panolog.scene.errors import RunFolderError
 from panolog.workers.tasks import COARSE, TaskId
+from tests.orchestrator.cli.program import call
 from tests.orchestrator.history import BEGAN, model, started
 
 BLOCKS = [TaskId.block(0), TaskId.block(1)]
@@ -77,7 +76,7 @@ def files(root: Path) -> dict[str, int]:
 
 
 def clean(*words: object) -> tuple[int, str, str]:
-    result = CliRunner().invoke(app.app, ["clean", *map(str, words)])
+    result = call("clean", *words)
     return result.exit_code, result.stdout, result.stderr.strip()
 
 

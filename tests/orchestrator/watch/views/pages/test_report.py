@@ -12,9 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from pydantic import BaseModel
-from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app
 from panolog.orchestrator.cli.session import session  # cli_results has commands to register
 from panolog.orchestrator.engine.driver.journal import Journal
 from panolog.orchestrator.engine.scheduling.pool import Failed
@@ -35,6 +33,7 @@ from panolog.orchestrator.watch.views.plan_page import BlockCameras, CameraView
 from panolog.scene.errors import InputError, RunError
 from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE
+from tests.orchestrator.cli.program import call
 from tests.orchestrator.fakes import Harness, fails
 from tests.orchestrator.history import BEGAN, append, begun
 from tests.orchestrator.watch.views.pages.snapshots import self_contained, snapshot_of
@@ -208,11 +207,11 @@ def test_the_driver_writes_the_report_and_one_that_cannot_be_written_is_a_notice
 
 
 def test_the_command_says_where_the_report_is(done: RunFolder, tmp_path: Path) -> None:
-    for options, path in (([], done.report), (["-o", str(tmp_path / "r.html")], tmp_path / "r.html")):
-        result = CliRunner().invoke(app.app, ["report", str(done.root), *options])
+    for options, path in (([], done.report), (["-o", tmp_path / "r.html"], tmp_path / "r.html")):
+        result = call("report", done.root, *options)
         assert (result.exit_code, result.stdout) == (0, f"{path}\n")
         assert path.is_file()
-    assert CliRunner().invoke(app.app, ["report", str(tmp_path)]).exit_code == 2
+    assert call("report", tmp_path).exit_code == 2
 
 
 def test_the_report_has_the_seams_and_pictures_of_the_worst(done: RunFolder) -> None:
