@@ -13,12 +13,24 @@ import pytest
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.preparation.notes import read_progress
 from panolog.scene.read import read_scene
-from tests.orchestrator.whole_runs.test_supervised import WITHOUT_RAY
 from tests.prepare.sources.street import Street, make_street
 from tests.ray_head import environment, wait_until
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
 
+# PanoLOG whose supervisor starts drivers that have workers without Ray.
+WITHOUT_RAY = """
+import sys
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.cli.session import supervise
+from panolog.orchestrator.engine.cluster import connection
+from panolog.orchestrator.engine.driver.local_pool import local_pool
+
+connection.connect = lambda *_: local_pool()
+supervise._PROGRAM = (sys.executable, __file__)
+if __name__ == "__main__":
+    app.main()
+"""
 OPTIONS = ("--width", "128", "--iterations", "20", "--device", "cpu", "--set", "sky.count=50")
 MOMENTS = ("frames", "masks", "features", "matches", "poses", "training")
 PATIENCE = 1800  # seconds
