@@ -62,7 +62,7 @@ def _for_viewers(model: ChosenModel) -> ModelSource:
 def _in_reach(model: ChosenModel, scene: ModelSource) -> ModelSource:
     """A scene without the few Gaussians that are farther than SPZ holds: some of a flight are at the horizon.
 
-    Of a scene that is larger than that it is all, which SPZ refuses.
+    A scene of which more is that far is returned whole, and SPZ refuses it.
     """
     middle, selection = Surroundings(scene.frame.origin[None], REACH / scene.scale), scene.selection
     near = replace(scene, selection=replace(selection, near=(*selection.near, middle)))
@@ -71,7 +71,7 @@ def _in_reach(model: ChosenModel, scene: ModelSource) -> ModelSource:
         return scene
     model.say(
         f"{left:,} of {scene.count:,} Gaussians are more than {REACH:.0f} units from the origin of exports, "
-        "which SPZ, glTF and 3D Tiles do not hold; left out"
+        "which SPZ, glTF and 3D Tiles do not hold: left out"
     )
     return near
 

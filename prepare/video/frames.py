@@ -28,9 +28,7 @@ from panolog.scene.write import Progress, no_progress
 PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
 _QUALITY = 95
 _DENSE = 0.5  # degrees of parallax between two frames of a large video that are looked at, at most
-_COARSE = (
-    1.5 * PARALLAX
-)  # degrees between two frames from which decoding can begin: then others are not needed
+_COARSE = 1.5 * PARALLAX  # degrees between frames from which decoding can begin, so that these suffice
 _WIDEST = 45.0  # degrees of parallax from which no features match
 
 

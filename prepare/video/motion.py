@@ -119,9 +119,10 @@ class MotionTracker:
             self._stray = None if self._stray is not None and self._measure(frame) else frame
 
     def add_near(self, number: int, time: float, grey: NDArray[np.uint8], farthest: float) -> bool:
-        """Adds a frame as `add`, some time after the last one, if it is sharp and as near as degrees say.
+        """Adds a frame as `add`, some time after the last one, if it is sharp and near enough.
 
-        Otherwise nothing is changed, and what lies between is needed.
+        Returns whether it was added: if not, the frames between are needed. Args: farthest, in degrees of
+        parallax.
         """
         if self._anchor is None and self._stray is not None:  # the first frame
             self._begin(self._stray)
