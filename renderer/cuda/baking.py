@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from panolog.renderer.cuda.parts import THREADS, TILE, Launch, Pairs, Projected, composite, tiles_of
+from panolog.renderer.cuda.parts import THREADS, TILE, Launch, Pairs, Projected, composite, of_tiles, tiles_of
 
 UNSEEN = 1 / 255  # kUnseen in csrc/bake.cpp
 WEIGHT_UNITS = 2**22  # kWeightUnits in csrc/cuda/composite.cu
@@ -52,15 +52,12 @@ def weights_of(
     Args: spans (T, 2); where the first value is above the second, the weights of the tile are 0.
     """
     weights = torch.zeros_like(pairs.entries)
+    splats, rays, *_ = projected
     launch(
-        "composite_weights" if projected.rays is None else "composite_ray_weights",
+        "composite_weights" if rays is None else "composite_ray_weights",
         tiles_of(width, height),
         THREADS,
-        **({"splats": projected.splats} if projected.rays is None else projected.rays._asdict()),
-        entries=pairs.entries,
-        starts=pairs.starts,
-        width=width,
-        height=height,
+        **of_tiles(splats, rays, pairs.entries, pairs.starts, width, height),
         spans=spans,
         weights=weights,
     )

@@ -12,6 +12,8 @@ from panolog.renderer.cuda.parts import (
     Exterior,
     Frame,
     Launch,
+    Pairs,
+    Projected,
     Rays,
     camera_struct,
     composite,
@@ -36,6 +38,20 @@ def _problem(given: dict[str, Any]) -> tuple[dict[str, Tensor], bytes, Exterior 
     return parameters, camera, Exterior.of(given["exterior"], *size, exact)
 
 
+def _seen(launch: Launch, given: dict[str, Any], screen: Tensor) -> tuple[Projected, Pairs, Exterior | None]:
+    """Splats as projected, their pairs with tiles, and what is around. Args: screen (N, 2), contiguous."""
+    parameters, camera, around = _problem(given)
+    size = (given["width"], given["height"])
+    angles = half_pixels(*size, screen.device) if given["exact"] else None
+    projected = project(launch, parameters, screen, camera, given["sh_degree"], angles, around)
+    return projected, list_pairs(launch, projected, *size, exterior=around), around
+
+
+def _rays(projected: Projected) -> Tensor:
+    """The rays of the splats (16 N,); (0,) with affine projection."""
+    return projected.splats.new_empty(0) if projected.rays is None else projected.rays.rays
+
+
 def rasterize(launch: Launch, **given: Any) -> tuple[Tensor, ...]:
     """`ops.rasterize`: color, alpha, inverse depth, state and the frame for the backward pass.
 
@@ -46,15 +62,10 @@ def rasterize(launch: Launch, **given: Any) -> tuple[Tensor, ...]:
     Raises:
         RunError: more than 2³¹ pairs of splats and tiles.
     """
-    parameters, camera, around = _problem(given)
-    size, screen = (given["width"], given["height"]), given["screen"][:, :2].contiguous()
-    angles = half_pixels(*size, screen.device) if given["exact"] else None
-    projected = project(launch, parameters, screen, camera, given["sh_degree"], angles, around)
+    projected, listed, around = _seen(launch, given, given["screen"][:, :2].contiguous())
     splats, seen, state, _, tile_counts = projected
-    listed = list_pairs(launch, projected, *size, exterior=around)
-    images = composite(launch, splats, seen, listed, *size, around)
-    rays = splats.new_empty(0) if seen is None else seen.rays
-    return *images, state, splats, rays, tile_counts, listed.entries, listed.starts
+    images = composite(launch, splats, seen, listed, given["width"], given["height"], around)
+    return *images, state, splats, _rays(projected), tile_counts, listed.entries, listed.starts
 
 
 def rasterize_backward(launch: Launch, **given: Any) -> tuple[Tensor, ...]:
@@ -90,15 +101,10 @@ def bake(launch: Launch, **given: Any) -> tuple[Tensor, ...]:
     Raises:
         RunError: more than 2³¹ pairs of splats and tiles.
     """
-    parameters, camera, _ = _problem(given | {"exterior": []})
-    size, means = (given["width"], given["height"]), parameters["means"]
-    screen = means.new_zeros(len(means), 2)
-    angles = half_pixels(*size, means.device) if given["exact"] else None
-    projected = project(launch, parameters, screen, camera, given["sh_degree"], angles)
-    pairs = list_pairs(launch, projected, *size)
-    found = surroundings(launch, projected, pairs, *size, given["own"], given["slack"], given["faint"])
-    rays = screen.new_empty(0) if projected.rays is None else projected.rays.rays
-    return *found, projected.splats, rays
+    screen = given["means"].new_zeros(len(given["means"]), 2)
+    projected, listed, _ = _seen(launch, given | {"exterior": []}, screen)
+    settings = (given[name] for name in ("width", "height", "own", "slack", "faint"))
+    return *surroundings(launch, projected, listed, *settings), projected.splats, _rays(projected)
 
 
 def photometric(launch: Launch, **given: Any) -> tuple[Tensor, Tensor, Tensor]:

@@ -226,6 +226,14 @@ def half_pixels(width: int, height: int, device: torch.device) -> tuple[Tensor, 
     return of(across, math.pi / width, width), of(down, math.pi / (2 * height), height)
 
 
+def of_tiles(
+    splats: Tensor, rays: Rays | None, entries: Tensor, starts: Tensor, width: int, height: int
+) -> dict[str, Argument]:
+    """What each kernel of csrc/cuda/composite.cu takes first: a block works on a tile of the image."""
+    lists: dict[str, Argument] = {"entries": entries, "starts": starts, "width": width, "height": height}
+    return {"splats": splats, **lists} if rays is None else rays._asdict() | lists
+
+
 def composite(
     launch: Launch,
     splats: Tensor,
@@ -242,11 +250,7 @@ def composite(
         "composite_forward" if rays is None else "composite_ray_forward",
         tiles_of(width, height),
         THREADS,
-        **({"splats": splats} if rays is None else rays._asdict()),
-        entries=pairs.entries,
-        starts=pairs.starts,
-        width=width,
-        height=height,
+        **of_tiles(splats, rays, pairs.entries, pairs.starts, width, height),
         **_of(exterior, "places", "front", "back"),
         color=color,
         alpha=alpha,
@@ -278,11 +282,7 @@ def composite_backward(
         f"composite{kind}_backward",
         tiles_of(width, height),
         THREADS,
-        **({"splats": splats} if rays is None else rays._asdict()),
-        entries=entries,
-        starts=starts,
-        width=width,
-        height=height,
+        **of_tiles(splats, rays, entries, starts, width, height),
         **_of(exterior, "places", "front"),
         **images,
         own=own,

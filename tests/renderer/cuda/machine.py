@@ -77,7 +77,7 @@ def surrounded(scene: Gaussians, at: Camera, own: Tensor) -> tuple[Gaussians, Ba
 
 
 def own_first(scene: Gaussians, own: Tensor) -> Gaussians:
-    """Those rows of a scene, and then the others."""
+    """A scene with the rows `own` first, and the others after them."""
     rows = torch.arange(len(scene))
     order = torch.cat([own, rows[~torch.isin(rows, own)]])
     return scene.with_tensors({name: tensor[order] for name, tensor in scene.tensors().items()})
@@ -104,7 +104,7 @@ def check_baked(machine: Machine, scene: Gaussians, at: Camera, own: Tensor) -> 
 
 
 def check_weights(machine: Machine, scene: Gaussians, at: Camera) -> None:
-    """Those of each splat in all tiles: the gradient of the sum of an image's red by the red of the splat."""
+    """Checks each splat's weight in all tiles: the gradient of the sum of an image's red by its own red."""
     tensors, size = scene.tensors() | {"sh0": torch.ones_like(scene.sh0)}, (at.width, at.height)
     given = arguments(scene.with_tensors(tensors), at, 0)
     truth = ops.rasterize(**given)

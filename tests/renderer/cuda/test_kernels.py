@@ -147,7 +147,7 @@ def test_what_is_baked_where_walls_hide_own_gaussians(exact: bool, machine: Mach
 
 @both
 def test_a_view_is_baked_with_four_waits(exact: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As the docstring of `bake` has them."""
+    """The docstring of `bake` says what the host waits for."""
     scene, at, launch = replace(cloud(100), exact=exact), camera(), EmulatedLaunch()
     monkeypatch.setattr(ops, "bake", functools.partial(launches.bake, launch))
     with counted((at.rotation, at.translation)) as found:
@@ -158,7 +158,7 @@ def test_a_view_is_baked_with_four_waits(exact: bool, monkeypatch: pytest.Monkey
 
 @both
 def test_weights(exact: bool, machine: Machine) -> None:
-    """Of several batches in some tiles."""
+    """Some tiles have several batches of splats."""
     check_weights(machine, replace(cloud(1500), exact=exact), camera(52))
 
 

@@ -194,7 +194,7 @@ def test_on_a_gpu_the_thread_that_reads_begins_the_copy_and_only_the_device_wait
 def test_a_gpu_without_room_for_the_whole_model_leaves_it_to_the_cpu(
     scene: Scene, initial: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It has room for one view. Any other error of it is one of the task."""
+    """The GPU has room for one view; an error other than want of memory ends the task."""
     where: list[str] = []
     message = "CUDA driver error: out of memory"
 
