@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, TypeAdapter
 
 from panolog.prepare.video.decode import MAX_FRAMES
-from panolog.prepare.video.parallax import WIDTH, Anchor, SphereBand
+from panolog.prepare.video.parallax import WIDTH, Anchor, Displacement, SphereBand
 from panolog.scene.files import write_bytes
 
 SHARP_WIDTH = 2048  # pixels at which sharpness is measured: finer structure is noise of the codec
@@ -129,12 +129,13 @@ class MotionTracker:
             self._stray = None
         if self._anchor is None or self._stray is not None:
             return False
-        frame = self._frame(number, time, grey)
-        self._recent.pop()
-        moved = copy(self._anchor).measure(frame.grey) if frame.clear else None
+        frame, anchor = self._frame(number, time, grey), copy(self._anchor)
+        moved = anchor.measure(frame.grey) if frame.clear else None
         if moved is None or abs(self._base + moved.parallax - self.pieces[-1].positions[-1]) > farthest:
+            self._recent.pop()  # comes again, after those between
             return False
-        self.add(number, time, grey)
+        self._anchor = anchor
+        self._append(frame, moved)
         return True
 
     def frames_within(self, parallax: float, most: int) -> int:
@@ -171,8 +172,12 @@ class MotionTracker:
     def _measure(self, frame: _Frame) -> bool:
         """Adds `frame` to the present piece, if its motion can be measured."""
         moved = None if self._anchor is None else self._anchor.measure(frame.grey)
-        if moved is None:
-            return False
+        if moved is not None:
+            self._append(frame, moved)
+        return moved is not None
+
+    def _append(self, frame: _Frame, moved: Displacement) -> None:
+        """Adds `frame` to the present piece, and makes it the anchor if that is far or seen no more."""
         piece = self.pieces[-1]
         piece.frames.append(frame.number)
         piece.times.append(_seconds(frame.time))
@@ -183,7 +188,6 @@ class MotionTracker:
             if anchor.usable:
                 self._anchor = anchor
                 self._base += moved.parallax if moved.parallax > _NOISE else 0.0
-        return True
 
 
 def sharpness(grey: NDArray[np.uint8]) -> float:
