@@ -54,7 +54,7 @@ void modifySplatColor(vec3 center, inout vec4 color) {
 export const ALL = new Float32Array(16);
 
 /** @param {Point[]} points @param {number} distance @returns {{ box: Box, bytes: Uint8Array }} the field, x first */
-export function field(points, distance) {
+function field(points, distance) {
   const whole = around(points);
   const lower = /** @type {Point} */ (whole.lower.map((value) => value - distance)),
     upper = /** @type {Point} */ (whole.upper.map((value) => value + distance));
@@ -73,9 +73,9 @@ export function field(points, distance) {
     }));
   };
   for (const point of spread(points, lower, size)) {
-    const across = cells(point, 0);
-    for (const z of cells(point, 2)) {
-      for (const y of cells(point, 1)) {
+    const [across, up, ahead] = [0, 1, 2].map((axis) => cells(point, axis));
+    for (const z of ahead) {
+      for (const y of up) {
         const row = SIDE * (y.cell + SIDE * z.cell),
           square = y.square + z.square;
         for (const x of across) {
