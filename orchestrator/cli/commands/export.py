@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from panolog.export.formats import ChosenModel, write_format
@@ -151,7 +150,7 @@ def _surroundings(model: _Model, distance: float) -> Surroundings:
     viewpoints = read_viewpoints(model.run, None) if model.run else None
     if viewpoints is None:
         raise InputError(f"--max-distance: {model.ply} has no cameras; give the run that has made it")
-    return Surroundings(np.stack([camera.position for camera in viewpoints.cameras.values()]), distance)
+    return Surroundings(viewpoints.positions, distance)
 
 
 def _doubts(place: Georeference, formats: tuple[str, ...]) -> list[str]:

@@ -158,7 +158,7 @@ def test_choices(run: RunFolder, tmp_path: Path, kind: str) -> None:
 def test_what_is_far_from_all_cameras_is_left_out(run: RunFolder, tmp_path: Path) -> None:
     viewpoints = read_viewpoints(run, None)
     assert viewpoints is not None
-    cameras = np.stack([camera.position for camera in viewpoints.cameras.values()])
+    cameras = viewpoints.positions
     whole, file = read_ply(run.point_cloud), tmp_path / "model.ply"
     scene = whole.means[: len(whole) - whole.sky].numpy()
     nearest = np.linalg.norm(scene[:, None] - cameras, axis=2).min(axis=1)

@@ -228,8 +228,7 @@ def place_of(folder: RunFolder, viewpoints: Viewpoints | None, locate: Locate = 
         return known
     if viewpoints is None:
         return Georeference()
-    centers = np.stack([camera.position for camera in viewpoints.cameras.values()])
-    up, middle = viewpoints.up.tolist(), np.round(centers.mean(axis=0)).tolist()
+    up, middle = viewpoints.up.tolist(), np.round(viewpoints.positions.mean(axis=0)).tolist()
     return Georeference(tuple(up), tuple(middle))
 
 

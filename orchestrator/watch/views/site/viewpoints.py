@@ -34,6 +34,11 @@ class Viewpoints:
     start: Viewpoint
     cameras: dict[str, Viewpoint]  # by the name of the panorama, in the plan's order
 
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """(C, 3) where the cameras are, in world units."""
+        return np.stack([camera.position for camera in self.cameras.values()])
+
 
 def read_viewpoints(
     folder: RunFolder, task: TaskId | None, camera: str | None = None, locate: Locate = here

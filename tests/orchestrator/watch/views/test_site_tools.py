@@ -70,7 +70,7 @@ def test_views_are_saved_cropped_and_rendered_from(browser: Browser, tmp_path: P
 def test_floaters_are_hidden_as_export_leaves_them_out(browser: Browser, tmp_path: Path) -> None:
     order = torch.randperm(60, generator=torch.Generator().manual_seed(2))
     file, model, viewpoints = page_of_layers(tmp_path, torch.linspace(-2, 4, 60)[order])
-    cameras = np.stack([camera.position for camera in viewpoints.cameras.values()])
+    cameras = viewpoints.positions
     with opened(browser, file.as_uri(), width=SIZE[0], height=SIZE[1]) as page:
         whole = shown(page)
         for faint, large, far in ((500, 1000, 1000), (0, 500, 1000), (0, 1000, 250), (500, 500, 300)):
