@@ -160,6 +160,16 @@ class TrainingStep:
             torch.cuda.synchronize()
         return time.perf_counter()
 
+    def milliseconds(self, work: Callable[[], object], repeats: int) -> float:
+        """How long some work takes: the median of the repetitions after a warm-up."""
+        work()
+        took = []
+        for _ in range(repeats):
+            start = self.now()
+            work()
+            took.append(self.now() - start)
+        return median(took) * 1e3
+
 
 def measure(case: Case, threads: int, repeats: int) -> Times:
     """Medians over `repeats` after a warm-up, means over the views; on the device of the case."""

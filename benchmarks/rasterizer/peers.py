@@ -13,7 +13,6 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from statistics import median
 from typing import Any
 
 import cv2
@@ -66,8 +65,8 @@ def ours(case: Case, repeats: int) -> tuple[Row, Tensor]:
     camera, model = case.views[0].camera, case.gaussians
     with torch.no_grad():
         color = step.forward()[1].color
-        forward = _milliseconds(step, step.forward, repeats)
-    whole = _milliseconds(step, step.rasterize, repeats)
+        forward = step.milliseconds(step.forward, repeats)
+    whole = step.milliseconds(step.rasterize, repeats)
     screen = model.means.new_zeros(len(model), 2)
     *_, starts = ops.rasterize(
         **model.tensors(),
@@ -99,10 +98,10 @@ def theirs(case: Case, repeats: int, panorama: Tensor) -> Row:
 
     with torch.no_grad():
         colors, meta = forward()
-        took = _milliseconds(step, forward, repeats)
+        took = step.milliseconds(forward, repeats)
     for name in ("means", "quats", "scales", "opacities", "colors"):
         given[name].requires_grad_()
-    both = _milliseconds(step, whole, repeats)
+    both = step.milliseconds(whole, repeats)
     seen = np.concatenate([perspective(to_bytes(panorama), lens, facing(*turn)) for turn in FACES])
     likeness = cv2.PSNR(to_bytes(colors).reshape(seen.shape), seen)
     pixels = len(FACES) * lens.width * lens.height
@@ -161,17 +160,6 @@ def arguments(model: Gaussians, camera: Camera, lens: Lens) -> dict[str, Any]:
 def table(rows: Sequence[Row]) -> str:
     """In Markdown."""
     return report.markdown(HEAD, [row.cells() for row in rows])
-
-
-def _milliseconds(step: TrainingStep, work: Callable[[], object], repeats: int) -> float:
-    """The median of some repetitions after a warm-up."""
-    work()
-    took = []
-    for _ in range(repeats):
-        start = step.now()
-        work()
-        took.append(step.now() - start)
-    return median(took) * 1e3
 
 
 def main() -> int:

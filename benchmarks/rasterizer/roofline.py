@@ -252,12 +252,10 @@ def measured(case: Case, repeats: int) -> dict[str, float]:
 
 def baking(case: Case, repeats: int) -> float:
     """Milliseconds of baking a view around an eighth of the Gaussians: the median after a warm-up."""
-    step, took = TrainingStep(case, case.views[0]), list[float]()
-    for _ in range(1 + repeats):
-        start = step.now()
-        bake(case.gaussians, len(case.gaussians) // 8, step.view.camera, near=case.near, unit=1.0)
-        took.append(step.now() - start)
-    return median(took[1:]) * 1e3
+    step, own = TrainingStep(case, case.views[0]), len(case.gaussians) // 8
+    return step.milliseconds(
+        lambda: bake(case.gaussians, own, step.view.camera, near=case.near, unit=1.0), repeats
+    )
 
 
 def comparison(took: Mapping[str, float], expected: Mapping[str, float]) -> str:
