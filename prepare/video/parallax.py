@@ -48,14 +48,15 @@ class SphereBand:
         self.top, self.rows = top, bottom - top
         self.inner = slice(self._row(_BAND[0]) - top, self._row(_BAND[1]) - top)
         grid = np.stack(np.meshgrid(np.arange(-_PAD, width + _PAD), np.arange(top, bottom)), axis=-1)
-        self._grid = self._directions(grid.reshape(-1, 2)).astype(np.float32)  # (rows * padded width, 3)
+        self._grid = self._directions(grid.reshape(-1, 2)).astype(np.float32)[None]  # (1, all pixels, 3)
 
     def turned(self, grey: NDArray[np.uint8], rotation: Array) -> NDArray[np.uint8]:
         """(rows, width + 2 pads) the band as a camera sees it whose directions are those of `grey`'s turned.
 
         `rotation` (3, 3) takes directions of that camera to directions of the one that took `grey` (H, W).
         """
-        x, y, z = (self._grid @ rotation.T.astype(np.float32)).T
+        # Not by `@`: NumPy's threads for it spin for longer than they compute.
+        x, y, z = np.asarray(cv2.transform(self._grid, rotation), np.float32)[0].T
         u = np.arctan2(x, z) * np.float32(self.width / (2 * np.pi)) + np.float32(self.width / 2 - 0.5)
         v = np.arcsin(np.clip(y, -1, 1)) * np.float32(self.height / np.pi) + np.float32(self.height / 2 - 0.5)
         shape = (self.rows, self.width + 2 * _PAD)
