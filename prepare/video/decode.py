@@ -210,7 +210,7 @@ class Video:
         self._container.seek(round(begin / (self._stream.time_base or 1)), stream=self._stream)
         if self._second is not None:
             self._second.seek(begin)
-        self._frames, self.time = self._decode(), -1.0
+        self._frames, self.time, self.passed = self._decode(), -1.0, 0
 
     def _decode(self) -> Iterator[av.VideoFrame]:
         """The frames that can be decoded, with those of the second lens next to them if it has its own."""

@@ -160,6 +160,21 @@ def test_of_a_large_video_frames_between_those_to_seek_are_decoded_where_these_a
     assert not (known := load_motion(out / "walk.motion.json")) or not known.coarse
 
 
+def test_a_large_video_that_is_fast_from_its_begin_has_the_true_numbers_of_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the file of motion had a number twice it was unsound, and each call followed the video anew."""
+    shots = walk([0.3] * 30)
+    video = write_video(tmp_path / "fast.mp4", [render(shot) for shot in shots], fourcc="mp4v")
+    monkeypatch.setattr(streams, "_LARGE", WIDTH)
+    files = extract_frames(video, tmp_path / "out")
+    known = load_motion(tmp_path / "out" / "fast.motion.json")
+    assert known is not None and known.coarse
+    (piece,) = known.pieces
+    assert piece.frames == [round(time * 30) for time in piece.times]
+    assert extract_frames(video, tmp_path / "out") == files
+
+
 def test_another_choice_replaces_the_first(short: Path, extracted: Path, tmp_path: Path) -> None:
     shutil.copytree(extracted, tmp_path / "out")
     extract_frames(short, tmp_path / "out", parallax=2.0)
