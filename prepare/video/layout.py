@@ -73,9 +73,11 @@ class Layout:
         """(width / 2, width, ...) of a decoded picture (H, W, ...); 0 where there is none."""
         eye = _displayed(picture, self.turn)[self.eye.slices]
         rows, columns = self.place.shape
+        height, width = eye.shape[:2]
+        if height >= 2 * rows and width >= 2 * columns and not (height % 2 or width % 2):
+            eye = _resized(eye, width // 2, height // 2)  # ten times as fast as by another factor
         if eye.shape[:2] != (rows, columns):
-            way = cv2.INTER_AREA if columns < eye.shape[1] else cv2.INTER_LINEAR
-            eye = np.asarray(cv2.resize(eye, (columns, rows), interpolation=way), picture.dtype)
+            eye = _resized(eye, columns, rows)
         if self.is_whole:
             return np.ascontiguousarray(eye)
         whole = np.zeros((self.width // 2, self.width, *picture.shape[2:]), picture.dtype)
@@ -166,3 +168,9 @@ def _displayed(picture: NDArray[Pixel], turn: Turn) -> NDArray[Pixel]:
     if a == 0:
         picture, a, d = picture.swapaxes(0, 1), c, b
     return picture[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
+
+
+def _resized(picture: NDArray[Pixel], columns: int, rows: int) -> NDArray[Pixel]:
+    """The picture (H, W, ...) as (rows, columns, ...)."""
+    way = cv2.INTER_AREA if columns < picture.shape[1] else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(picture, (columns, rows), interpolation=way), picture.dtype)
