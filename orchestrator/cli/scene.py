@@ -113,7 +113,7 @@ def stitch(
 ) -> None:
     """Make panoramas of pictures or a video that show two fisheye circles."""
     from panolog.prepare.raw_files import FrameChoice, stitch_source
-    from panolog.prepare.video.frames import PARALLAX
+    from panolog.prepare.video.selection import PARALLAX
 
     chosen = FrameChoice(PARALLAX if parallax is None else parallax, frames)
     with progress_bar("looking for the lenses", resumable=True) as show:
@@ -152,7 +152,7 @@ def sfm(
     from panolog.orchestrator.runs.machines.machine import memory_of_preparation
     from panolog.prepare.sfm.joining.join import join_scene
     from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
-    from panolog.prepare.video.frames import PARALLAX
+    from panolog.prepare.video.selection import PARALLAX
 
     settings = SfmSettings(
         pairing=pairs,

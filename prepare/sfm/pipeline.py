@@ -26,7 +26,8 @@ from panolog.prepare.sfm.trajectory import (
 from panolog.prepare.sources.find import Sources, find_sources
 from panolog.prepare.sources.gather import Gathered, gather
 from panolog.prepare.stitching.lenses import Up
-from panolog.prepare.video.frames import PARALLAX, frame_times
+from panolog.prepare.video.frames import frame_times
+from panolog.prepare.video.selection import PARALLAX
 from panolog.prepare.world.exif import read_exif
 from panolog.prepare.world.georeference import Georeference, check_metres, georeference, scale_from_distance
 from panolog.scene.errors import ConfigError, SceneError

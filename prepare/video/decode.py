@@ -92,7 +92,7 @@ class Video:
             raise SceneError(
                 f"{path}: cannot be opened as a video; it is damaged, truncated before its index, or no video"
             )
-        self._frame = first
+        self.frame = first  # the last frame, as it was decoded
         self._size = (first.width, first.height)
         try:
             check_colours(first)
@@ -124,11 +124,11 @@ class Video:
 
         `time`, `picture` and `grey` are those of the last one.
         """
-        frame: av.VideoFrame | None = self._frame
+        frame: av.VideoFrame | None = self.frame
         while frame is not None and self.passed < MAX_FRAMES:
             # FFmpeg reuses the buffers of frames that are let go, and where a frame is damaged it shows
             # what was in its buffer: so that is done here, at the same moment each time.
-            self._frame = frame
+            self.frame = frame
             coming = self._ahead.submit(next, self._frames, None)
             self._show(frame)
             yield self.passed - 1
@@ -139,43 +139,45 @@ class Video:
 
         Args: keys, what `keys` was when all of the video had been decoded.
         """
-        self._show(self._frame)
+        self._show(self.frame)
         for wanted in times:
             begin = max((key for key in keys if key <= wanted), default=0.0)
             if begin > self.time or wanted < self.time:
                 self._seek(begin)
             while self.time < wanted and (frame := next(self._frames, None)) is not None:
-                self._frame = frame
+                self.frame = frame
                 self._show(frame)
             if self.time != wanted:
                 return
             yield wanted
 
-    def between(self, begin: float, end: float) -> Iterator[int]:
+    def between(self, begin: float | None, end: float) -> Iterator[int]:
         """The numbers, by their times, of the frames between two times, in seconds; each call is later.
 
         Where seeking does not find the first of them, the video is not plain.
 
-        Args: begin, that of a frame from which decoding can begin.
+        Args: begin, that of a frame from which decoding can begin; None: there are no frames.
         """
+        if begin is None:
+            return
         self._by_time = True
         if not self.decoded:
-            self._show(self._frame)
+            self._show(self.frame)
         self._seek(begin)
         found = False
         for frame in self._frames:
             if round(self._time(frame), 6) >= end:
                 break
-            self._frame = frame
+            self.frame = frame
             self._show(frame)
             found |= self.time == begin
             if self.time > begin:
                 yield self.passed - 1
         self.is_plain &= found
 
-    def picture(self) -> NDArray[np.uint8] | None:
-        """(height, width, 3) BGR; None if it is damaged or unlike the first one."""
-        return self._converted(lambda frame: self.layout.panorama(self._converter.bgr(frame)))
+    def picture(self, frame: av.VideoFrame | None = None) -> NDArray[np.uint8] | None:
+        """(height, width, 3) BGR of `frame`, or the last one; None if it is damaged or unlike the first."""
+        return self._converted(frame, lambda it: self.layout.panorama(self._converter.bgr(it)))
 
     def grey(self, width: int = WIDEST) -> NDArray[np.uint8] | None:
         """(H, W) luma, full range, at most `width` wide, for a fraction of the time of `picture`.
@@ -183,7 +185,7 @@ class Video:
         None as there.
         """
         layout = self.layout.scaled(width)
-        return self._converted(lambda frame: self._converter.grey(frame, layout))
+        return self._converted(None, lambda it: self._converter.grey(it, layout))
 
     def notes(self) -> list[str]:
         """Messages about a video that was decoded, one line each."""
@@ -228,9 +230,11 @@ class Video:
         self._damaged += 1
         self.is_plain = False
 
-    def _converted(self, convert: Callable[[av.VideoFrame], NDArray[np.uint8]]) -> NDArray[np.uint8] | None:
-        """The panorama of the last frame."""
-        frame = self._frame
+    def _converted(
+        self, frame: av.VideoFrame | None, convert: Callable[[av.VideoFrame], NDArray[np.uint8]]
+    ) -> NDArray[np.uint8] | None:
+        """The panorama of a frame, or of the last one."""
+        frame = frame or self.frame
         if (frame.width, frame.height) == self._size and not frame.is_corrupt:
             try:
                 return convert(frame)
@@ -285,9 +289,8 @@ def open_video(path: Path, effort: Effort = "exact", up: Up | None = None) -> It
     """Opens a video in any container of `FORMATS` with any codec of FFmpeg; one of two lenses is stitched.
 
     Args: effort, "exact" decodes all frames in one thread, so that damaged ones are the same each time.
-        "chosen" decodes in several threads, and of large videos no frames that no others refer to, most of
-        which are coded worst. "draft" also leaves out what smooths the borders of blocks in large ones, and
-        "keys" all frames but those from which decoding can begin.
+        "fast" decodes in several threads, and of large videos no frames that no others refer to, most of
+        which are coded worst; "keys" only those from which decoding can begin.
         up, of a video that is to be stitched, where up is in its first circle; None: up.
     Raises SceneError: it is missing, cannot be opened, is no panorama, or its width is out of bounds.
     """

@@ -138,13 +138,21 @@ class MotionTracker:
         self._append(frame, moved)
         return True
 
-    def frames_within(self, parallax: float, most: int) -> int:
-        """How many frames the camera takes for so many degrees at its present pace, from 1 to `most`."""
+    @property
+    def pace(self) -> float | None:
+        """Degrees from one frame to the next, lately; None where that is not known."""
         last = self.pieces[-1] if self.pieces and self._stray is None else Piece()
         if len(last.frames) < 2:
-            return 1
+            return None
         moved, frames = (it[-1] - it[-2] for it in (last.positions, last.frames))
-        return int(np.clip(parallax * frames / max(abs(moved), 1e-6), 1, most))
+        return abs(moved) / frames
+
+    def is_due(self, number: int, parallax: float, most: int) -> bool:
+        """Whether a frame is `most` frames after the last one, or the next would be by more degrees away."""
+        if self.pace is None:
+            return True
+        after = number - self.pieces[-1].frames[-1]
+        return after >= most or (after + 1) * self.pace > parallax
 
     def finish(self) -> list[Piece]:
         """All pieces, after the last frame."""

@@ -12,7 +12,7 @@ from av.stream import Disposition
 
 WIDEST = 12_288  # pixels: more than any camera records
 FORMATS = "mov,matroska,avi,mpegts,mpeg,flv,ogg,asf"  # no playlists: they name other files and addresses
-Effort = Literal["exact", "chosen", "draft", "keys"]
+Effort = Literal["exact", "fast", "keys"]
 _THREADS = 8  # of a video at most: each holds a frame
 _LARGE = 3000  # pixels: narrower frames are decoded fast enough
 _FAST, _ENOUGH = 20, 7.5  # frames per second, of which every second one will do; that are looked at, at least
@@ -58,17 +58,14 @@ def first_shown(container: av.container.InputContainer) -> float:
 
 def prepare_stream(stream: av.VideoStream, effort: Effort) -> av.VideoStream:
     """The stream, which leaves out what `effort` allows."""
-    options, large = dict(_DECODING), stream.width >= _LARGE
     if effort != "exact":
         stream.thread_type = "AUTO"
     stream.thread_count = 1 if effort == "exact" else min(_THREADS, os.cpu_count() or 1)
-    if effort != "exact" and large and (stream.average_rate or 0) >= _FAST:
+    if effort != "exact" and stream.width >= _LARGE and (stream.average_rate or 0) >= _FAST:
         stream.codec_context.skip_frame = "NONREF"
     if effort == "keys":
         stream.codec_context.skip_frame = "NONKEY"
-    if effort in ("draft", "keys") and large:
-        options["skip_loop_filter"] = "all"
-    stream.codec_context.options = options
+    stream.codec_context.options = _DECODING
     return stream
 
 

@@ -106,17 +106,17 @@ def test_seeking_finds_the_frames_of_reading_in_order(
     many = Encoding(encoding.codec, encoding.pixels, encoding.options | {"g": "8"})
     frames = known_frames(40, encoding.bits)
     path = write_clip(tmp_path / f"clip.{container}", frames, many)
-    with open_video(path, "draft") as video:
+    with open_video(path, "fast") as video:
         times = [video.time for _ in video.frames()]
         keys = video.keys
         assert video.is_plain
     assert len(times) == 40 and len(keys) > 2
     chosen = [0, 1, 7, 8, 19, 33, 39]
-    with open_video(path, "chosen") as video:
+    with open_video(path, "fast") as video:
         for number, time in zip(chosen, video.frames_at([times[it] for it in chosen], keys), strict=True):
             assert time == times[number]
             assert same(video.picture(), expected(frames[number], bits=encoding.bits)), number
-    with open_video(path, "chosen") as video:
+    with open_video(path, "fast") as video:
         assert list(video.frames_at([times[3], times[4] + 0.001, times[9]], keys)) == [times[3]]
 
 
@@ -128,7 +128,7 @@ def test_frames_that_none_refer_to_are_left_out_of_large_videos(
     path = write_clip(tmp_path / "clip.mp4", known_frames(40), encoding)
     with open_video(path) as video:
         every = [video.time for _ in video.frames()]
-    with open_video(path, "draft") as video:
+    with open_video(path, "fast") as video:
         some = [video.time for _ in video.frames() if video.grey(64) is not None]
         assert video.passed >= 38
         assert video.notes() == []

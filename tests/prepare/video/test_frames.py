@@ -2,7 +2,8 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from panolog.prepare.video import streams
 from panolog.prepare.video.decode import Video
 from panolog.prepare.video.frames import extract_frames
 from panolog.prepare.video.motion import load_motion
+from panolog.prepare.video.selection import search
 from panolog.scene.errors import InputError
 from panolog.scene.files import SUFFIX
 from panolog.scene.image_files import decode
@@ -48,6 +50,13 @@ def extracted(short: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return extract_frames(short, tmp_path_factory.mktemp("frames") / "out")[0].parent
 
 
+@pytest.fixture(scope="module")
+def twelfth(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A walk in which decoding can begin at each twelfth frame."""
+    images = [render(shot) for shot in walk([0.12] * 60)]
+    return write_video(tmp_path_factory.mktemp("video") / "walk.mp4", images, fourcc="mp4v")
+
+
 def test_even_baseline_sharp_frames_and_none_at_rest(tmp_path: Path) -> None:
     shots, images = tour(), tour_images()
     video = write_video(tmp_path / "tour.mp4", images, fourcc="mp4v")
@@ -79,7 +88,7 @@ def test_a_standing_camera_gives_no_scene(tmp_path: Path) -> None:
 
 
 def test_goes_on_where_it_was_stopped(short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = extract_frames(short, tmp_path / "whole", parallax=PARALLAX)
+    whole = extract_frames(short, tmp_path / "whole", parallax=PARALLAX, most=100)
     assert len(whole) >= 3
     calls: list[tuple[int, int]] = []
 
@@ -90,23 +99,82 @@ def test_goes_on_where_it_was_stopped(short: Path, tmp_path: Path, monkeypatch: 
 
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        extract_frames(short, out, parallax=PARALLAX, progress=stop)
+        extract_frames(short, out, parallax=PARALLAX, most=100, progress=stop)
     assert calls == [(n, 16) for n in range(1, 9)] + [
         (9 + number, 9 + numbers(whole)[-1]) for number in numbers(whole)[:2]
     ]
     kept = {path: path.stat().st_mtime_ns for path in sorted(out.glob("*.jpg"))}
     assert [path.name for path in kept] == [path.name for path in whole[:2]]
     assert not list(out.glob(f".*{SUFFIX}"))
-    monkeypatch.setattr(module, "_search", None)  # the motion is known
+    monkeypatch.setattr(module, "search", None)  # the motion is known
     (out / f".short_000001.jpg.1234{SUFFIX}").write_bytes(b"of a killed writer")
-    again = extract_frames(short, out, parallax=PARALLAX)
+    again = extract_frames(short, out, parallax=PARALLAX, most=100)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     assert [path.read_bytes() for path in again] == [path.read_bytes() for path in whole]
     assert sorted(path.name for path in out.iterdir()) == sorted(
         path.name for path in (tmp_path / "whole").iterdir()
     )
     monkeypatch.setattr(module, "open_video", None)  # all is there
-    assert extract_frames(short, out, parallax=PARALLAX) == again
+    assert extract_frames(short, out, parallax=PARALLAX, most=100) == again
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_chosen_frames_are_written_while_their_video_is_followed(
+    large: bool, twelfth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All but one or two at the ends, with the bytes that decoding again gives, as where a limit is given."""
+    monkeypatch.setattr(streams, "_LARGE", WIDTH + (not large))
+    again = extract_frames(twelfth, tmp_path / "again", most=1000)
+    sought: list[float] = []
+    original = Video.frames_at
+
+    def frames_at(self: Video, times: Sequence[float], keys: Sequence[float]) -> Iterator[float]:
+        sought.extend(times)
+        return original(self, times, keys)
+
+    monkeypatch.setattr(Video, "frames_at", frames_at)
+    files = extract_frames(twelfth, tmp_path / "out")
+    assert len(files) > 6 and len(sought) <= 2
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "again").iterdir())
+    assert [path.read_bytes() for path in files] == [path.read_bytes() for path in again]
+
+
+def test_goes_on_after_a_stop_while_the_video_was_followed(twelfth: Path, tmp_path: Path) -> None:
+    whole, out = extract_frames(twelfth, tmp_path / "whole"), tmp_path / "out"
+
+    def stop(done: int, total: int) -> None:
+        if out.exists():
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        extract_frames(twelfth, out, progress=stop)
+    (kept,) = out.iterdir()
+    assert kept.suffix == SUFFIX
+    with pytest.raises(KeyboardInterrupt):  # at once: what is left of a killed process takes no room
+        extract_frames(
+            twelfth, out, progress=lambda done, total: stop(done, total) if not kept.exists() else None
+        )
+    assert [path.read_bytes() for path in extract_frames(twelfth, out)] == [it.read_bytes() for it in whole]
+    assert sorted(path.name for path in out.iterdir()) == sorted(
+        path.name for path in (tmp_path / "whole").iterdir()
+    )
+
+
+def test_what_was_written_of_a_video_that_turns_out_to_be_damaged_is_not_used(
+    twelfth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = bytearray(twelfth.read_bytes())
+    data[len(data) * 3 // 4 : len(data) * 3 // 4 + 400] = bytes(400)
+    for name in ("early", "late"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "walk.mp4").write_bytes(data)
+    early, late = (
+        extract_frames(tmp_path / name / "walk.mp4", tmp_path / name / "out", most=most)
+        for name, most in (("early", None), ("late", 1000))
+    )
+    assert [path.read_bytes() for path in early] == [path.read_bytes() for path in late]
+    assert not list((tmp_path / "early" / "out").glob(f".*{SUFFIX}"))
 
 
 def test_frames_that_seeking_does_not_find_are_read_in_order(
@@ -124,9 +192,9 @@ def test_of_a_large_video_that_moves_slowly_few_frames_are_looked_at(
     slow = write_video(tmp_path / "slow.avi", [render(shot) for shot in walk([0.004] * 30)])
     for video in (short, slow):
         monkeypatch.setattr(streams, "_LARGE", WIDTH + 1)
-        every = module._search(video, "", no_progress, None, fine=True)
+        every = search(video, "", no_progress, None, None, fine=True)
         monkeypatch.setattr(streams, "_LARGE", WIDTH)
-        some = module._search(video, "", no_progress, None, fine=True)
+        some = search(video, "", no_progress, None, None, fine=True)
         (all_, few) = (sum(len(piece.frames) for piece in it.pieces) for it in (every, some))
         assert few == all_ if video == short else few < 0.5 * all_
         ends = [max(piece.positions[-1] for piece in it.pieces) for it in (every, some)]
@@ -140,7 +208,7 @@ def test_of_a_large_video_frames_between_those_to_seek_are_decoded_where_these_a
     shots = walk([0.03] * 36 + [0.3] * 24 + [0.03] * 40)
     video = write_video(tmp_path / "walk.mp4", [render(shot) for shot in shots], fourcc="mp4v")
     monkeypatch.setattr(streams, "_LARGE", WIDTH)
-    few, every = (module._search(video, "", no_progress, None, fine=fine) for fine in (False, True))
+    few, every = (search(video, "", no_progress, None, None, fine=fine) for fine in (False, True))
     assert (few.coarse, every.coarse) == (True, False)
     (coarse,), (whole,) = few.pieces, every.pieces
     assert [number for number in coarse.frames if number <= 36 or 60 <= number < 96] == [
@@ -148,7 +216,7 @@ def test_of_a_large_video_frames_between_those_to_seek_are_decoded_where_these_a
         *range(60, 96, 12),
     ]
     assert len([number for number in coarse.frames if 36 < number < 60]) > 12
-    assert coarse.frames[-1] == whole.frames[-1] == 99
+    assert min(coarse.frames[-1], whole.frames[-1]) >= 96
     for number, position in zip(coarse.frames, coarse.positions, strict=True):
         if number in whole.frames:
             assert position == pytest.approx(whole.positions[whole.frames.index(number)], rel=0.1, abs=0.5)
@@ -158,6 +226,37 @@ def test_of_a_large_video_frames_between_those_to_seek_are_decoded_where_these_a
     assert steps.max() < 1.3, steps
     assert len(extract_frames(video, out, parallax=1.0)) > 2 * len(files)  # which requires another search
     assert not (known := load_motion(out / "walk.motion.json")) or not known.coarse
+
+
+def test_of_a_large_video_frames_before_one_to_seek_are_left_out_once_that_is_near_enough(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Decoding can begin at each twelfth frame, and between two of these the camera moves by 9 degrees."""
+    shots = walk([0.1] * 40)
+    video = write_video(tmp_path / "walk.mp4", [render(shot) for shot in shots], fourcc="mp4v")
+    monkeypatch.setattr(streams, "_LARGE", WIDTH)
+    (piece,) = search(video, "", no_progress, None, None, fine=False).pieces
+    assert {0, 12, 24, 36} <= set(piece.frames)
+    assert max(number % 12 for number in piece.frames if number < 36) <= 7
+    assert 2.5 < max(np.diff(piece.positions)) <= 6
+    steps = np.diff([shots[number].along for number in numbers(extract_frames(video, tmp_path / "out"))])
+    assert steps[:-1].max() / steps[:-1].min() < 1.8, steps  # the last one ends where the video does
+
+
+def test_of_a_large_video_that_stands_blurred_frames_to_seek_are_no_obstacle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shots = walk([0.0] * 26 + [0.1] * 24)
+    shots = [
+        replace(shot, turn=(0.0, 0.0, 0.0), blur=4.0 * (n in (12, 24, 36))) for n, shot in enumerate(shots)
+    ]
+    video = write_video(tmp_path / "walk.mp4", [render(shot) for shot in shots], fourcc="mp4v")
+    monkeypatch.setattr(streams, "_LARGE", WIDTH)
+    found = search(video, "", no_progress, None, None, fine=False)
+    assert found.coarse and len(found.pieces) == 1
+    files = extract_frames(video, tmp_path / "out")
+    assert not {12, 24, 36}.intersection(numbers(files))
+    assert sum(number < 26 for number in numbers(files)) == 1 and len(files) > 3
 
 
 def test_a_large_video_that_is_fast_from_its_begin_has_the_true_numbers_of_frames(

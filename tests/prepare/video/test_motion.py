@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from panolog.prepare.video.motion import MotionTracker, Piece, sharpness
-from panolog.prepare.video.selection import choose_frames
+from panolog.prepare.video.selection import Choice, choose_frames
 from tests.prepare.video.videos import HEIGHT, WIDTH, Image, Shot, render, turn, walk
 
 pytestmark = pytest.mark.system
@@ -107,3 +107,25 @@ def test_a_blurred_stretch_is_stepped_over() -> None:
     piece = Piece(rows, [0.0] * len(rows), positions.tolist(), np.where(blurred, 0.1, 1.0).tolist())
     chosen = choose_frames([piece], PARALLAX, None)
     assert len(chosen) == 5 and not blurred[chosen].any()
+
+
+def test_steps_begin_anew_after_a_gap_and_both_ends_are_there() -> None:
+    """As of a video of which the frames before those from which decoding can begin were left out."""
+    positions = [begin + it for begin in range(0, 90, 9) for it in np.arange(0.0, 4.6, 0.5)]
+    rows = list(range(len(positions)))
+    chosen = choose_frames([Piece(rows, [0.0] * len(rows), positions, [1.0] * len(rows))], 4.0, None)
+    assert (chosen[0], chosen[-1]) == (0, rows[-1])
+    steps = np.diff([positions[row] for row in chosen])
+    assert steps.min() >= 2.4 and steps.max() <= 5.6
+
+
+def test_while_frames_come_the_same_are_chosen_but_for_the_end() -> None:
+    random = np.random.default_rng(0)
+    positions = np.cumsum(random.uniform(0, 2, 300))
+    choice, early = Choice(PARALLAX), list[int]()
+    for row, position in enumerate(positions):
+        done = choice.add(row, float(position), float(random.uniform(0.2, 1.0)))
+        early += [] if done is None else [done]
+        assert done is None or positions[done] > position - 1.8 * PARALLAX
+    assert set(choice.finish()) - set(early) <= {choice.held, choice.last}
+    assert early == choice.finish()[: len(early)] or early[:-1] == choice.finish()[: len(early) - 1]
