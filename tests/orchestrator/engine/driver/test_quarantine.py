@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 
+from panolog.orchestrator.engine.driver.attempts import Attempt
 from panolog.orchestrator.engine.scheduling import quarantine
 from panolog.orchestrator.engine.scheduling.pool import Failed
+from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.machines.config import QuarantineConfig
-from panolog.orchestrator.runs.machines.nodes import Gpu, Node
+from panolog.orchestrator.runs.machines.nodes import Gpu, Node, Placement
 from panolog.orchestrator.runs.records import (
     BlockPlan,
     CheckpointSaved,
@@ -33,6 +35,7 @@ from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from tests.orchestrator.fakes import CrashError, FakePool, Harness, Script, SetClock, well
 from tests.orchestrator.history import AGAIN, after, started
+from tests.orchestrator.scripted import Works
 
 A, B = Node("aaaa", "gpu-a", 2, 2**40), Node("bbbb", "gpu-b", 2, 2**40)
 CARDS = tuple(Gpu("NVIDIA L4", 22 * 2**30, f"GPU-{number}") for number in range(4))
@@ -153,6 +156,11 @@ def test_failures_on_a_bad_node_do_not_count_against_its_tasks() -> None:
     assert quarantine.excuses(state, (A.id, ""), Failure.LOST)
     assert not quarantine.excuses(state, (A.id, ""), Failure.MEMORY)
     assert not quarantine.excuses(state, (B.id, ""), Failure.LOST)
+    spec: Any = Works(task=BLOCKS[3])
+    for node in (A, B):
+        attempt = Attempt(spec, 1, 0, Placement(node.id, 1.0, 2**30), latest=0.0)
+        record = attempt.failed(Failed("no"), state, (A, B), RunConfig(retries=0))
+        assert (record.excused, record.final) == (node is A, node is B)
 
 
 # With the driver
