@@ -67,7 +67,7 @@ class DoubleSphere:
         return np.asarray(np.clip(shown * self.gain * falls * lit + grain + 2, 0, 255), np.uint8)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """Two of them, in pictures of `size` pixels a side."""
 

@@ -16,9 +16,8 @@ from panolog.prepare.sources.gather import gather
 from panolog.prepare.stitching.circles import halves
 from panolog.prepare.stitching.lenses import APPROXIMATE
 from panolog.prepare.video.decode import open_video
-from panolog.prepare.video.frames import extract_frames
 from panolog.scene.errors import InputError
-from panolog.scene.image_files import read_info
+from panolog.scene.image_files import decode_colors, read_info
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
 from tests.orchestrator.cli.program import call, one_line, shown
@@ -28,11 +27,12 @@ from tests.prepare.video.videos import numbers, render, walk
 pytestmark = pytest.mark.system
 
 Image = NDArray[np.uint8]
+Walked = list[tuple[Image, Image]]
 COUNT = 16
 
 
 @pytest.fixture(scope="module")
-def walked() -> list[tuple[Image, Image]]:
+def walked() -> Walked:
     """(H, W, 3) panoramas of a walk, and their two circles side by side."""
     known, views = camera(400), [render(it, 1024, bearer=False) for it in walk([0.12] * COUNT)]
     return [(view, known.picture(view, seed)) for seed, view in enumerate(views)]
@@ -53,11 +53,16 @@ def raw(kind: str, folder: Path, pictures: list[Image]) -> Path:
     return write(folder / "VID_20260101_000000_00_001.insv", one)
 
 
-@pytest.mark.parametrize("kind", ["both circles", "two streams", "two files", "a dark rim below"])
-def test_frames_are_those_of_the_panorama(
-    kind: str, walked: list[tuple[Image, Image]], tmp_path: Path
-) -> None:
-    path = raw(kind, tmp_path, [it for _, it in walked])
+@pytest.fixture(scope="module")
+def card(walked: Walked, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with both files of a video: the lenses of a file are found once."""
+    return raw("two files", tmp_path_factory.mktemp("card"), [it for _, it in walked]).parent
+
+
+@pytest.mark.parametrize("kind", ["two streams", "two files", "a dark rim below"])
+def test_frames_are_those_of_the_panorama(kind: str, walked: Walked, card: Path, tmp_path: Path) -> None:
+    pictures = [it for _, it in walked]
+    path = card / "VID_20260101_000000_00_001.insv" if kind == "two files" else raw(kind, tmp_path, pictures)
     with open_video(path) as video:
         assert 700 < video.width <= 800 and video.height * 2 == video.width
         for number in video.frames():
@@ -70,21 +75,15 @@ def test_frames_are_those_of_the_panorama(
         assert video.decoded == COUNT and video.notes() == [f"{path}: {APPROXIMATE}"]
 
 
-def test_frames_are_chosen_as_of_any_video(walked: list[tuple[Image, Image]], tmp_path: Path) -> None:
-    path = raw("two files", tmp_path, [it for _, it in walked])
-    files = extract_frames(path, tmp_path / "frames")
-    chosen = numbers(files)
-    assert len(chosen) >= 3 and (chosen[0], chosen[-1]) == (0, COUNT - 1)
-    picture = cv2.imread(str(files[1]))
-    assert picture is not None
-    truth = cv2.resize(walked[chosen[1]][0], picture.shape[1::-1], interpolation=cv2.INTER_AREA)
-    assert np.abs(picture.astype(float) - truth).mean() < 12
-
-
-def test_the_command_takes_videos(walked: list[tuple[Image, Image]], tmp_path: Path) -> None:
+def test_the_command_takes_videos(walked: Walked, tmp_path: Path) -> None:
     path, out = raw("both circles", tmp_path, [it for _, it in walked]), tmp_path / "out"
     printed = shown("scene", "stitch", path, "-o", out, "--frames", "3")
-    assert printed["panoramas"] == 3 == len(list(out.glob("clip_*.jpg")))
+    made = sorted(out.glob("clip_*.jpg"))
+    chosen = numbers(made)
+    assert printed["panoramas"] == 3 == len(made) and (chosen[0], chosen[-1]) == (0, COUNT - 1)
+    picture = decode_colors(made[1])
+    truth = cv2.resize(walked[chosen[1]][0], picture.shape[1::-1], interpolation=cv2.INTER_AREA)
+    assert np.abs(picture.astype(float) - truth).mean() < 12
     assert json.loads((out / "lenses.json").read_bytes())[0]["size"] == [400, 400]
     again = one_line(call("scene", "stitch", path, "-o", out, "--frames", "3", "--up", "right"))
     assert "is about another video of the name clip, or of another --up" in again
@@ -92,14 +91,14 @@ def test_the_command_takes_videos(walked: list[tuple[Image, Image]], tmp_path: P
     assert "shows no two fisheye circles" in one_line(call("scene", "stitch", flat, "-o", tmp_path / "no"))
 
 
-def test_one_lens_of_two_files_is_refused(walked: list[tuple[Image, Image]], tmp_path: Path) -> None:
+def test_one_lens_of_two_files_is_refused(walked: Walked, tmp_path: Path) -> None:
     path = raw("two files", tmp_path, [it for _, it in walked[:4]])
     path.with_name(path.name.replace("_00_", "_10_")).unlink()
     with pytest.raises(InputError, match=r"400 x 400 pixels are not 2:1; stitch it"), open_video(path):
         pass
 
 
-def test_circles_of_different_places_are_refused(walked: list[tuple[Image, Image]], tmp_path: Path) -> None:
+def test_circles_of_different_places_are_refused(walked: Walked, tmp_path: Path) -> None:
     known, noise = camera(400), np.random.default_rng(1)
     small = noise.integers(40, 220, (4, 24, 48, 3), np.uint8)
     views = [np.asarray(cv2.resize(it, (1024, 512)), np.uint8) for it in small]
@@ -114,9 +113,7 @@ def test_circles_of_different_places_are_refused(walked: list[tuple[Image, Image
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["video", "folder"])
-def test_raw_files_become_a_scene_in_one_command(
-    kind: str, walked: list[tuple[Image, Image]], tmp_path: Path
-) -> None:
+def test_raw_files_become_a_scene_in_one_command(kind: str, walked: Walked, tmp_path: Path) -> None:
     source = tmp_path / "raw"
     if kind == "video":
         source = raw("both circles", tmp_path, [it for _, it in walked])
@@ -138,23 +135,23 @@ def test_raw_files_become_a_scene_in_one_command(
     assert json.loads((tmp_path / "scene" / "sfm.json").read_bytes())["left_out"] == []
 
 
-def test_raw_files_go_with_panoramas_and_with_each_other(
-    walked: list[tuple[Image, Image]], tmp_path: Path
-) -> None:
-    card, photographs, stitched = (tmp_path / name for name in ("card", "photographs", "stitched"))
-    for folder in (card, photographs, stitched):
+def test_raw_files_go_with_panoramas_and_with_each_other(walked: Walked, card: Path, tmp_path: Path) -> None:
+    photographs, stitched, several = tmp_path / "photographs", tmp_path / "stitched", 2
+    for folder in (photographs, stitched):
         folder.mkdir()
-    raw("two files", card, [picture for _, picture in walked])
-    for number, (panorama, picture) in enumerate(walked[::4]):
+    for number, (panorama, picture) in enumerate(walked[:: COUNT // several]):
         cv2.imwrite(str(photographs / f"{number}.jpg"), picture)
         (photographs / f"{number}.jpg").rename(photographs / f"{number}.insp")
         cv2.imwrite(str(stitched / f"{number}.png"), panorama)
     sources = find_sources([card, photographs, stitched])
     found = gather(sources, tmp_path / "work", SfmSettings(), no_progress)
     labels = [panorama.source for panorama in found.panoramas]
-    several = len(walked[::4])
     assert labels.count("photographs") == labels.count("stitched") == several
-    assert labels.count("VID_20260101_000000_00_001") == len(labels) - 2 * several >= 3
+    frames = [it.path for it in found.panoramas if it.source == "VID_20260101_000000_00_001"]
+    chosen = numbers(frames)
+    assert len(chosen) == len(labels) - 2 * several >= 3 and (chosen[0], chosen[-1]) == (0, COUNT - 1)
+    truth = walked[chosen[1]][0]
+    assert np.abs(decode_colors(frames[1]).astype(float) - truth).mean() < 12
     sizes = {(info.width, info.height) for info in (read_info(it.path) for it in found.panoramas)}
     assert sizes == {(walked[0][0].shape[1], walked[0][0].shape[0])}  # that of the widest
     assert sum(note.endswith(APPROXIMATE) for note in found.notes) == 2
