@@ -85,6 +85,28 @@ def test_frames_are_those_of_the_panorama(kind: str, walked: Walked, card: Path,
         assert video.decoded == COUNT and video.notes() == [f"{path}: {APPROXIMATE}"]
 
 
+def test_raw_files_go_with_panoramas_and_with_each_other(walked: Walked, card: Path, tmp_path: Path) -> None:
+    photographs, stitched, several = tmp_path / "photographs", tmp_path / "stitched", 2
+    for folder in (photographs, stitched):
+        folder.mkdir()
+    for number, (panorama, picture) in enumerate(walked[:: COUNT // several]):
+        cv2.imwrite(str(photographs / f"{number}.jpg"), picture)
+        (photographs / f"{number}.jpg").rename(photographs / f"{number}.insp")
+        cv2.imwrite(str(stitched / f"{number}.png"), panorama)
+    sources = find_sources([card, photographs, stitched])
+    found = gather(sources, tmp_path / "work", SfmSettings(), no_progress)
+    labels = [panorama.source for panorama in found.panoramas]
+    assert labels.count("photographs") == labels.count("stitched") == several
+    frames = [it.path for it in found.panoramas if it.source == "VID_20260101_000000_00_001"]
+    chosen = numbers(frames)
+    assert len(chosen) == len(labels) - 2 * several >= 3 and (chosen[0], chosen[-1]) == (0, COUNT - 1)
+    assert number_of(decode_colors(frames[1]), walked) == chosen[1]
+    sizes = {(info.width, info.height) for info in (read_info(it.path) for it in found.panoramas)}
+    assert sizes == {(walked[0][0].shape[1], walked[0][0].shape[0])}  # that of the widest
+    assert sum(note.endswith(APPROXIMATE) for note in found.notes) == 2
+    assert found.left_out == ()
+
+
 def test_the_command_takes_videos(walked: Walked, tmp_path: Path) -> None:
     path, out = raw("a dark rim below", tmp_path, [it for _, it in walked]), tmp_path / "out"
     printed = shown("scene", "stitch", path, "-o", out, "--frames", "3")
@@ -141,25 +163,3 @@ def test_raw_files_become_a_scene_in_one_command(kind: str, walked: Walked, tmp_
     steps = np.diff(along)
     assert (np.sign(steps) == np.sign(steps[0])).all()  # in order along a line, as the camera has walked
     assert json.loads((tmp_path / "scene" / "sfm.json").read_bytes())["left_out"] == []
-
-
-def test_raw_files_go_with_panoramas_and_with_each_other(walked: Walked, card: Path, tmp_path: Path) -> None:
-    photographs, stitched, several = tmp_path / "photographs", tmp_path / "stitched", 2
-    for folder in (photographs, stitched):
-        folder.mkdir()
-    for number, (panorama, picture) in enumerate(walked[:: COUNT // several]):
-        cv2.imwrite(str(photographs / f"{number}.jpg"), picture)
-        (photographs / f"{number}.jpg").rename(photographs / f"{number}.insp")
-        cv2.imwrite(str(stitched / f"{number}.png"), panorama)
-    sources = find_sources([card, photographs, stitched])
-    found = gather(sources, tmp_path / "work", SfmSettings(), no_progress)
-    labels = [panorama.source for panorama in found.panoramas]
-    assert labels.count("photographs") == labels.count("stitched") == several
-    frames = [it.path for it in found.panoramas if it.source == "VID_20260101_000000_00_001"]
-    chosen = numbers(frames)
-    assert len(chosen) == len(labels) - 2 * several >= 3 and (chosen[0], chosen[-1]) == (0, COUNT - 1)
-    assert number_of(decode_colors(frames[1]), walked) == chosen[1]
-    sizes = {(info.width, info.height) for info in (read_info(it.path) for it in found.panoramas)}
-    assert sizes == {(walked[0][0].shape[1], walked[0][0].shape[0])}  # that of the widest
-    assert sum(note.endswith(APPROXIMATE) for note in found.notes) == 2
-    assert found.left_out == ()
