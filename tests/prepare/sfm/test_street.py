@@ -38,6 +38,7 @@ class Made:
     shots: list[Shot]
     featured: Path  # the workspace before matching
     matched: Path  # and before mapping
+    settings: SfmSettings
     report: SfmReport
     scene: Scene
 
@@ -68,7 +69,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Made:
         assert not output.exists()
         report = make_scene(source, output, settings, no_progress)
     assert not workspace_folder(output).exists()
-    return Made(source, shots, featured, matched, report, read_scene(output))
+    return Made(source, shots, featured, matched, settings, report, read_scene(output))
 
 
 def test_poses_are_those_of_the_street_in_metres(street: Made) -> None:
@@ -112,7 +113,7 @@ def test_neither_an_interruption_nor_who_watches_changes_anything(
     shutil.copytree(street.matched, workspace_folder(output), symlinks=True)
     monkeypatch.setattr(sketch, "_PAUSE_S", 0.0)
     monkeypatch.setattr(sketch, "_SHARE", 1e9)
-    again = make_scene(street.source, output, SfmSettings(), no_progress, show=shown.append).found.model
+    again = make_scene(street.source, output, street.settings, no_progress, show=shown.append).found.model
     counts = [len(it.names) for it in shown]
     assert counts[:5] == [3, 4, 5, 6, 7] and set(shown[4].names) == set(NAMES)
     assert all(len(it.points) > 20 and not len(it.fixes) for it in shown)
@@ -120,6 +121,8 @@ def test_neither_an_interruption_nor_who_watches_changes_anything(
     assert np.ptp(shown[-1].centers[:, 2]) < 0.1 * np.ptp(shown[-1].centers)
     first = street.report.found.model
     assert again.rows == first.rows and len(again.points) == len(first.points)
+    assert np.array_equal(again.rotations, first.rotations)
+    assert np.array_equal(again.translations, first.translations)
     for (rows, where), (others, there) in zip(again.sightings, first.sightings, strict=True):
         assert np.array_equal(rows, others) and np.array_equal(where, there)
 

@@ -18,6 +18,7 @@ SIZE = (1024, 512)
 _SIDE, _ROUND = 12.0, 8.0  # metres from the middle to the fronts, and to the way
 _SEEN, _NEAR, _ALIKE = 22.0, 4.5, 1.6  # metres to points, between neighbours, to where a place looks the same
 _NOISE = 0.3  # pixels
+_FRONT, _FLOOR = 130, 450  # points of each front, and of the ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +30,18 @@ class Square:
 
 
 def square(
-    folder: Path, *, count: int = 32, ground: bool = True, order: NDArray[np.int64] | None = None
+    folder: Path,
+    *,
+    count: int = 32,
+    ground: bool = True,
+    order: NDArray[np.int64] | None = None,
+    points_by: int = 1,
 ) -> Square:
-    """Args: ground, whether there are points that do not repeat; order, of the names (count,)."""
+    """Args: ground, whether there are points that do not repeat; order, of the names (count,); points_by, how
+    many times as many points there are.
+    """
     random = np.random.default_rng(1)
-    points, copy_of = _points(random, ground)
+    points, copy_of = _points(random, _FRONT * points_by, _FLOOR * points_by * ground)
     centers, rotations = _way(random, count)
     if order is not None:
         centers, rotations = centers[order], rotations[order]
@@ -66,19 +74,17 @@ def square(
     return Square(centers, work)
 
 
-def _points(random: np.random.Generator, ground: bool) -> tuple[Array, NDArray[np.int64]]:
+def _points(random: np.random.Generator, front: int, ground: int) -> tuple[Array, NDArray[np.int64]]:
     """(P, 3), and (4, P) which point looks like each after so many quarter turns, -1 if none does."""
     one = np.column_stack(
-        [random.uniform(-_SIDE, _SIDE, 260), np.full(260, _SIDE), random.uniform(0, 9, 260)]
+        [random.uniform(-_SIDE, _SIDE, front), np.full(front, _SIDE), random.uniform(0, 9, front)]
     )
     sides = np.concatenate(
         [Rotation.from_euler("z", 90 * turn, degrees=True).apply(one) for turn in range(4)]
     )
     rows = np.arange(len(sides))
     copies = np.stack([(rows + turn * len(one)) % len(sides) for turn in range(4)])
-    if not ground:
-        return sides, copies
-    floor = np.column_stack([random.uniform(-_SIDE, _SIDE, (900, 2)), random.uniform(-0.1, 0.3, 900)])
+    floor = np.column_stack([random.uniform(-_SIDE, _SIDE, (ground, 2)), random.uniform(-0.1, 0.3, ground)])
     alone = np.full((4, len(floor)), -1)
     alone[0] = len(sides) + np.arange(len(floor))
     return np.concatenate([sides, floor]), np.concatenate([copies, alone], axis=1)

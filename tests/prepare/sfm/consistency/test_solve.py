@@ -33,22 +33,18 @@ def _error(place: Square, found: Solution) -> float:
     )
 
 
-def test_neighbours_in_order_outweigh_sides_that_look_the_same_and_give_equal_poses(tmp_path: Path) -> None:
-    place, other = (square(tmp_path / name, count=COUNT, ground=False) for name in "ab")
-    found, again = _solve(place), _solve(other)
+def test_neighbours_in_order_outweigh_sides_that_look_the_same(tmp_path: Path) -> None:
+    place = square(tmp_path, count=COUNT, ground=False)
+    found = _solve(place)
     assert found.skeleton.ordered
     assert _error(place, found) < 0.002 * length(place.centers)
     assert found.trusted
-    for row, (rotation, shift) in found.found.poses.items():
-        assert np.array_equal(rotation, again.found.poses[row][0])
-        assert np.array_equal(shift, again.found.poses[row][1])
 
 
 def test_a_guess_where_the_walk_jumps_is_refuted_and_another_pair_joins_the_parts(tmp_path: Path) -> None:
     """The walk jumps to where the opposite side looks the same, and returns from there."""
-    place = square(
-        tmp_path, count=COUNT, order=np.array([0, 1, 2, 3, 4, 5, 13, 12, 11, 10, 9, 8, 7, 6, 14, 15])
-    )
+    order = np.array([0, 1, 2, 3, 4, 5, 13, 12, 11, 10, 9, 8, 7, 6, 14, 15])
+    place = square(tmp_path, count=COUNT, order=order, points_by=2)
     found = _solve(place)
     assert found.skeleton.ordered and found.trusted
     assert _error(place, found) < 0.1
@@ -78,21 +74,19 @@ def test_a_pose_that_a_single_pair_holds_needs_the_order(tmp_path: Path, ordered
     assert found.found.poses.keys() == {*range(COUNT)} - solver.unconfirmed
 
 
-@pytest.mark.parametrize(("error", "parts"), [(1e8, 2), (9.0, 1), (np.inf, 1)])
-def test_what_has_shrunk_to_a_point_is_another_part(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float, parts: int
-) -> None:
+def test_what_has_shrunk_to_a_point_is_another_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Links that no points hold are known to be weak, but need not be wrong."""
+    weak = [Link((2, 3), (0, 1, 2), 0, np.inf), Link((5, 6), (0, 1, 2, 3, 4, 5), 3, 9.0)]
 
     def links(model: SparseModel, width: int) -> list[Link]:
-        return [Link((9, 10), tuple(range(10, COUNT)), 3, error)] if len(model.rows) == COUNT else []
+        loose = Link((9, 10), tuple(range(10, COUNT)), 3, 1e8)
+        return [weak[0], loose, weak[1]] if len(model.rows) == COUNT else weak
 
-    place = square(tmp_path, count=COUNT)
     monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.links_of", links)
+    place = square(tmp_path, count=COUNT)
     with silence_colmap():
         found = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
-    rows = [[*range(10)], [*range(10, COUNT)]] if parts == 2 else [[*range(COUNT)]]
-    assert [sorted(part.found.poses) for part in found] == rows
+    assert [sorted(part.found.poses) for part in found] == [[*range(10)], [*range(10, COUNT)]]
 
 
 def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
