@@ -25,7 +25,7 @@ from tests.prepare.video.videos import Shot, render, walk, write_video
 
 pytestmark = pytest.mark.system
 
-WIDTH, COUNT = 640, 7
+WIDTH, COUNT = 512, 7
 NAMES = [f"pano {number}.{suffix}" for number, suffix in enumerate(["webp", "WEBP", *["png"] * (COUNT - 2)])]
 HIDDEN = WIDTH // 4  # columns under a mask
 

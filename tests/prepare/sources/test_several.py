@@ -2,13 +2,15 @@
 
 import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from panolog.prepare.panorama_files import LayerFiles, PanoramaFile
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene, workspace_folder
+from panolog.prepare.sfm.reconstruct import Reconstruction
 from panolog.prepare.sources.find import find_sources
 from panolog.prepare.sources.gather import Gathered, gather
 from panolog.scene.errors import InputError
@@ -16,6 +18,7 @@ from panolog.scene.image_files import read_info
 from panolog.scene.read import read_scene
 from panolog.scene.write import StageProgress, no_progress
 from tests.prepare.sfm.accuracy import drift
+from tests.prepare.sfm.reports import in_a_row
 from tests.prepare.sources.street import PHOTOGRAPH, STEP, Street, make_street
 from tests.prepare.world.stills import crop, write_still
 
@@ -59,22 +62,21 @@ def content(found: Gathered) -> dict[str, str]:
     return {it.name: hashlib.sha256(it.path.read_bytes()).hexdigest() for it in found.panoramas}
 
 
-@pytest.mark.parametrize(
-    "stops",
-    [
-        {"frames": lambda done, total: done > 0.8 * total, "sizes": lambda done, total: done == 3},
-        {"frames": lambda done, total: done > 0.3 * total, "metadata": lambda done, total: done == 2},
-    ],
-)
-def test_what_was_stopped_ends_the_same(
-    stops: dict[str, Callable[[int, int], bool]], street: Street, tmp_path: Path
-) -> None:
+def test_what_was_stopped_ends_the_same(street: Street, tmp_path: Path) -> None:
+    stops = [
+        ("frames", 0.3),
+        ("frames", 0.8),
+        ("metadata", 0.4),
+        ("sizes", 0.2),
+    ]  # stages, and shares of them
+    left = stops.copy()
+
     def stop(what: str, done: int, total: int) -> None:
-        if what in left and left[what](done, total):
-            del left[what]
+        if left and what == left[0][0] and done > left[0][1] * total:
+            del left[0]
             raise KeyboardInterrupt
 
-    calm, left = gathered(street, tmp_path / "calm"), dict(stops)
+    calm = gathered(street, tmp_path / "calm")
     for _ in stops:
         with pytest.raises(KeyboardInterrupt):
             gathered(street, tmp_path / "stopped", stop)
@@ -86,14 +88,29 @@ def test_what_was_stopped_ends_the_same(
     assert {it: it.stat().st_mtime_ns for it in before} == before  # nothing is made again
 
 
-@pytest.mark.system
-def test_they_become_one_scene(street: Street, tmp_path: Path) -> None:
+def _in_a_row(panoramas: tuple[PanoramaFile, ...], layers: LayerFiles, *_: Any, **__: Any) -> Any:
+    """All of them, a metre apart."""
+    model = in_a_row(tuple(range(len(panoramas))))
+    size = (PHOTOGRAPH, PHOTOGRAPH // 2)
+    return [Reconstruction(panoramas, layers, size, model, [], [], {}, frozenset(), [], 100, 9)]
+
+
+@pytest.mark.parametrize(
+    "posed", [False, pytest.param(True, marks=[pytest.mark.system, pytest.mark.nightly])]
+)
+def test_they_become_one_scene(
+    posed: bool, street: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Args: posed, whether poses are found, as sfm/test_street.py finds them for other sources."""
+    if not posed:
+        monkeypatch.setattr("panolog.prepare.sfm.pipeline.reconstruct", _in_a_row)
     report = make_scene(street.all, tmp_path / "scene", SfmSettings(), no_progress)
     scene = read_scene(tmp_path / "scene")
     names = [panorama.name for panorama in scene.panoramas]
     assert scene.width == PHOTOGRAPH and len(names) == len(report.found.panoramas) >= 12
-    truth = np.array([[0.0, 0.0, street.along(name)] for name in names])
-    assert drift(scene.centers, truth) < 0.02 * np.ptp(truth)
+    if posed:
+        truth = np.array([[0.0, 0.0, street.along(name)] for name in names])
+        assert drift(scene.centers, truth) < 0.02 * np.ptp(truth)
     assert (scene.panoramas[names.index("stills/8.jpg")].mask is None) is False
     said = json.loads((tmp_path / "scene" / "sfm.json").read_text())["sources"]
     assert [(it["name"], it["path"]) for it in said] == [

@@ -76,7 +76,7 @@ def test_a_pose_that_a_single_pair_holds_needs_the_order(tmp_path: Path, ordered
 
 def test_what_has_shrunk_to_a_point_is_another_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Links that no points hold are known to be weak, but need not be wrong."""
-    weak = [Link((2, 3), (0, 1, 2), 0, np.inf), Link((5, 6), (0, 1, 2, 3, 4, 5), 3, 9.0)]
+    weak = [Link((2, 3), (0, 1, 2), 0, np.inf), Link((1, 2), (0, 1), 3, 9.0)]
 
     def links(model: SparseModel, width: int) -> list[Link]:
         loose = Link((9, 10), tuple(range(10, COUNT)), 3, 1e8)

@@ -21,7 +21,7 @@ from tests.prepare.video.videos import Array, Shot, render, walk
 
 pytestmark = pytest.mark.system
 
-WIDTH, STEP, COUNT = 640, 0.9, 4
+WIDTH, STEP, COUNT = 512, 0.9, 4
 WORLD = Rotation.from_euler("xyz", (0.3, -0.8, 1.9)).as_matrix(), np.array([4.0, -1.0, 2.5])  # of the street
 
 
