@@ -89,8 +89,10 @@ def to_bake(scene: Gaussians, at: Camera, own: int) -> dict[str, Any]:
     return {**scene.tensors(), **vars(at), **settings, "slack": SLACK, "faint": FAINT}
 
 
-def check_baked(machine: Machine, scene: Gaussians, at: Camera, own: Tensor) -> None:
-    """What is before, among and behind some rows of a scene."""
+def check_baked(
+    machine: Machine, scene: Gaussians, at: Camera, own: Tensor, keep: Tensor | None = None
+) -> None:
+    """What is before, among and behind some rows of a scene. Args: keep, `certain` of it."""
     whole = own_first(scene, own)
     given = to_bake(whole, at, len(own))
     *truth, spans, among, splats, rays = ops.bake(**given)
@@ -99,8 +101,10 @@ def check_baked(machine: Machine, scene: Gaussians, at: Camera, own: Tensor) -> 
     assert torch.equal(our_among, among)
     assert (our_splats.shape, our_rays.shape) == (splats.shape, rays.shape)
     active = bake(whole, len(own), at, near=NEAR, unit=1.0).active(at.width, at.height)
-    for first in (0, 3) if active.any() else ():
-        check_images(ours[first : first + 3], truth[first : first + 3], certain(whole, at) & active)
+    if active.any():
+        keep = certain(whole, at) if keep is None else keep
+        for first in (0, 3):
+            check_images(ours[first : first + 3], truth[first : first + 3], keep & active)
 
 
 def check_weights(machine: Machine, scene: Gaussians, at: Camera) -> None:

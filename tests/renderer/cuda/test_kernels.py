@@ -66,13 +66,20 @@ def machine(request: pytest.FixtureRequest) -> Machine:
     return emulated(EmulatedLaunch(seed=seed))
 
 
+@functools.cache
+def hard(name: str, exact: bool, width: int = 64) -> tuple[Gaussians, Camera, torch.Tensor]:
+    """One of `SCENES`, the camera, and `certain` of both, which takes longer than most kernels."""
+    at = camera(width)
+    scene = scenes(at, exact)[name]
+    return scene, at, certain(scene, at)
+
+
 @pytest.mark.parametrize(("name", "exact"), SCENES, ids=NAMES)
 @pytest.mark.parametrize(("width", "degree"), [(64, 0), (202, 3)])
 def test_hard_scenes(name: str, exact: bool, width: int, degree: int, machine: Machine) -> None:
     """At 64 pixels every splat counts as wide, at 202 most do not and the last tile is a part of one."""
-    at = camera(width)
-    scene = scenes(at, exact)[name]
-    check_against_cpu(machine, scene, at, degree, certain(scene, at))
+    scene, at, keep = hard(name, exact, width)
+    check_against_cpu(machine, scene, at, degree, keep)
 
 
 @pytest.mark.parametrize(("name", "exact"), SCENES, ids=NAMES)
@@ -81,10 +88,9 @@ def test_compositing_rounds_as_a_card_may(rounding: str, name: str, exact: bool)
     """With fused multiply-adds, and without denormals: NVRTC may use both."""
     if rounding == "contract" and not has_fused_multiply_add():
         pytest.skip("this processor has no fused multiply-add")
-    at = camera()
-    scene = scenes(at, exact)[name]
+    scene, at, keep = hard(name, exact)
     machine = emulated(EmulatedLaunch(contract=rounding == "contract", flush=rounding == "flush"))
-    check_against_cpu(machine, scene, at, 3, certain(scene, at))
+    check_against_cpu(machine, scene, at, 3, keep)
 
 
 def by_distance(scene: Gaussians, at: Camera) -> torch.Tensor:
@@ -106,10 +112,9 @@ OWN = {  # rows of those that train, of all rows by their distance
 )
 @pytest.mark.parametrize(("name", "exact"), SCENES, ids=NAMES)
 def test_an_exterior(name: str, exact: bool, width: int, own: str, machine: Machine) -> None:
-    at = camera(width)
-    scene = scenes(at, exact)[name]
+    scene, at, keep = hard(name, exact, width)
     block, exterior = surrounded(scene, at, OWN[own](by_distance(scene, at)))
-    check_against_cpu(machine, block, at, 3, certain(scene, at), exterior)
+    check_against_cpu(machine, block, at, 3, keep, exterior)
 
 
 @pytest.mark.parametrize(
@@ -124,9 +129,8 @@ def test_an_exterior(name: str, exact: bool, width: int, own: str, machine: Mach
 @pytest.mark.parametrize(("name", "exact"), SCENES, ids=NAMES)
 def test_what_is_baked(name: str, exact: bool, width: int, own: str, machine: Machine) -> None:
     """At 18 pixels the second of two tiles across has two columns, and both are neighbours on both sides."""
-    at = camera(width)
-    scene = scenes(at, exact)[name]
-    check_baked(machine, scene, at, OWN[own](by_distance(scene, at)))
+    scene, at, keep = hard(name, exact, width)
+    check_baked(machine, scene, at, OWN[own](by_distance(scene, at)), keep)
 
 
 @both
