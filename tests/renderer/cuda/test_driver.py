@@ -59,7 +59,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return os.environ | {"LD_LIBRARY_PATH": ":".join(paths), "XDG_CACHE_HOME": str(folder)}
 
 
-@pytest.mark.parametrize("arch", [ARCH, UNKNOWN])
+@pytest.mark.parametrize("arch", [ARCH, pytest.param(UNKNOWN, marks=pytest.mark.nightly)])
 def test_the_driver_copies_what_each_kernel_takes(
     arch: str, environment: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
