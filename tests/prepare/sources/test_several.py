@@ -63,12 +63,8 @@ def content(found: Gathered) -> dict[str, str]:
 
 
 def test_what_was_stopped_ends_the_same(street: Street, tmp_path: Path) -> None:
-    stops = [
-        ("frames", 0.3),
-        ("frames", 0.8),
-        ("metadata", 0.4),
-        ("sizes", 0.2),
-    ]  # stages, and shares of them
+    # Stages, and shares of them.
+    stops = [("frames", 0.3), ("frames", 0.8), ("metadata", 0.4), ("sizes", 0.2)]
     left = stops.copy()
 
     def stop(what: str, done: int, total: int) -> None:
