@@ -25,6 +25,7 @@ from benchmarks.paper.variants import (
     Measured,
     Settings,
     Variant,
+    deciding,
     differing,
     differs_in_plan_alone,
     flat,
@@ -96,7 +97,7 @@ class Bench:
             result = replace(result, notes=(*result.notes, *self.off(variant, result)))
             results.save(self._file(variant), result)
         root = self.done[result.same_as].root if result.same_as else self._root(variant)
-        self.done[variant.name] = Done(config, result, root)
+        self.done[variant.name] = Done(complete(result.settings), result, root)
         return result
 
     def known(self, variant: Variant) -> bool:
@@ -346,16 +347,17 @@ def _count(blocks: str) -> int:
 
 
 def other_settings(stored: dict[str, Any], config: dict[str, Any]) -> str:
-    """Settings of a stored result that would be others now and change a model; empty if there are none.
-
-    Settings that have come since then count as having had their defaults.
-    """
+    """Settings of a stored result that would be others now and change its model; empty if there are none."""
     if not stored:
         return "settings that are not stored with it"
-    then = flat(RunConfig(recipe="paper")) | stored
-    changed = differing(then, config, ("preview.",))
-    changes = [f"{key} = {then.get(key)}, not {value}" for key, value in changed.items()]
+    then = complete(stored)
+    changes = [f"{key} = {then.get(key)}, not {value}" for key, value in deciding(then, config).items()]
     return ", ".join(changes)
+
+
+def complete(stored: dict[str, Any]) -> dict[str, Any]:
+    """Stored settings, with the defaults of those that have come since then."""
+    return flat(RunConfig(recipe="paper")) | stored
 
 
 def turns(config: RunConfig) -> tuple[tuple[int, ...], tuple[int, ...]]:

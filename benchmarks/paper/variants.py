@@ -28,8 +28,9 @@ _SWITCHES = {  # settings of the panolog recipe that mean something only togethe
     "distance": ("optimizer.unit", "optimizer.least_pixels"),
     "depth": ("depth.unit", "depth.sky", "depth.wT"),
 }
-_FREE = ("recipe", "refine", "blocks", "partition.", "stage2.", "checkpoint.", "preview.")  # not in Stage I
-_NO_SCORES = ("recipe", "refine", "partition.tau_grad", "stage2.", "checkpoint.", "preview.")  # nor in scores
+_SECOND = ("recipe", "refine", "stage2.", "passes.", "checkpoint.", "preview.")  # after scores
+_FREE = (*_SECOND, "blocks", "partition.")  # not in Stage I
+_NO_SCORES = (*_SECOND, "partition.tau_grad")
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,11 @@ def differing(a: Mapping[str, Any], b: Mapping[str, Any], without: Sequence[str]
     return {
         key: value for key, value in b.items() if a.get(key) != value and not key.startswith(tuple(without))
     }
+
+
+def deciding(stored: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
+    """What a model of settings `config` would have otherwise than one of settings `stored`."""
+    return differing(stored, config, ("preview.",) if config["refine"] else _FREE)
 
 
 def same_stage_one(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:

@@ -1,6 +1,7 @@
 """The command: wrong input, results of other settings or code, and the order in which variants run."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,19 @@ def test_a_result_of_other_settings_is_refused(
     given = [str(bench.scene), "-o", str(bench.folder.parent), "--tables", "tau", *SMALL]
     assert command.main(given) == 2
     assert "settings that are not stored" in capsys.readouterr().err
+
+
+def test_a_result_of_stage_one_outlasts_other_settings_of_blocks(
+    bench: Bench, stored: Callable[..., None]
+) -> None:
+    alone, blocks = KNOWN["panolog-stage1"], KNOWN["panolog"]
+    for variant, outlasts in ((alone, True), (blocks, False)):
+        settings = variant.config(SETTINGS, 0, 16) | {"stage2.rate": 0.5, "passes.rate": 0.5}
+        stored(variant.name, settings=settings)
+        with nullcontext() if outlasts else pytest.raises(panolog.InputError, match=r"stage2\.rate = 0\.5"):
+            bench.check([variant])
+    bench.result(alone)
+    assert bench.done[alone.name].config["stage2.rate"] == 0.5  # as a run has it that borrows from this one
 
 
 def test_only_some_variants_may_run_and_all_results_are_reported(
