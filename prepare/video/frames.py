@@ -151,7 +151,7 @@ class _Frames:
         jpeg = _jpeg(source, frame, time, sensors()[0]) if source.layout.is_whole else None
         if jpeg is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
-            write_bytes(self._early(number), jpeg)
+            self._early(number).write_bytes(jpeg)  # `publish` brings it to the disk
         return jpeg is not None
 
     def publish(self, numbers: Iterable[int]) -> None:
