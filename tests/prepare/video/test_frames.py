@@ -57,6 +57,13 @@ def twelfth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_video(tmp_path_factory.mktemp("video") / "walk.mp4", images, fourcc="mp4v")
 
 
+@pytest.fixture
+def large_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Sequence[Shot]], Path]:
+    """Makes a video that counts as a large one; decoding can begin at each twelfth frame."""
+    monkeypatch.setattr(streams, "_LARGE", WIDTH)
+    return lambda shots: write_video(tmp_path / "walk.mp4", [render(shot) for shot in shots], fourcc="mp4v")
+
+
 def test_even_baseline_sharp_frames_and_none_at_rest(tmp_path: Path) -> None:
     shots, images = tour(), tour_images()
     video = write_video(tmp_path / "tour.mp4", images, fourcc="mp4v")
@@ -202,12 +209,11 @@ def test_of_a_large_video_that_moves_slowly_few_frames_are_looked_at(
 
 
 def test_of_a_large_video_frames_between_those_to_seek_are_decoded_where_these_are_far_apart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    large_video: Callable[[Sequence[Shot]], Path], tmp_path: Path
 ) -> None:
     """Decoding can begin at each twelfth frame; the camera is slow, for 24 frames fast, and slow again."""
     shots = walk([0.03] * 36 + [0.3] * 24 + [0.03] * 40)
-    video = write_video(tmp_path / "walk.mp4", [render(shot) for shot in shots], fourcc="mp4v")
-    monkeypatch.setattr(streams, "_LARGE", WIDTH)
+    video = large_video(shots)
     few, every = (search(video, "", no_progress, None, None, fine=fine) for fine in (False, True))
     assert (few.coarse, every.coarse) == (True, False)
     (coarse,), (whole,) = few.pieces, every.pieces
@@ -229,12 +235,11 @@ def test_of_a_large_video_frames_between_those_to_seek_are_decoded_where_these_a
 
 
 def test_of_a_large_video_frames_before_one_to_seek_are_left_out_once_that_is_near_enough(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    large_video: Callable[[Sequence[Shot]], Path], tmp_path: Path
 ) -> None:
     """Decoding can begin at each twelfth frame, and between two of these the camera moves by 9 degrees."""
     shots = walk([0.1] * 40)
-    video = write_video(tmp_path / "walk.mp4", [render(shot) for shot in shots], fourcc="mp4v")
-    monkeypatch.setattr(streams, "_LARGE", WIDTH)
+    video = large_video(shots)
     (piece,) = search(video, "", no_progress, None, None, fine=False).pieces
     assert {0, 12, 24, 36} <= set(piece.frames)
     assert max(number % 12 for number in piece.frames if number < 36) <= 7
@@ -244,14 +249,13 @@ def test_of_a_large_video_frames_before_one_to_seek_are_left_out_once_that_is_ne
 
 
 def test_of_a_large_video_that_stands_blurred_frames_to_seek_are_no_obstacle(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    large_video: Callable[[Sequence[Shot]], Path], tmp_path: Path
 ) -> None:
     shots = walk([0.0] * 26 + [0.1] * 24)
     shots = [
         replace(shot, turn=(0.0, 0.0, 0.0), blur=4.0 * (n in (12, 24, 36))) for n, shot in enumerate(shots)
     ]
-    video = write_video(tmp_path / "walk.mp4", [render(shot) for shot in shots], fourcc="mp4v")
-    monkeypatch.setattr(streams, "_LARGE", WIDTH)
+    video = large_video(shots)
     found = search(video, "", no_progress, None, None, fine=False)
     assert found.coarse and len(found.pieces) == 1
     files = extract_frames(video, tmp_path / "out")
@@ -260,14 +264,12 @@ def test_of_a_large_video_that_stands_blurred_frames_to_seek_are_no_obstacle(
 
 
 def test_a_large_video_that_is_fast_from_its_begin_has_the_true_numbers_of_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    large_video: Callable[[Sequence[Shot]], Path], tmp_path: Path
 ) -> None:
     """Where the file of motion had a number twice it was unsound, and each call followed the video anew."""
-    shots = walk([0.3] * 30)
-    video = write_video(tmp_path / "fast.mp4", [render(shot) for shot in shots], fourcc="mp4v")
-    monkeypatch.setattr(streams, "_LARGE", WIDTH)
+    video = large_video(walk([0.3] * 30))
     files = extract_frames(video, tmp_path / "out")
-    known = load_motion(tmp_path / "out" / "fast.motion.json")
+    known = load_motion(tmp_path / "out" / "walk.motion.json")
     assert known is not None and known.coarse
     (piece,) = known.pieces
     assert piece.frames == [round(time * 30) for time in piece.times]
