@@ -166,7 +166,7 @@ class _Way:
             early.restart()
 
     def due(self, numbers: Iterator[int]) -> Iterator[int]:
-        """Those of `numbers` that are far enough from the last frame."""
+        """The numbers of frames, of `numbers`, that are far enough from the last one."""
         return (number for number in numbers if self._motion.is_due(number, self._apart, self._often))
 
     def follow(self, source: Video, numbers: Iterator[int]) -> Iterator[int]:

@@ -85,7 +85,7 @@ def test_what_was_stopped_ends_the_same(street: Street, tmp_path: Path) -> None:
 
 
 def _in_a_row(panoramas: tuple[PanoramaFile, ...], layers: LayerFiles, *_: Any, **__: Any) -> Any:
-    """All of them, a metre apart."""
+    """A reconstruction of all panoramas, a metre from one to the next, in place of a search for poses."""
     model = in_a_row(tuple(range(len(panoramas))))
     size = (PHOTOGRAPH, PHOTOGRAPH // 2)
     return [Reconstruction(panoramas, layers, size, model, [], [], {}, frozenset(), [], 100, 9)]

@@ -110,7 +110,7 @@ def test_a_blurred_stretch_is_stepped_over() -> None:
 
 
 def test_steps_begin_anew_after_a_gap_and_both_ends_are_there() -> None:
-    """As of a video of which the frames before those from which decoding can begin were left out."""
+    """A large video has such gaps, where frames before one from which decoding can begin are left out."""
     positions = [begin + it for begin in range(0, 90, 9) for it in np.arange(0.0, 4.6, 0.5)]
     rows = list(range(len(positions)))
     chosen = choose_frames([Piece(rows, [0.0] * len(rows), positions, [1.0] * len(rows))], 4.0, None)
