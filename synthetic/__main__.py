@@ -24,6 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         place.add_argument("--width", type=int, default=512, help="of a panorama in pixels (512)")
         number = points or "250 for each panorama"
         place.add_argument("--points", type=int, default=points, help=f"of the sparse cloud ({number})")
+        place.add_argument("--between", action="store_true", help="also panoramas between these, held out")
         place.add_argument("--seed", type=int, default=0, help="of houses, path and cloud (0)")
     given = vars(parser.parse_args(arguments))
     make = {"town": make_town, "flight": make_flight, "city": make_city}[given.pop("place")]

@@ -2,7 +2,7 @@
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from panolog.synthetic.trace import CitySun, PanoramaRays, Scenery, Sun
 
 SAMPLES = 3  # rays per pixel, each way
 DENSITY = 250  # points of a city's sparse cloud for each panorama
+_STEP = 1.5  # of the median step: neighbours that are farther apart have none between them
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,16 @@ class Place:
     name: str  # with which the names of its images begin
     far: float = FAR  # metres from which on no points of the cloud are seen
     smallest: float = 0.0  # share of a pixel; shapes that look smaller are left out of a panorama
+    held_out: int = 0  # how many panoramas, the last ones, are the test split and no part of the cloud
+
+    def with_between(self) -> "Place":
+        """The place with panoramas half-way between neighbours on its path, which are held out."""
+        ways = np.diff(self.centers, axis=0)
+        steps = np.linalg.norm(ways, axis=1)
+        near = np.flatnonzero(steps < _STEP * np.median(steps))
+        rotations = np.concatenate([self.rotations, self.rotations[near]])
+        centers = np.concatenate([self.centers, self.centers[near] + ways[near] / 2])
+        return replace(self, rotations=rotations, centers=centers, held_out=len(near))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +78,16 @@ def make_town(
     width: int = 512,
     points: int = 8000,
     seed: int = 0,
+    between: bool = False,
     progress: Progress = no_progress,
 ) -> Path:
     """Ray-casts a small town, seen on a walk along its street; arguments and errors as `make_place`."""
     _check(panoramas, width)
     shapes = town(seed)
     place = Place(Scenery(shapes), Sun.over(shapes, sun()), *camera_path(panoramas, seed), "street")
-    return make_place(folder, place, width=width, points=points, seed=seed, progress=progress)
+    return make_place(
+        folder, place, width=width, points=points, seed=seed, between=between, progress=progress
+    )
 
 
 def make_flight(
@@ -84,6 +98,7 @@ def make_flight(
     width: int = 512,
     points: int = 30_000,
     seed: int = 0,
+    between: bool = False,
     progress: Progress = no_progress,
 ) -> Path:
     """Ray-casts a district of so many blocks along x and y, seen on a flight over it.
@@ -97,7 +112,9 @@ def make_flight(
     shapes = district(*blocks, seed)
     light = Sun.over(shapes, sun(), reach, 0.25)
     place = Place(Scenery(shapes), light, *flight_path(*blocks, panoramas, seed), "flight")
-    return make_place(folder, place, width=width, points=points, seed=seed, progress=progress)
+    return make_place(
+        folder, place, width=width, points=points, seed=seed, between=between, progress=progress
+    )
 
 
 def make_city(
@@ -108,6 +125,7 @@ def make_city(
     width: int = 512,
     points: int | None = None,
     seed: int = 0,
+    between: bool = False,
     progress: Progress = no_progress,
 ) -> Path:
     """Ray-casts a city, as large as so many panoramas on a drive along all of its streets take.
@@ -128,7 +146,7 @@ def make_city(
     light = CitySun(scenery, sun(), np.array([*streets.middle, 0.0]), streets.reach)
     place = Place(scenery, light, rotations, centers, "city", far=60.0, smallest=0.5)
     count = DENSITY * panoramas if points is None else points
-    return make_place(folder, place, width=width, points=count, seed=seed, progress=progress)
+    return make_place(folder, place, width=width, points=count, seed=seed, between=between, progress=progress)
 
 
 def _check(panoramas: int, width: int) -> None:
@@ -139,7 +157,14 @@ def _check(panoramas: int, width: int) -> None:
 
 
 def make_place(
-    folder: Path, place: Place, *, width: int, points: int, seed: int, progress: Progress = no_progress
+    folder: Path,
+    place: Place,
+    *,
+    width: int,
+    points: int,
+    seed: int,
+    between: bool = False,
+    progress: Progress = no_progress,
 ) -> Path:
     """Ray-casts a place and writes it as a COLMAP scene; returns `folder`.
 
@@ -153,15 +178,18 @@ def make_place(
         width: of the panoramas in pixels, a multiple of 4; they are half as high.
         points: of the sparse cloud; fewer where too few are seen twice.
         seed: of the cloud and the depth maps.
+        between: whether panoramas half-way between neighbours are added and held out (`test.txt`), so that
+            all others train: far more, and farther from what trains, than every 8th.
         progress: called first with 0, then after each panorama, in order: how many are done, and of how many.
             Each counts twice: its picture, and what it sees of the sparse cloud.
 
     Raises ConfigError: too few panoramas, or a width that cannot be; OSError: `folder` cannot be written.
     """
+    place = place.with_between() if between else place
     panoramas = len(place.centers)
     for part in ("images", "depths", "skymasks"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    shoot = _Shoot(folder, place, width, 2 * points // panoramas + 1, seed)
+    shoot = _Shoot(folder, place, width, 2 * points // (panoramas - place.held_out) + 1, seed)
     samples: list[SurfaceSample] = []
     rows: list[NDArray[np.int64]] = []
     progress(0, 2 * panoramas)
@@ -169,12 +197,15 @@ def make_place(
         for done, sample in enumerate(pool.map(partial(_panorama, shoot), range(panoramas)), start=1):
             samples.append(sample)
             progress(done, 2 * panoramas)
-        cloud = concatenate_samples(samples)
+        cloud = concatenate_samples(samples[: panoramas - place.held_out])
         for seen in pool.map(
             partial(visible_rows, place.scenery, cloud.points, far=place.far), place.centers
         ):
             rows.append(seen)
             progress(panoramas + len(rows), 2 * panoramas)
+    if place.held_out:
+        test = [shoot.image(row).removesuffix(".png") for row in range(panoramas - place.held_out, panoramas)]
+        write_bytes(folder / "test.txt", "".join(f"{stem}\n" for stem in test).encode())
     _write_model(shoot, cloud, rows, points)
     return folder
 
@@ -210,8 +241,9 @@ def _depth_map(shoot: _Shoot, index: int, among: NDArray[np.int64] | None) -> ND
 
 
 def _write_model(shoot: _Shoot, cloud: SurfaceSample, rows: list[NDArray[np.int64]], points: int) -> None:
-    """Keeps `points` of the cloud that two panoramas see, adds a small error, and writes sparse/0."""
-    views = np.bincount(np.concatenate(rows), minlength=len(cloud.points))
+    """Keeps `points` of the cloud that two training panoramas see, adds an error, and writes sparse/0."""
+    training = len(rows) - shoot.place.held_out
+    views = np.bincount(np.concatenate(rows[:training]), minlength=len(cloud.points))
     random = np.random.default_rng([shoot.seed, 5])
     kept = np.sort(random.permutation(np.flatnonzero(views >= 2))[:points])
     row_of = np.full(len(cloud.points), -1)

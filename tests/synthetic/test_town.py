@@ -112,6 +112,15 @@ def test_windows_miss_nothing(seed: int) -> None:
         )
 
 
+def test_panoramas_between_others_are_held_out_and_no_part_of_the_cloud(tmp_path: Path) -> None:
+    plain = read_scene(make_town(tmp_path / "plain", panoramas=3, width=64, points=100))
+    scene = read_scene(make_town(tmp_path / "between", panoramas=3, width=64, points=100, between=True))
+    assert (scene.train, scene.test) == ((0, 1, 2), (3, 4))
+    np.testing.assert_array_equal(scene.centers[:3], plain.centers)
+    np.testing.assert_allclose(scene.centers[3:], (plain.centers[1:] + plain.centers[:-1]) / 2, atol=1e-9)
+    np.testing.assert_array_equal(scene.points, plain.points)
+
+
 def test_progress_is_reported_in_order(tmp_path: Path) -> None:
     reported: list[tuple[int, int]] = []
     make_town(tmp_path, panoramas=2, width=32, points=50, progress=lambda *step: reported.append(step))
