@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -28,6 +29,14 @@ _WIDEN = 1.03  # factor of the step, repeated until there are few enough
 Write = Callable[[int, Video, av.VideoFrame, float], bool]
 
 
+class _Frame(NamedTuple):
+    """A frame that may be chosen."""
+
+    number: int
+    position: float  # degrees of parallax since the first of its piece
+    merit: float
+
+
 class Choice:
     """Chooses frames of a piece as they come, about a step from one to the next, and both ends.
 
@@ -37,43 +46,51 @@ class Choice:
 
     def __init__(self, step: float) -> None:
         """Args: step, in degrees of parallax."""
-        self.held: int | None = None  # the best frame so far for the next place
-        self.last: int | None = None  # the best frame so far for the end of the piece
         self._step = step
         self._place = self._end = 0.0  # degrees: the next place, and the farthest frame
-        self._chosen: list[tuple[int, float]] = []  # frames with their positions
-        self._held, self._last = (0.0, 0.0), (0.0, -math.inf)  # merits and positions
+        self._chosen: list[_Frame] = []
+        self._best: _Frame | None = None  # so far for the next place
+        self._last: _Frame | None = None  # the best so far for the end of the piece
+
+    @property
+    def open(self) -> set[int]:
+        """The numbers of frames that may still be chosen."""
+        return {it.number for it in (self._best, self._last) if it is not None}
 
     def add(self, number: int, position: float, sharpness: float) -> int | None:
         """Adds the next frame; returns the one for which there is no better one any more, if any.
 
         Args: position, in degrees of parallax since the first.
         """
-        done = None
-        if self.held is not None and position > self._place + _AROUND * self._step:
-            done, at, self.held = self.held, self._held[1], None
-            self._chosen.append((done, at))
-            self._place = self._step + (self._place if abs(at - self._place) < _NEAR * self._step else at)
+        done, best, last = None, self._best, self._last
+        around = _AROUND * self._step
+        if best is not None and position > self._place + around:
+            near = abs(best.position - self._place) < _NEAR * self._step
+            self._place = self._step + (self._place if near else best.position)
+            self._chosen.append(best)
+            done, best = best.number, None
         away = (position - self._place) / self._step
         merit = sharpness * max(0.0, 1 - abs(away))
-        if away >= -_AROUND and (self.held is None or merit > self._held[0]):
-            self.held, self._held = number, (merit, position)
+        if away >= -_AROUND and (best is None or merit > best.merit):
+            best = _Frame(number, position, merit)
         late = math.log(max(sharpness, 1e-9)) + position / self._step
-        if late >= self._last[0] or position > self._last[1] + _AROUND * self._step:
-            self.last, self._last = number, (late, position)
+        if last is None or late >= last.merit or position > last.position + around:
+            last = _Frame(number, position, late)
+        self._best, self._last = best, last
         self._end = max(self._end, position)
         return done
 
     def finish(self) -> list[int]:
         """The numbers, ascending, of all chosen frames, if the piece ends here; one where it hardly moves."""
-        if self.last is None:
+        last = self._last
+        if last is None:
             return []
         if self._end < _LEAST * self._step:
-            return [self.last]
-        found = [*self._chosen, *([] if self.held is None else [(self.held, self._held[1])])]
-        while len(found) > 1 and self._last[1] - found[-1][1] < _LEAST * self._step:
+            return [last.number]
+        found = [*self._chosen, *([] if self._best is None else [self._best])]
+        while len(found) > 1 and last.position - found[-1].position < _LEAST * self._step:
             found.pop()
-        return sorted({self.last, *(number for number, _ in found)})
+        return sorted({last.number, *(it.number for it in found)})
 
 
 def choose_frames(pieces: Sequence[Piece], parallax: float, most: int | None) -> list[int]:
@@ -134,8 +151,8 @@ class Early:
             if done is not None:
                 self._save(source, done)
         self._seen = len(piece.frames)
-        kept = self._choice.held, self._choice.last
-        self._shots = {number: shot for number, shot in self._shots.items() if number in kept}
+        still = self._choice.open
+        self._shots = {number: shot for number, shot in self._shots.items() if number in still}
 
     def finish(self, source: Video) -> None:
         """Writes the frames at the end of a piece, if the camera moves in it."""
