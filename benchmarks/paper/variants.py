@@ -159,7 +159,8 @@ def groups() -> tuple[Group, ...]:
             note="`stage1-all` trains Stage I alone for as many iterations as Stage I and all blocks"
             " together, `stage1-time` for as long as Stage I, scoring and the longest block take on as many"
             " machines as blocks. That time is simulated: the sum of the stages with the longest block in"
-            " place of all. Stage I and each block were timed alone on the machine, with all of its cores.",
+            " place of all. Stage I and each block ran one after another, on the cores that a row names;"
+            " other work on the machine is not excluded.",
         ),
         Group("g2ps", "G²PS against position alone", ("panolog-position", "panolog", "panolog-tau-0.8")),
         Group("switches", "Each switch of the panolog recipe", ("paper", *switches, "panolog")),
