@@ -236,7 +236,7 @@ class ResetConfig(Group):
 
 
 class OptimizerConfig(Group):
-    """Adam's learning rates per iteration, constant except for positions."""
+    """Adam's learning rates per iteration, constant except for positions and, where set, opacities."""
 
     position: float = Field(default=1.6e-4, ge=0, description="first rate of means, in `unit`; 3DGS, app. A")
     position_final: float = Field(default=1.6e-6, gt=0, description="last rate of means, in `unit`; 3DGS")
@@ -252,11 +252,20 @@ class OptimizerConfig(Group):
         description="least scale of a scene Gaussian along each axis, in pixels of training at its"
         " distance (`unit`): what is thinner is a needle for who comes closer; 0 = none, 3DGS",
     )
+    largest: float = Field(
+        default=0.0,
+        ge=0,
+        description="largest scale of a scene Gaussian along each axis, as a part of its distance (`unit`):"
+        " what is larger lies over the whole sky of a panorama and shifts its colours; 0 = none",
+    )
     sh0: float = Field(default=2.5e-3, ge=0, description="rate of SH of degree 0; 3DGS, app. A")
     shN: float = Field(  # noqa: N815
         default=1.25e-4, ge=0, description="rate of SH of degrees 1 to 3, a twentieth of sh0; 3DGS"
     )
-    opacity: float = Field(default=0.05, ge=0, description="rate of logit opacities; 3DGS")
+    opacity: float = Field(default=0.05, ge=0, description="first rate of logit opacities; 3DGS")
+    opacity_final: float | None = Field(
+        default=None, gt=0, description="last rate of logit opacities; none = as the first one, 3DGS"
+    )
     scale: float = Field(default=5e-3, ge=0, description="rate of log scales; 3DGS")
     rotation: float = Field(default=1e-3, ge=0, description="rate of quaternions; 3DGS")
     short_runs: float = Field(
@@ -375,8 +384,9 @@ class TrainConfig(CaptureConfig):
             raise ValueError(
                 "densify.split_gradient is of affine splats: set it to 0, or projection to affine"
             )
-        if self.optimizer.least_pixels > 0 and self.optimizer.unit != "distance":
-            raise ValueError(
-                "optimizer.least_pixels needs distances: set it to 0, or optimizer.unit to distance"
-            )
+        for name in ("least_pixels", "largest"):
+            if getattr(self.optimizer, name) > 0 and self.optimizer.unit != "distance":
+                raise ValueError(
+                    f"optimizer.{name} needs distances: set it to 0, or optimizer.unit to distance"
+                )
         return self

@@ -1,5 +1,6 @@
 """The state of a model in training: its parameters with their Adam moments, row by row."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -77,16 +78,22 @@ class ModelState:
             if name in rows
         }
 
-    def widen(self, angle: float) -> None:
-        """No axis of a scene Gaussian is less than `angle` radians for the nearest camera, as at its begin.
+    def bound(self, least: float, most: float) -> None:
+        """No axis of a scene Gaussian is smaller or larger, in parts of its first distance from a camera.
 
         What is thinner than a pixel of all training panoramas is not determined by them. Seen from nearer, or
         in a picture with more pixels, it is a needle (cf. the 3D smoothing of Mip-Splatting, Yu et al. 2024).
+        What is larger than its distance lies over the whole sky of a panorama: it shifts the colours of all
+        that is behind, and they change when it is removed.
+
+        Args: least and most; 0 = no bound.
         """
-        if angle > 0:
+        if least > 0 or most > 0:
             scales = self.gaussians.scales[self.gaussians.scene]
-            least = (self.units["means"][self.gaussians.scene] * angle).log_()
-            torch.maximum(scales, least[:, None], out=scales)
+            distance = self.units["means"][self.gaussians.scene, None].log()
+            low = math.log(least) if least > 0 else -math.inf
+            high = math.log(most) if most > 0 else math.inf
+            torch.clamp(scales, distance + low, distance + high, out=scales)
 
     def rearrange(self, source: Tensor, new: Tensor, sky: int) -> None:
         """Row i becomes a copy of row source[i], with zero moments if it is `new`.

@@ -44,7 +44,7 @@ class Plan:
     state: ModelState
     rates: dict[str, float]
     rows: dict[str, int]  # how many of each parameter move; parameters that are not in it do not
-    least: float  # radians, as in `ModelState.widen`
+    sizes: tuple[float, float]  # as in `ModelState.bound`
     statistics: Statistics | None  # where its screen gradients count
     learning: Learning | None  # of how the view was captured, in Stage I
 
@@ -82,7 +82,7 @@ class Direct:
             found = take(problem, moving, plan.iteration, screen=counts)
         except FloatingPointError as error:
             raise self._broken(str(error), plan) from error
-        plan.state.widen(plan.least)
+        plan.state.bound(*plan.sizes)
         seen, loss, learnt = found
         if plan.statistics is not None and learnt.screen is not None:
             visible = seen.state == ops.VISIBLE
@@ -164,7 +164,7 @@ class Pipeline:
         """Launches all of an iteration."""
         moving = plan.state.moving(plan.rates, plan.rows)
         found = iteration.take(self._launch, plan.problem, moving, plan.iteration, self._status, room)
-        plan.state.widen(plan.least)
+        plan.state.bound(*plan.sizes)
         if plan.statistics is not None:
             into = plan.statistics
             iteration.add_statistics(

@@ -151,6 +151,17 @@ class Schedule:
             return 0.0
         return math.exp((1 - share) * math.log(first) + share * math.log(rates.position_final))
 
+    def opacity(self, iteration: int) -> float:
+        """The rate of logit opacities of Stage I: it decays exponentially where it has a last value.
+
+        As that of positions, the last one is larger in a shorter run, but not more than the first.
+        """
+        rates = self.config.optimizer
+        if rates.opacity_final is None or rates.opacity == 0:
+            return rates.opacity
+        last = min(1.0, self.length**2 * rates.opacity_final / rates.opacity)
+        return float(rates.opacity * last ** (iteration / self.iterations))
+
     def cooling(self, iteration: int) -> float:
         """The rate of positions over the first one of Stage I, at most 1."""
         first = self.config.optimizer.position
@@ -170,6 +181,11 @@ class Schedule:
             return 0.0
         return float(depth.w0 * (depth.wT / depth.w0) ** (iteration / self.iterations))
 
+    def sizes(self, width: int) -> tuple[float, float]:
+        """The bounds of scales, as `ModelState.bound` takes them, of panoramas `width` pixels wide."""
+        rates = self.config.optimizer
+        return rates.least_pixels * 2 * math.pi / width, rates.largest
+
     @property
     def length(self) -> float:
         """By what the rates of shapes are multiplied in a run that is shorter than a full one."""
@@ -184,7 +200,7 @@ class Schedule:
             "means": self.length**2 * self.position(iteration) * unit,
             "quats": shapes * rates.rotation,
             "scales": shapes * rates.scale * (self.config.stage2.scale if self.refine else 1.0),
-            "opacities": rates.opacity * rate,
+            "opacities": self.opacity(iteration) * rate,
             "sh0": colors * rates.sh0,
             "shN": colors * rates.shN,
         }

@@ -5,7 +5,6 @@ iteration: a task that resumes from a checkpoint ends with the same bytes as one
 """
 
 import logging
-import math
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
@@ -354,7 +353,7 @@ class Trainer:
             rows=trained_rows(
                 self.state.gaussians, degree, refine=self.schedule.refine, sky_scales=sky_scales
             ),
-            least=self.spec.config.optimizer.least_pixels * 2 * math.pi / self.spec.width,
+            sizes=self.schedule.sizes(self.spec.width),
             statistics=self.statistics if self.schedule.collects(iteration) else None,
             learning=self.learning if self.spec.cell is None else None,
         )

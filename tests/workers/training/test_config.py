@@ -23,9 +23,10 @@ def test_absolute_gradients_are_of_affine_splats() -> None:
         TrainConfig.model_validate({"projection": "exact", "densify": {"split_gradient": 4e-4}})
 
 
-def test_sizes_in_pixels_need_distances() -> None:
-    with pytest.raises(ValidationError, match="least_pixels needs distances: set it to 0, or "):
-        TrainConfig.model_validate({"optimizer": {"least_pixels": 0.3}})
+@pytest.mark.parametrize("name", ["least_pixels", "largest"])
+def test_bounds_of_sizes_need_distances(name: str) -> None:
+    with pytest.raises(ValidationError, match=f"{name} needs distances: set it to 0, or "):
+        TrainConfig.model_validate({"optimizer": {name: 0.3}})
 
 
 def test_every_field_is_described() -> None:

@@ -111,14 +111,22 @@ def test_a_step_may_be_a_part_of_the_distance() -> None:
     assert sorted(state.units["means"].tolist()) == [1, 1, 10, 10, 99, 99]
 
 
-def test_no_axis_is_less_than_an_angle_for_the_nearest_camera() -> None:
+@pytest.mark.parametrize(
+    ("least", "most", "expected"),
+    [
+        (0.01, 0.0, [0.05, 8.0, 0.1, 8.0, 0.5, 8.0]),
+        (0.0, 0.5, [0.05, 2.0, 0.05, 5.0, 0.5, 8.0]),
+        (0.01, 0.5, [0.05, 2.0, 0.1, 5.0, 0.5, 8.0]),
+    ],
+)
+def test_axes_are_bounded_by_the_distance_from_the_nearest_camera(
+    least: float, most: float, expected: list[float]
+) -> None:
     state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=1, moments=0)
     state.units["means"] = torch.tensor([4.0, 10.0, 10.0])
-    state.gaussians.scales[:, 1] = math.log(0.2)
-    state.widen(0.01)
-    assert state.gaussians.scales[:, :2].exp().flatten().tolist() == pytest.approx(
-        [0.05, 0.2, 0.1, 0.2, 0.5, 0.2]
-    )
+    state.gaussians.scales[:, 1] = math.log(8.0)
+    state.bound(least, most)
+    assert state.gaussians.scales[:, :2].exp().flatten().tolist() == pytest.approx(expected)
 
 
 def test_what_is_near_may_be_slow_to_depend_on_the_direction() -> None:

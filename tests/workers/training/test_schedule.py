@@ -141,6 +141,22 @@ def test_noise_cools_from_one_with_the_rate_of_positions(iterations: int) -> Non
     assert schedule(iterations, refine=True, stage2={"position": 0.3}).cooling(0) == pytest.approx(0.3)
 
 
+def test_the_rate_of_opacities_decays_to_its_last_one() -> None:
+    optimizer = {"opacity": 0.04, "opacity_final": 0.01}
+    runs = (
+        schedule(200, optimizer=optimizer),
+        schedule(200, optimizer=optimizer, refine=True, stage2={"rate": 0.5}),
+    )
+    for run, part in zip(runs, (1.0, 0.5), strict=True):
+        assert [run.rates(at)["opacities"] for at in (0, 100, 200)] == pytest.approx(
+            [0.04 * part, 0.02 * part, 0.01 * part]
+        )
+    for iterations, last in ((30_000, 0.01), (15_000, 0.02), (3_000, 0.04)):
+        short = schedule(iterations, optimizer=optimizer | {"short_runs": 0.5})
+        assert short.rates(iterations)["opacities"] == pytest.approx(last)
+    assert {schedule(200).rates(at)["opacities"] for at in (0, 200)} == {0.05}
+
+
 def test_a_short_run_has_larger_rates_where_they_follow_its_length() -> None:
     usual, hasty = (schedule(300, optimizer={"short_runs": p}).rates(100) for p in (0, 0.5))
     ratios = {name: hasty[name] / usual[name] for name in usual}
