@@ -118,13 +118,6 @@ def test_a_program_measures(
     check(json.loads(ended.stdout), tmp_path)
 
 
-def test_what_a_run_shows_changes_no_model(scenes: dict[str, Path]) -> None:
-    words = [str(scenes["scene"]), "--cost", "--iterations", "40", "--width", "32"]
-    command = [sys.executable, "-m", "benchmarks.living", *words]
-    ended = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
-    assert ended.stdout.endswith("the models are equal to the byte\n"), ended.stderr
-
-
 def test_chaos_that_is_stopped_leaves_no_process(tmp_path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "benchmarks.chaos", "--folder", tmp_path], cwd=ROOT
