@@ -5,16 +5,15 @@ from pathlib import Path
 import pytest
 
 from benchmarks.processes import in_fresh_process, peak_memory
-from benchmarks.progress import moments, worst
 from benchmarks.runs import clock, stage_seconds
 from benchmarks.scale.driver import lost
 from benchmarks.scale.merging import SKY, _check, fill, measure
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.records import PreflightSaved, Progressed, Record, Stored
+from panolog.orchestrator.runs.records import Progressed, Stored
 from panolog.orchestrator.runs.thinning import DENSE
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import join_ply, ply_header
-from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.tasks import TaskId
 from tests.benchmarks.histories import ONE, ZERO, written
 
 
@@ -53,21 +52,6 @@ def test_the_start_of_workers_may_count_or_not() -> None:
     assert stage_seconds(records) == {"coarse": 20, "block": 9}
     assert stage_seconds(records, start=False) == {"coarse": 8, "block": 4}
     assert clock(records, start=False) == {3: 8, 6: 12}
-
-
-def test_what_a_run_has_shown_is_compared_with_the_time_that_was_over() -> None:
-    def at(id: int, time: float, record: Record) -> Stored:
-        return Stored(id, time, record)
-
-    estimate = PreflightSaved("preflight.json", {"coarse": 300.0})
-    records = written("100 began, 100 started coarse, 400 model coarse, 400 done")
-    half = [at(7, 200, Progressed(COARSE, 50, 100, 0.5)), at(8, 300, Progressed(COARSE, 99, 100, 0.5))]
-    found = moments([records[0], at(9, 100, estimate), records[1], *half, *records[2:]])
-    assert [(it.seconds, round(it.over, 2)) for it in found[-3:]] == [(100, 0.33), (200, 0.67), (300, 1)]
-    wrong = worst(found)
-    assert wrong is not None and wrong.seconds == 200 and wrong.shown == pytest.approx(0.99)
-    with pytest.raises(InputError, match="has not ended well"):
-        moments(records[:2])
 
 
 def test_the_stages_add_up_to_the_run() -> None:
