@@ -1,18 +1,12 @@
 """What benchmarks compute from what they have measured, and the loads that they make."""
 
-from pathlib import Path
-
 import pytest
 
+from benchmarks.driver import lost
 from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.runs import clock, stage_seconds
-from benchmarks.scale.driver import lost
-from benchmarks.scale.merging import SKY, _check, fill, measure
-from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Progressed, Stored
 from panolog.orchestrator.runs.thinning import DENSE
-from panolog.scene.errors import InputError, RunError
-from panolog.scene.ply import join_ply, ply_header
 from panolog.workers.tasks import TaskId
 from tests.benchmarks.histories import ONE, ZERO, written
 
@@ -26,16 +20,6 @@ def test_lost_repeated_and_late_events_are_counted() -> None:
     kept = [Stored(i, 0.0, Progressed(ZERO, i, 300, 1.0)) for i in (*range(1, DENSE + 1), 200, 300)]
     assert lost({ZERO: 300}, kept) == 0
     assert lost({ZERO: 300}, kept[:-1]) == 1
-
-
-def test_a_wrong_merge_and_a_full_disk_are_noticed(tmp_path: Path) -> None:
-    first, *rest = fill(RunFolder(tmp_path), 3, 500, seed=1)
-    wrong = [(path, range(ply_header(path)[0])) for path in [*rest[:-1], first, rest[-1]]]
-    join_ply(tmp_path / "wrong.ply", wrong, sky=SKY)
-    with pytest.raises(RunError, match="differs"):
-        _check([first, *rest], tmp_path / "wrong.ply")
-    with pytest.raises(InputError, match="free disk"):
-        measure(tmp_path, blocks=1, gaussians=10**13, seed=0)
 
 
 def test_a_fresh_process_shares_no_memory_and_its_error_comes_back() -> None:

@@ -52,17 +52,11 @@ def performance(found: Found, _: Path) -> None:
     assert "street" in Path(found["page"]).read_text()
 
 
-def scale(found: Found, _: Path) -> None:
-    first, resumed = found["driver"]["first"], found["driver"]["resumed"]
+def driver(found: Found, _: Path) -> None:
+    first, resumed = found["first"], found["resumed"]
     assert first["messages"] > 0 and resumed["messages"] > 0
     assert resumed["lost"] == 0
     assert 0 < resumed["full"] < resumed["seconds"]
-    assert [row["gaussians"] for row in found["merge"]] == [1000, 2000]
-    assert all(0 < row["starts"] <= row["gaussians"] for row in found["levels"])
-    for row in found["cities"]["cities"]:
-        assert set(row["stages"]) == {"coarse", "score", "block", "repair", "measure"}
-        assert all(task["memory"] > 2**20 and task["seconds"] > 0 for task in row["stages"].values())
-    assert found["cities"]["cities"][1]["stages"]["coarse"]["count"] == 7  # of at most 12 of 21 panoramas
 
 
 def captures(found: Found, _: Path) -> None:
@@ -94,7 +88,6 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {"scene": noise, "street": street}
 
 
-PARTS = "cities,driver,merge,levels"
 PAPER = (
     "{scene} -o {folder} --tables ablations,tau --width 32 --iterations 16 --set sky.count=20 --device cpu"
 )
@@ -102,7 +95,7 @@ PROGRAMS: list[tuple[Callable[[Found, Path], None], str, str]] = [
     (chaos, "chaos", "--runs 1 --seed 4 --faults driver,eio"),
     (paper, "paper", PAPER),
     (performance, "performance", "--quick -o {folder}/performance.md"),
-    (scale, "scale", f"--quick -o {{folder}} --only {PARTS}"),
+    (driver, "driver", "--quick"),
     (captures, "places.captures", "{folder} --places --scene {street} --kinds photographs --colmap"),
 ]
 

@@ -14,7 +14,7 @@ from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
 from panolog.orchestrator.engine.scheduling.pool import NONE, Ended, Hello, InProcess, Message
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.machines.nodes import Node, Placement
-from panolog.partition.cells import Cell, Grid
+from panolog.partition.cells import Cell
 from panolog.partition.contraction import expand
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.evaluation import EvaluateSpec
@@ -36,14 +36,6 @@ class _Running:
     messages: Iterator[Timed]
     due: float  # when the next message is sent
     message: Message
-
-
-def grid(blocks: int) -> Grid:
-    """A grid of that many blocks, as cubic as possible."""
-    x = max(n for n in range(1, round(blocks ** (1 / 3)) + 1) if blocks % n == 0)
-    rest = blocks // x
-    y = max(n for n in range(1, int(rest**0.5) + 1) if rest % n == 0)
-    return Grid((rest // y, y, x))
 
 
 class SimulatedPool(InProcess):

@@ -1,45 +1,48 @@
-"""The driver with very many blocks and workers, killed in the middle and resumed."""
+"""The driver with very many blocks and workers, killed in the middle and resumed.
+
+    python -m benchmarks.driver [--json]
+
+Driver, database, files and `panolog status` are real; workers are simulated, and their messages come by the
+clock (`simulated_pool`). The driver ends when half of the blocks are done, as after a crash, and another
+resumes the run.
+"""
 
 import os
 import socket
 import subprocess
+import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 
-import numpy as np
-
+from benchmarks import report
 from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.runs import BIN, history
-from benchmarks.scale.simulated_pool import SimulatedPool, grid
+from benchmarks.simulated_pool import SimulatedPool
 from panolog.orchestrator.engine.driver.driver import Driver
 from panolog.orchestrator.engine.driver.job import Job
 from panolog.orchestrator.engine.driver.journal import Journal
-from panolog.orchestrator.engine.estimates.costs import CostModel, predictor
-from panolog.orchestrator.engine.scheduling.placement import Demand, Running, place
 from panolog.orchestrator.engine.stages.scenes import scene_of
 from panolog.orchestrator.runs import folder as run_folder
-from panolog.orchestrator.runs import info as run_info
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.config import PassesConfig, RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.info import SceneRef, read_info
-from panolog.orchestrator.runs.machines.nodes import Gpu, Node, Placement
+from panolog.orchestrator.runs.info import SceneRef, make_info, read_info, write_info
 from panolog.orchestrator.runs.records import ModelSaved, Progressed, RunBegan, Stored, TaskStarted
 from panolog.orchestrator.runs.state import RunState
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.runs.thinning import DENSE
+from panolog.partition.cells import Grid
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import Stage, TaskId
 
 _STATUS = 3  # commands, of which the median counts
-_GPUS = 8  # of a node
-_CARD = 80 * 2**30  # bytes
 _WIDTH = 64  # pixels of the town, which is not trained on
 
 
@@ -51,10 +54,14 @@ class _HaltedError(RuntimeError):
 class Load:
     """What is simulated."""
 
-    blocks: int
+    grid: Grid
     workers: int
     rate: float  # events per second of each worker
     seconds: float  # of a block's training, on average
+
+
+WHOLE = Load(Grid((25, 20, 20)), 2_000, 0.2, 60.0)
+SMALL = Load(Grid((3, 2, 2)), 4, 10.0, 0.5)
 
 
 @dataclass(frozen=True)
@@ -72,14 +79,6 @@ class Phase:
 
 
 @dataclass(frozen=True)
-class Decision:
-    """What to start on GPUs when one of them has become free."""
-
-    seconds: float  # of CPU
-    memory: float  # peak of the process, 1e6 bytes
-
-
-@dataclass(frozen=True)
 class DriverScale:
     """A whole run, by two drivers."""
 
@@ -88,7 +87,32 @@ class DriverScale:
     resumed: Phase
     status: float  # seconds of the command, the run being halted
     database: float  # 1e6 bytes at the end
-    decision: Decision
+
+    def rows(self) -> list[tuple[str, object]]:
+        """What was measured, by what it is."""
+        load, first, resumed = self.load, self.first, self.resumed
+        cpu = first.cpu + resumed.cpu
+        return [
+            ("blocks, workers", f"{load.grid.count:,}, {load.workers:,}"),
+            ("messages a second of each worker, seconds of a block", f"{load.rate:g}, {load.seconds:g}"),
+            ("messages of progress", first.messages + resumed.messages),
+            ("of them lost after the resume", resumed.lost),
+            (
+                "seconds until half of the blocks were done, and of the rest",
+                f"{first.seconds:.1f}, {resumed.seconds:.1f}",
+            ),
+            (
+                "seconds until all workers had a block: at first, after the resume",
+                f"{first.full:.1f}, {resumed.full:.1f}",
+            ),
+            ("CPU of both drivers, s", cpu),
+            ("CPU of a block with its messages, ms", 1e3 * cpu / load.grid.count),
+            ("longest wait of a message, s", max(first.late, resumed.late)),
+            ("longest turn of the driver's loop, CPU s", max(first.turn, resumed.turn)),
+            ("memory of a driver, peak MB", max(first.memory, resumed.memory)),
+            ("run.db, MB", self.database),
+            ("`panolog status --json`, s", self.status),
+        ]
 
 
 class _Watch:
@@ -124,9 +148,7 @@ def measure(folder: Path, load: Load) -> DriverScale:
     command = [str(BIN / "panolog"), "status", str(root), "--json"]
     status = median(_seconds(command) for _ in range(_STATUS))
     resumed = in_fresh_process(_drive, folder, load, halt=False)
-    decision = in_fresh_process(decide, load.blocks - load.workers, load.workers)
-    database = RunFolder(root).database.stat().st_size / 1e6
-    return DriverScale(load, first, resumed, status, database, decision)
+    return DriverScale(load, first, resumed, status, RunFolder(root).database.stat().st_size / 1e6)
 
 
 def _seconds(command: Sequence[str]) -> float:
@@ -139,9 +161,9 @@ def _drive(folder: Path, load: Load, *, halt: bool) -> Phase:
     """One driver, in this process. Raises what it raises, but for the end that it is to have."""
     root = RunFolder(folder / "run")
     if halt:
-        prepare(folder, load)
+        _prepare(folder, root, load)
     pool = SimulatedPool(load.workers, load.rate, load.seconds)
-    watch = _Watch(min(load.workers, load.blocks), load.blocks // 2 if halt else None)
+    watch = _Watch(min(load.workers, load.grid.count), load.grid.count // 2 if halt else None)
     began, cpu = time.perf_counter(), time.process_time()
     info = read_info(root)
     with lock.hold(root.lock), closing(Database(root.database)) as database:
@@ -164,16 +186,13 @@ def _drive(folder: Path, load: Load, *, halt: bool) -> Phase:
     )
 
 
-def prepare(folder: Path, load: Load) -> Job:
-    """A run that has not begun, of a town whose panoramas are never read."""
+def _prepare(folder: Path, root: RunFolder, load: Load) -> None:
+    """Makes a run that has not begun, of a town whose panoramas are never read."""
     scene = read_scene(make_town(folder / "town", panoramas=9, width=_WIDTH, points=300))
-    blocks, passes = str(grid(load.blocks)), PassesConfig()
-    config = RunConfig(width=_WIDTH, device="cpu", blocks=blocks, passes=passes)
-    root = RunFolder(folder / "run")
+    config = RunConfig(width=_WIDTH, device="cpu", blocks=str(load.grid), passes=PassesConfig())
     run_folder.make(root.root)
     reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
-    run_info.write_info(root, run_info.make_info(reference, config))
-    return Job(root, scene, config)
+    write_info(root, make_info(reference, config))
 
 
 def lost(sent: Mapping[TaskId, int], records: Sequence[Stored]) -> int:
@@ -191,21 +210,18 @@ def lost(sent: Mapping[TaskId, int], records: Sequence[Stored]) -> int:
     )
 
 
-def decide(waiting: int, gpus: int) -> Decision:
-    """Places blocks of different length that wait, where one GPU has become free and the others are busy."""
-    random = np.random.default_rng(0)
-    model = CostModel(scale=7.0)
-    cards = tuple(Gpu("card", _CARD) for _ in range(_GPUS))
-    nodes = [Node(str(i), str(i), 64, 2**39, cards) for i in range(-(-gpus // _GPUS))]
-    demands = [
-        Demand(TaskId.block(block), _CARD // 2 + 1, predictor(model, *random.integers(20, 10**6, 2).tolist()))
-        for block in range(waiting)
-    ]
-    busy = [
-        Running(Placement(node.id, 8.0, _CARD, 1.0, gpu, kind="card"), float(random.uniform(1, 3600)))
-        for node in nodes
-        for gpu in range(_GPUS)
-    ]
-    began = time.process_time()
-    place(demands, nodes, busy[1:], cuda=True)
-    return Decision(time.process_time() - began, peak_memory() / 1e6)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The program; returns its exit code."""
+    parser = report.parser("driver", __doc__)
+    options = parser.parse_args(arguments)
+
+    def work() -> report.Report:
+        with TemporaryDirectory(prefix="panolog-driver-") as folder:
+            found = measure(Path(folder), SMALL if options.quick else WHOLE)
+        return report.Report(asdict(found), report.markdown(("what", "measured"), found.rows()))
+
+    return report.run("driver", options, work)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
