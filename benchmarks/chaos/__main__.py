@@ -6,7 +6,7 @@
 A small town with four blocks is reconstructed on a Ray cluster of two nodes on this machine: once
 undisturbed, then repeatedly with one or two faults at random times (`faults.Kind`). Drivers run under
 `panolog run --supervise`, nodes that end are started again, as by a service manager. Every run must end
-with the bytes of the undisturbed one, and each fault may cost as much as `faults.LIMITS` says.
+with the bytes of the undisturbed one, within twice its time and what `faults.LIMITS` allows for each fault.
 """
 
 import argparse
@@ -19,79 +19,66 @@ from pathlib import Path
 
 from benchmarks import report
 from benchmarks.chaos.cluster import two_nodes
-from benchmarks.chaos.fault_costs import FaultCost, longest_unsaved
 from benchmarks.chaos.faults import Kind, plans
 from benchmarks.chaos.runs import ChaosRuns, Run
-from benchmarks.runs import history
 from panolog.scene.errors import RunError
 
-HEAD = (
-    *("run", "fault at s", "tasks ended", "redone s", "recovery s", "lost s"),
-    *("allowed s", "run took s longer", "bytes"),
-)
+HEAD = ("run", "faults at s", "run took s", "allowed s", "bytes")
 _FAULTS = f"all, kill, {', '.join(Kind)}"
 KILLS = (Kind.DRIVER, Kind.WORKER, Kind.RAYLET)
-_HOST = (Kind.NET, Kind.VERSION)  # need a host of its own for the second node
+SLOWER = 2.0  # times the undisturbed run: half of the cluster may be in quarantine, and the machine is shared
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """All runs, and what each fault may cost."""
+    """All runs, and how long each of them may take."""
 
     runs: tuple[Run, ...]  # the undisturbed one first
-    interval: float  # seconds between two checkpoints of the undisturbed run, at most
-    cable: bool = True  # whether the second node had a host of its own
 
     @property
     def undisturbed(self) -> Run:
         """The undisturbed run."""
         return self.runs[0]
 
-    def allowed(self, cost: FaultCost) -> float:
-        """Seconds that those faults may cost."""
-        return len(cost.faults) * self.interval + cost.allowed
+    def allowed(self, run: Run) -> float:
+        """Seconds that a run may take."""
+        return SLOWER * self.undisturbed.seconds + sum(fault.allowed for fault in run.faults)
 
     def failures(self) -> list[str]:
-        """One line for each run with other bytes and each cost above the limit."""
+        """One line for each run with other bytes, and for each that took too long."""
         lines = []
         for run in self.runs[1:]:
             if run.digest != self.undisturbed.digest:
                 lines.append(f"run {run.number}: {run.end or 'other bytes'}")
-            for cost in run.costs:
-                if cost.seconds > self.allowed(cost):
-                    lines.append(f"run {run.number}: lost {cost.seconds:.1f} s of {self.allowed(cost):.1f} s")
+            if run.seconds > self.allowed(run):
+                lines.append(f"run {run.number}: took {run.seconds:.1f} s of {self.allowed(run):.1f} s")
         return lines
 
     def rows(self) -> Iterator[tuple[object, ...]]:
-        """One for each disturbance, in the order of HEAD."""
+        """One for each disturbed run, in the order of HEAD."""
         for run in self.runs[1:]:
             same = "failed" if run.end else "same" if run.digest == self.undisturbed.digest else "OTHER"
-            for cost in run.costs:
-                what = ", ".join(f"{fault.what} {fault.time - run.began:.1f}" for fault in cost.faults)
-                longer = run.seconds - self.undisturbed.seconds
-                tasks = ", ".join(map(str, cost.tasks))
-                costs = (cost.redone, cost.recovery, cost.seconds, self.allowed(cost), longer)
-                yield (run.number, what, tasks, *costs, same)
+            what = ", ".join(f"{fault.what} {fault.time - run.began:.1f}" for fault in run.faults)
+            yield run.number, what, run.seconds, self.allowed(run), same
 
 
 def chaos(root: Path, runs: int, seed: int, kinds: Sequence[Kind]) -> Outcome:
     """All runs, in the folder `root`. Raises RunError if the cluster or the undisturbed run fails."""
     root.mkdir(parents=True, exist_ok=True)
-    with two_nodes(root) as cluster:
+    with two_nodes() as cluster:
         town = ChaosRuns(cluster, root)
         done = [town.run(0, [])]
         if not done[0].digest:
             raise RunError(f"the undisturbed run failed: {done[0].end}")
-        kinds = [kind for kind in kinds if kind not in _HOST or cluster.cable]
         for number, plan in enumerate(plans(runs, seed, done[0].seconds, kinds), 1):
             done.append(town.disturbed(number, plan))
             print(_line(done[-1], runs), file=sys.stderr, flush=True)
-        return Outcome(tuple(done), longest_unsaved(history(town.folder(0))), cluster.cable is not None)
+        return Outcome(tuple(done))
 
 
 def _line(run: Run, runs: int) -> str:
     """The progress of the benchmark."""
-    causes = ", ".join(fault.what for cost in run.costs for fault in cost.faults)
+    causes = ", ".join(fault.what for fault in run.faults)
     return f"run {run.number} of {runs}: {causes}: {run.end or f'{run.seconds:.0f} s'}"
 
 
@@ -120,12 +107,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with tempfile.TemporaryDirectory(prefix="chaos-runs-") as folder:
             outcome = chaos(options.folder or Path(folder), options.runs, options.seed, options.faults)
         failures = outcome.failures()
-        seconds = outcome.undisturbed.seconds
-        first = f"undisturbed {seconds:.1f} s, checkpoint interval {outcome.interval:.1f} s"
-        if not outcome.cable and (skipped := [kind for kind in _HOST if kind in options.faults]):
-            first += f"\n\nskipped {', '.join(skipped)}: without root and /dev/net/tun"
         parts = [
-            first,
+            f"undisturbed {outcome.undisturbed.seconds:.1f} s",
             report.markdown(HEAD, list(outcome.rows())),
             "\n".join(failures) or "all runs passed",
         ]

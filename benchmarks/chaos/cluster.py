@@ -3,22 +3,20 @@
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import psutil
 
-import panolog.workers
-from benchmarks.chaos import cards
-from benchmarks.chaos.cable import Cable, laid
 from benchmarks.chaos.shim import Control, build
 from panolog.scene.errors import RunError
 from tests.ray_head import BIN, all_end, cluster_environment, free_ports
 
 HEAD, SECOND, DRIVER = GROUPS = "head", "second", "driver"  # of processes that have faults in common
 _NODES = HEAD, SECOND
+_HOST = "127.0.0.1"
 _TMP = "/tmp"  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _NO_WORK = ("ray::IDLE", "ray::Agent", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
 _TIMEOUT_S = 600.0  # for a node to start, also on a busy machine
@@ -27,14 +25,10 @@ _POLL_S = 0.05  # between two checks of a process table or a port
 
 
 @contextmanager
-def two_nodes(hidden: Path) -> Iterator["LocalCluster"]:
-    """The cluster for as long as the context lasts. Raises RunError if it does not start.
-
-    Args: hidden, a folder that the second node does not see, if namespaces can be made.
-    """
-    temporary = TemporaryDirectory(prefix="chaos-", dir=_TMP, ignore_cleanup_errors=True)
-    with laid(hidden) as cable, temporary as folder:
-        cluster = LocalCluster(Path(folder), cable)
+def two_nodes() -> Iterator["LocalCluster"]:
+    """The cluster for as long as the context lasts. Raises RunError if it does not start."""
+    with TemporaryDirectory(prefix="chaos-", dir=_TMP, ignore_cleanup_errors=True) as folder:
+        cluster = LocalCluster(Path(folder))
         with all_end():  # the children of a killed node or driver too
             cluster.keep()
             cluster.wait()
@@ -44,13 +38,9 @@ def two_nodes(hidden: Path) -> Iterator["LocalCluster"]:
 class LocalCluster:
     """A head and a second node of one core each, whose processes take faults, as do drivers."""
 
-    def __init__(self, folder: Path, cable: Cable | None) -> None:
-        """The second node is at the end of the cable if there is one.
-
-        Raises RunError if the library of `shim` cannot be built.
-        """
+    def __init__(self, folder: Path) -> None:
+        """Raises RunError if the library of `shim` cannot be built."""
         self._folder = folder
-        self.cable = cable
         (self._port,) = free_ports(1)
         self._environment = cluster_environment() | _AS_NICE
         self._library = build(folder)
@@ -60,16 +50,7 @@ class LocalCluster:
     @property
     def address(self) -> str:
         """Of the cluster, for `--address`."""
-        return f"{self._host}:{self._port}"
-
-    @property
-    def _host(self) -> str:
-        return self.cable.near if self.cable else "127.0.0.1"
-
-    @property
-    def copies(self) -> Path | None:
-        """Where the second node has its copies of files that it does not see; None if it sees all."""
-        return self._folder / "panolog" if self.cable else None
+        return f"{_HOST}:{self._port}"
 
     def environment(self, group: str) -> dict[str, str]:
         """Of a node or of DRIVER."""
@@ -84,7 +65,7 @@ class LocalCluster:
     def wait(self) -> None:
         """Until all nodes have joined. Raises RunError if one does not."""
         end = time.monotonic() + _TIMEOUT_S
-        while not (_answers(self._host, self._port) and all(map(self.raylet, _NODES))):
+        while not (_answers(_HOST, self._port) and all(map(self.raylet, _NODES))):
             if time.monotonic() > end:
                 raise RunError(f"the Ray cluster did not start; see {self._folder}")
             time.sleep(_POLL_S)
@@ -97,27 +78,6 @@ class LocalCluster:
     def gcs(self) -> psutil.Process | None:
         """The head's record of the cluster; without it, the head ends."""
         return self._process(HEAD, "gcs_server")
-
-    def other_sources(self) -> Callable[[], None]:
-        """Restarts the second node with other sources, which only its host sees. Returns what ends it."""
-        assert self.cable is not None
-        enter, path = self.cable.enter, Path(panolog.workers.__file__).resolve()
-        other = self._folder / "other.py"
-        other.write_text(f"{path.read_text()}# another version\n")
-        subprocess.run([*enter, "mount", "--bind", other, path], check=True)
-        self._restart()
-
-        def undo() -> None:
-            subprocess.run([*enter, "umount", path], check=True)
-            self._restart()
-
-        return undo
-
-    def _restart(self) -> None:
-        """Ends the second node at once; `keep` starts it again."""
-        if raylet := self.raylet():
-            raylet.kill()
-            self._nodes[SECOND].wait()
 
     def busy_worker(self, choice: float) -> psutil.Process | None:
         """A worker with a task or an actor, on any node. Args: choice in [0, 1), which of several."""
@@ -132,16 +92,12 @@ class LocalCluster:
         return None
 
     def _start(self, name: str) -> None:
-        host = self._host
-        options = ["--head", f"--port={self._port}", f"--temp-dir={self._folder}"]
-        options += ["--include-dashboard=false", f"--num-gpus={len(cards.CARDS)}"]
-        enter: Sequence[str] = ()
-        if name != HEAD:
-            options = [f"--address={self.address}"]
-        if name == SECOND and self.cable:
-            host, enter = self.cable.far, self.cable.enter
+        options = [f"--address={self.address}"]
+        if name == HEAD:
+            options = ["--head", f"--port={self._port}", f"--temp-dir={self._folder}"]
+            options += ["--include-dashboard=false"]
         agent, metrics = free_ports(2)
-        command = [*enter, str(BIN / "ray"), "start", "--block", f"--node-ip-address={host}"]
+        command = [str(BIN / "ray"), "start", "--block", f"--node-ip-address={_HOST}"]
         command += ["--num-cpus=1", "--object-store-memory=100000000"]
         command += ["--min-worker-port=0", "--max-worker-port=0"]
         command += [f"--dashboard-agent-listen-port={agent}", f"--metrics-export-port={metrics}", *options]

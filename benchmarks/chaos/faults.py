@@ -1,7 +1,6 @@
 """The faults that the benchmark knows: what each does to a run, for how long, and what it may cost."""
 
 import errno
-import json
 import signal
 import subprocess
 import sys
@@ -14,13 +13,9 @@ from random import Random
 import psutil
 from typing_extensions import assert_never
 
-from benchmarks.chaos import cards
-from benchmarks.chaos.cable import Cable
 from benchmarks.chaos.cluster import GROUPS, HEAD, SECOND, LocalCluster
 from benchmarks.chaos.shim import READ, WRITE, Rule
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.state import replay
-from panolog.orchestrator.runs.store import read_milestones
 from panolog.workers.tasks import StrEnum
 
 SILENCE_S = 30.0  # deadlines.message; a worker reports every second
@@ -29,7 +24,6 @@ RETRY_S = 1.0  # disk.retry
 QUARANTINE = 3  # quarantine.failures
 DAY_S = 86_400  # by which a clock jumps
 _DELAY_S = 0.05  # of each slow call: a commit to run.db makes twenty
-_LOSS, _LATENCY_S = 0.1, 0.1  # of the packets of a bad network
 _START_S = 10.0  # in which a failure is noticed and a task has started again
 _SUPERVISOR_S = 2.0  # before it resumes
 _HEAD_S = 25.0  # in which a lost head is noticed and started again
@@ -59,21 +53,17 @@ class Kind(StrEnum):
     SLOW = "slow"  # each read and write of scene and run takes longer
     LOCKED = "locked"  # another process locks run.db
     GCS = "gcs"  # SIGKILL for the head's record of the cluster, and a new head
-    NET = "net"  # the second node's network loses and delays packets
     CLOCK = "clock"  # the wall clock of driver and workers jumps
     TERMINAL = "terminal"  # SIGKILL for what reads the output of supervisor and driver
     DAMAGE = "damage"  # the checkpoint of a busy worker is overwritten in part, and the worker killed
     VANISH = "vanish"  # the run folder is elsewhere for a while, as where a disk is unmounted
     MIRROR = "mirror"  # SIGKILL for what copies the run into its store
     STORE = "store"  # each read and write of the store takes longer
-    CARD = "card"  # every task on one of the head's two (simulated) GPUs fails at once until the run ends
-    EDIT = "edit"  # run.json gets another value, and SIGKILL for the driver; the file is restored by hand
-    VERSION = "version"  # the second node restarts with other sources until the run ends
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How long a fault takes, and what it may cost besides that and one checkpoint interval."""
+    """How long a fault takes, and what it may cost besides that."""
 
     costs: float  # seconds
     lasts: tuple[float, ...] = (0.0,)  # seconds, one of these; 0 = nothing ends it before the run
@@ -91,16 +81,12 @@ LIMITS = {
     Kind.SLOW: Limits(_START_S, (4.0, 8.0)),
     Kind.LOCKED: Limits(RETRY_S + _START_S, (3.0, 8.0)),
     Kind.GCS: Limits(_HEAD_S + _SUPERVISOR_S + _START_S),
-    Kind.NET: Limits(_START_S, (5.0, 10.0)),
     Kind.CLOCK: Limits(_START_S),
     Kind.TERMINAL: Limits(_START_S),
     Kind.DAMAGE: Limits(_START_S + _ANEW_S),
     Kind.VANISH: Limits(RETRY_S + _START_S, (3.0, 6.0)),
     Kind.MIRROR: Limits(_START_S),
     Kind.STORE: Limits(_START_S, (4.0, 8.0)),
-    Kind.CARD: Limits(QUARANTINE * _START_S),
-    Kind.EDIT: Limits(_SUPERVISOR_S + 2 * _START_S),
-    Kind.VERSION: Limits((1 + QUARANTINE) * _START_S),
 }
 
 
@@ -165,8 +151,13 @@ def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
     match planned.kind:
         case Kind.DRIVER | Kind.MIRROR | Kind.WORKER | Kind.RAYLET | Kind.HANG | Kind.PAUSE | Kind.GCS:
             return _signal(planned, victim)
-        case Kind.BADNODE | Kind.EIO | Kind.CARD:
-            return _unreadable(planned, victim)
+        case Kind.BADNODE:
+            return "bad node", _fail(cluster, (SECOND,), Rule(victim.scene, READ, errno.EIO))
+        case Kind.EIO:
+            error = errno.EIO if choice < 1 / 2 else errno.ESTALE
+            group = SECOND if int(choice * 4) % 2 else HEAD
+            once = Rule(victim.scene, READ, error, times=1)
+            return f"{errno.errorcode[error]} {group}", _fail(cluster, (group,), once)
         case Kind.ENOSPC:
             if not RunFolder(victim.root).presence.exists():
                 return None  # on a full disk no run has to begin
@@ -177,15 +168,16 @@ def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
             return f"{planned.kind} {lasts:g} s", _fail(cluster, GROUPS, *rules)
         case Kind.LOCKED:
             return _lock(f"lock {lasts:g} s", RunFolder(victim.root).database)
-        case Kind.NET:
-            return _disturb(f"lose packets {lasts:g} s", cluster.cable)
         case Kind.CLOCK:
             jump = DAY_S if choice < 1 / 2 else -DAY_S
             return f"clock {jump:+d} s", _move_clocks(cluster, jump)
-        case Kind.VERSION:
-            return "other version", cluster.other_sources()
-        case Kind.TERMINAL | Kind.DAMAGE | Kind.VANISH | Kind.EDIT:
-            return _of_run(planned, victim)
+        case Kind.TERMINAL:
+            victim.terminal.kill()
+            return "dead terminal", nothing
+        case Kind.DAMAGE:
+            return _damage(planned, victim)
+        case Kind.VANISH:
+            return _move_away(f"no folder {lasts:g} s", victim.root)
         case _:
             assert_never(planned.kind)
 
@@ -216,34 +208,8 @@ def _signal(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
     return f"{what} {planned.lasts:g} s" if planned.lasts else what, undo
 
 
-def _unreadable(planned: Planned, victim: Victim) -> tuple[str, Undo]:
-    """Panoramas, or the file of a GPU, cannot be read on a node: once or for good."""
-    cluster, choice = victim.cluster, planned.choice
-    group = SECOND if planned.kind == Kind.BADNODE or int(choice * 4) % 2 else HEAD
-    folder = cluster.copies if group == SECOND and cluster.copies else victim.scene
-    if planned.kind == Kind.BADNODE:
-        return "bad node", _fail(cluster, (SECOND,), Rule(folder, READ, errno.EIO))
-    if planned.kind == Kind.CARD:
-        card = victim.root.with_name(cards.CARDS[int(choice * 2)])
-        return f"broken {card.name}", _fail(cluster, (HEAD,), Rule(card, READ, errno.EIO))
-    error = errno.EIO if choice < 1 / 2 else errno.ESTALE
-    return f"{errno.errorcode[error]} {group}", _fail(cluster, (group,), Rule(folder, READ, error, 1))
-
-
 def nothing() -> None:
     """What ends a fault that stays, or has ended."""
-
-
-def _of_run(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
-    """What happens to the files and the output of a run, on no machine."""
-    if planned.kind == Kind.TERMINAL:
-        victim.terminal.kill()
-        return "dead terminal", nothing
-    if planned.kind == Kind.DAMAGE:
-        return _damage(planned, victim)
-    if planned.kind == Kind.EDIT:
-        return _edit(victim)
-    return _move_away(f"no folder {planned.lasts:g} s", victim.root)
 
 
 def _damage(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
@@ -261,21 +227,6 @@ def _damage(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
     with suppress(psutil.NoSuchProcess):
         worker.kill()
     return "damage checkpoints, kill worker", nothing
-
-
-def _edit(victim: Victim) -> tuple[str, Undo] | None:
-    """Changes run.json once its settings are recorded, and kills the driver; its end restores the file."""
-    folder = RunFolder(victim.root)
-    if victim.driver is None or not folder.preflight.exists():
-        return None
-    if not replay(read_milestones(folder.database)).prepared:
-        return None
-    text = folder.info.read_text()
-    info = json.loads(text)
-    info["config"]["iterations"] += 100
-    victim.driver.kill()
-    folder.info.write_text(json.dumps(info))
-    return "edit run.json, kill driver", lambda: folder.info.write_text(text)
 
 
 def _move_away(what: str, root: Path) -> tuple[str, Undo] | None:
@@ -312,13 +263,6 @@ def _lock(what: str, database: Path) -> tuple[str, Undo] | None:
     assert locker.stdout is not None
     locker.stdout.readline()
     return what, locker.communicate
-
-
-def _disturb(what: str, cable: Cable | None) -> tuple[str, Undo] | None:
-    if cable is None:
-        return None
-    cable.disturb(_LOSS, _LATENCY_S)
-    return what, lambda: cable.disturb(0.0, 0.0)
 
 
 def _move_clocks(cluster: LocalCluster, seconds: int) -> Undo:

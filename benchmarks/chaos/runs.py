@@ -12,24 +12,46 @@ from shutil import rmtree
 
 import psutil
 
-from benchmarks.chaos import cards, faults
+from benchmarks.chaos import faults
 from benchmarks.chaos.cluster import DRIVER, LocalCluster
-from benchmarks.chaos.fault_costs import Fault, FaultCost, fault_costs, true_times
-from benchmarks.chaos.faults import HELLO_S, QUARANTINE, RETRY_S, SILENCE_S, Kind, Planned, Undo, Victim
-from benchmarks.runs import history
+from benchmarks.chaos.faults import (
+    HELLO_S,
+    LIMITS,
+    QUARANTINE,
+    RETRY_S,
+    SILENCE_S,
+    Kind,
+    Planned,
+    Undo,
+    Victim,
+)
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.synthetic.make import make_town
 
 SETTINGS = (
-    *("--blocks", "2x2x1", "--iterations", "200", "--width", "128"),
+    *("--device", "cpu", "--blocks", "2x2x1", "--iterations", "200", "--width", "128"),
     *("--set", "sky.count=500", "--set", "preview.every=100"),
     *("--set", "checkpoint.every=50", "--set", "checkpoint.share=1"),
     *("--set", f"deadlines.message={SILENCE_S}", "--set", f"deadlines.hello={HELLO_S}"),
     *("--set", f"quarantine.failures={QUARANTINE}", "--set", f"disk.retry={RETRY_S}"),
 )
 _TIMEOUT_S = 3600.0  # for a run, also on a busy machine
-_REFUSED = "exit code 2:"  # as `resume` does where run.json is not as it was
 _POLL_S = 0.1  # between two looks at the run
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One that was caused."""
+
+    time: float  # seconds since the epoch
+    kind: Kind
+    what: str
+    until: float = 0.0  # when it was ended; 0 = nothing did before the run's end
+
+    @property
+    def allowed(self) -> float:
+        """Seconds that it may cost."""
+        return LIMITS[self.kind].costs + max(0.0, self.until - self.time)
 
 
 @dataclass(frozen=True)
@@ -39,7 +61,7 @@ class Run:
     number: int  # 0 is the undisturbed one
     began: float  # seconds since the epoch
     seconds: float
-    costs: tuple[FaultCost, ...]
+    faults: tuple[Fault, ...]
     digest: str  # of the PLY; empty if the run failed
     end: str  # error of the run; empty if it did not fail
 
@@ -70,15 +92,6 @@ class _Causing:
                 self.undoes[number]()
                 self.undoes[number] = faults.nothing
 
-    def restored(self) -> bool:
-        """Does by hand what a fault leaves to do, once; whether there was one."""
-        edits = [i for i, fault in enumerate(self.caused) if fault.kind == Kind.EDIT and not fault.until]
-        for number in edits:
-            self.undoes[number]()
-            self.undoes[number] = faults.nothing
-            self.caused[number] = replace(self.caused[number], until=time.time())
-        return bool(edits)
-
     def end(self) -> None:
         """Ends all faults."""
         for undo in self.undoes:
@@ -91,7 +104,6 @@ class ChaosRuns:
     def __init__(self, cluster: LocalCluster, root: Path) -> None:
         self._cluster = cluster
         self._root = root
-        cards.make(root)
         self._scene = make_town(root / "town", panoramas=12, width=128, points=1000)
 
     def run(self, number: int, plan: Sequence[Planned]) -> Run:
@@ -100,25 +112,17 @@ class ChaosRuns:
         self._cluster.wait()
         began = time.time()
         causing = _Causing(list(plan), began)
-        simulated = any(planned.kind == Kind.CARD for planned in plan)
-        program = ("benchmarks.chaos.cards", str(self._root)) if simulated else ("panolog.orchestrator.cli",)
-        device = "cuda" if simulated else "cpu"
-        arguments = ["run", str(self._scene), *SETTINGS, "--device", device, "-o"]
         try:
-            while (end := self._attend([*program, *arguments], causing, folder)).startswith(_REFUSED):
-                if not causing.restored():
-                    break
-                arguments = ["resume"]
+            end = self._attend(causing, folder)
         finally:
             causing.end()
-        ended, paths = time.time(), RunFolder(folder)
-        digest = "" if end else hashlib.sha256(paths.point_cloud.read_bytes()).hexdigest()
-        records = true_times(history(folder), began) if paths.database.exists() else []
-        return Run(number, began, ended - began, tuple(fault_costs(records, causing.caused)), digest, end)
+        seconds = time.time() - began
+        digest = "" if end else hashlib.sha256(RunFolder(folder).point_cloud.read_bytes()).hexdigest()
+        return Run(number, began, seconds, tuple(causing.caused), digest, end)
 
     def disturbed(self, number: int, plan: Sequence[Planned]) -> Run:
         """A run with at least one fault: one that ended before the first is repeated with earlier ones."""
-        while not (run := self.run(number, plan)).costs and not run.end:
+        while not (run := self.run(number, plan)).faults and not run.end:
             for folder in (self.folder(number), self._store(self.folder(number))):
                 rmtree(folder)
             plan = [replace(planned, after=planned.after / 2) for planned in plan]
@@ -131,29 +135,27 @@ class ChaosRuns:
     def _store(self, folder: Path) -> Path:
         return self._root / "store" / folder.name
 
-    def _launch(
-        self, command: Sequence[str], folder: Path
-    ) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+    def _launch(self, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         """The supervisor of a run, and what writes its output to a log."""
-        given = [*command, f"file://{self._store(folder)}", "--local", str(folder)]
-        given += ["--supervise", "--address", self._cluster.address]
-        environment = self._cluster.environment(DRIVER)
+        command = [sys.executable, "-m", "panolog.orchestrator.cli", "run", str(self._scene), *SETTINGS]
+        command += ["-o", f"file://{self._store(folder)}", "--local", str(folder)]
+        command += ["--supervise", "--address", self._cluster.address]
         with (self._root / f"{folder.name}.log").open("ab") as log:
             terminal = subprocess.Popen("cat", stdin=subprocess.PIPE, stdout=log)
         assert terminal.stdin is not None
         with terminal.stdin as output:
             supervisor = subprocess.Popen(
-                [sys.executable, "-m", *given],
-                env={**environment, "PATH": f"{self._root}:{environment['PATH']}"},
+                command,
+                env=self._cluster.environment(DRIVER),
                 stdout=output,
                 stderr=output,
                 stdin=subprocess.DEVNULL,
             )
         return supervisor, terminal
 
-    def _attend(self, command: Sequence[str], causing: _Causing, folder: Path) -> str:
-        """Runs a command to its end. Returns its error, empty if it ended well."""
-        supervisor, terminal = self._launch(command, folder)
+    def _attend(self, causing: _Causing, folder: Path) -> str:
+        """A run to its end. Returns its error, empty if it ended well."""
+        supervisor, terminal = self._launch(folder)
         try:
             return self._watch(supervisor, terminal, causing, folder)
         finally:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 from panolog.orchestrator.runs.records import (
     CheckpointSaved,
-    Failure,
     Merged,
     Noticed,
     Outcome,
@@ -14,7 +13,6 @@ from panolog.orchestrator.runs.records import (
     RunEnded,
     ScoresSaved,
     Stored,
-    TaskFailed,
 )
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.orchestrator.history import AGAIN, BEGAN, model, started
@@ -35,8 +33,6 @@ OF_TASK: dict[str, Callable[[TaskId], Record]] = {
     "saved": lambda task: CheckpointSaved(task, 10, "checkpoint", 1),
     "model": model,
     "scores": lambda task: ScoresSaved(task, "0.npz", 4),
-    "lost": lambda task: TaskFailed(task, 1, "died", final=False, kind=Failure.LOST),
-    "unread": lambda task: TaskFailed(task, 1, "Input/output error", final=False),
 }
 
 

@@ -27,7 +27,7 @@ Found = dict[str, Any]
 
 def chaos(found: Found, _: Path) -> None:
     undisturbed, disturbed = found["runs"]
-    assert disturbed["costs"]
+    assert disturbed["faults"]
     assert disturbed["digest"] == undisturbed["digest"], disturbed["end"]
 
 

@@ -3,10 +3,8 @@
 from collections import Counter
 
 from benchmarks.chaos.__main__ import Outcome
-from benchmarks.chaos.fault_costs import Fault, FaultCost
 from benchmarks.chaos.faults import LIMITS, Kind, plans
-from benchmarks.chaos.runs import Run
-from panolog.workers.tasks import COARSE
+from benchmarks.chaos.runs import Fault, Run
 
 
 def test_equal_seeds_give_equal_plans_with_every_kind_equally_often() -> None:
@@ -19,16 +17,20 @@ def test_equal_seeds_give_equal_plans_with_every_kind_equally_often() -> None:
     assert max(counts.values()) - min(counts.values()) <= 1
 
 
-def test_other_bytes_and_too_long_losses_are_reported() -> None:
-    allowed = 2.0 + LIMITS[Kind.WORKER].costs
-    long = FaultCost((Fault(5.0, Kind.WORKER, "kill"),), (COARSE,), 3.0, ((5.0, 5.0 + allowed),))
-    short = FaultCost((Fault(9.0, Kind.WORKER, "kill"),), (COARSE,), 1.0, ((9.0, 9.0 + allowed - 1),))
-    runs = [Run(0, 0.0, 30.0, (), "a", ""), Run(1, 0.0, 45.0, (long, short), "b", "")]
-    outcome = Outcome(tuple(runs), interval=2.0)
-    assert outcome.failures() == [
-        "run 1: other bytes",
-        f"run 1: lost {allowed + 3:.1f} s of {allowed:.1f} s",
+def test_other_bytes_and_runs_that_take_too_long_are_reported() -> None:
+    full = (Fault(5.0, Kind.ENOSPC, "disk full", until=8.0), Fault(9.0, Kind.WORKER, "kill worker"))
+    allowed = 2 * 30.0 + 3.0 + LIMITS[Kind.ENOSPC].costs + LIMITS[Kind.WORKER].costs
+    undisturbed = Run(0, 0.0, 30.0, (), "a", "")
+    runs = [
+        Run(1, 0.0, allowed - 1, full, "a", ""),
+        Run(2, 0.0, allowed + 1, full, "b", ""),
+        Run(3, 0.0, 9.0, (), "", "exit code 1: no"),
     ]
-    assert [row[0] for row in outcome.rows()] == [1, 1]
-    failed = Outcome((runs[0], Run(1, 0.0, 9.0, (), "", "exit code 1: no")), 2.0)
-    assert failed.failures() == ["run 1: exit code 1: no"]
+    outcome = Outcome((undisturbed, *runs))
+    assert outcome.failures() == [
+        "run 2: other bytes",
+        f"run 2: took {allowed + 1:.1f} s of {allowed:.1f} s",
+        "run 3: exit code 1: no",
+    ]
+    assert [row[-1] for row in outcome.rows()] == ["same", "OTHER", "failed"]
+    assert next(outcome.rows())[1] == "disk full 5.0, kill worker 9.0"
