@@ -12,7 +12,6 @@ import json
 import resource
 import shutil
 import sys
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -25,20 +24,17 @@ from numpy.typing import NDArray
 from benchmarks import report
 from benchmarks.places.layouts import LAYOUTS
 from benchmarks.places.shoot import Walk, as_video, shoot
-from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
-from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
-from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
-from panolog.scene.image_files import check_images, decode
+from panolog.scene.image_files import decode
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
 from tests.prepare.sfm.accuracy import drift, length
 
 KINDS = ("photographs", "shuffled", "second", "third", "sessions", "copies", "video")
 _RIGHT = 0.2  # percent of the way
-HEAD = ("place", "as", "by", "outcome", "posed", "of", "rms, % of the way", "CPU seconds")
+HEAD = ("place", "as", "outcome", "posed", "of", "rms, % of the way", "CPU seconds")
 Image = NDArray[np.uint8]
 
 
@@ -48,7 +44,6 @@ class Outcome:
 
     place: str
     kind: str
-    way: str  # of finding the poses
     outcome: str  # right, part (right, but not whole), refused or wrong
     posed: int
     panoramas: int
@@ -99,67 +94,25 @@ def lay_out(kind: str, walk: Walk, source: Path) -> tuple[Path, dict[str, int]]:
     return source, names
 
 
-def try_capture(name: str, kind: str, walk: Walk, folder: Path, colmap: bool) -> list[Outcome]:
-    """Poses of a capture by `panolog scene sfm`, and by COLMAP's defaults."""
+def try_capture(name: str, kind: str, walk: Walk, folder: Path) -> Outcome:
+    """Poses of a capture by `panolog scene sfm`."""
     scene = folder / "scene"
     for leftover in (scene, folder / "scene.sfm", folder / "source"):
         shutil.rmtree(leftover, ignore_errors=True)
     source, names = lay_out(kind, walk, folder / "source")
-
-    def judge(way: str, stems: Sequence[str], centers: NDArray[np.float64], cpu: float) -> Outcome:
-        truth = walk.centers[[names[stem] for stem in stems]]
-        off = 100 * drift(centers, truth) / length(walk.centers)
-        whole = "right" if len(stems) == len(names) or kind == "video" else "part"
-        return Outcome(name, kind, way, whole if off <= _RIGHT else "wrong", len(stems), len(names), off, cpu)
-
     begin = cpu_seconds()
     try:
         make_scene(source, scene, SfmSettings(), no_progress)
     except InputError as error:
         spent = cpu_seconds() - begin
-        found = [Outcome(name, kind, "scene sfm", "refused", 0, len(names), None, spent, str(error))]
-    else:
-        made, spent = read_scene(scene), cpu_seconds() - begin
-        found = [judge("scene sfm", [it.stem for it in made.panoramas], made.centers, spent)]
-    if colmap and kind != "video":
-        files = sorted(source.iterdir())
-        panoramas = tuple(PanoramaFile(source, file.name, file) for file in files if file.stem in names)
-        begin = cpu_seconds()
-        models = by_colmap(panoramas, check_images(files), ("incremental", "global"))
-        spent = cpu_seconds() - begin
-        for mapper, model in models.items():
-            way = f"COLMAP {mapper}"
-            stems = [panoramas[row].path.stem for row in model.rows] if model else []
-            if model is None or len(stems) < 3:
-                found.append(Outcome(name, kind, way, "refused", 0, len(names), None, spent))
-            else:
-                found.append(judge(way, stems, model.centers, spent))
-    return found
-
-
-def by_colmap(
-    panoramas: tuple[PanoramaFile, ...], size: tuple[int, int], mappers: Sequence[str]
-) -> dict[str, SparseModel | None]:
-    """The largest reconstruction of panoramas by COLMAP's defaults, of each mapper; size, (width, height)."""
-    import pycolmap  # noqa: PLC0415
-
-    made: dict[str, SparseModel | None] = dict.fromkeys(mappers)
-    with tempfile.TemporaryDirectory(prefix="sfm-") as folder, silence_colmap():
-        work = Workspace(Path(folder), panoramas)
-        work.open(None)
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = "EQUIRECTANGULAR"
-        pycolmap.extract_features(
-            work.database, work.images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader
-        )
-        pycolmap.match_exhaustive(work.database)
-        for mapper in mappers:
-            run = pycolmap.global_mapping if mapper == "global" else pycolmap.incremental_mapping
-            models = run(work.database, work.images, work.models)
-            if models:
-                best = max(models.values(), key=lambda model: model.num_reg_images())
-                made[mapper] = from_colmap(best, work.numbers, size)
-    return made
+        return Outcome(name, kind, "refused", 0, len(names), None, spent, str(error))
+    made, spent = read_scene(scene), cpu_seconds() - begin
+    truth = walk.centers[[names[it.stem] for it in made.panoramas]]
+    off = 100 * drift(made.centers, truth) / length(walk.centers)
+    posed = len(made.panoramas)
+    whole = "right" if posed == len(names) or kind == "video" else "part"
+    outcome = whole if off <= _RIGHT else "wrong"
+    return Outcome(name, kind, outcome, posed, len(names), off, spent)
 
 
 def cpu_seconds() -> float:
@@ -175,7 +128,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--places", nargs="*", choices=LAYOUTS, default=list(LAYOUTS))
     parser.add_argument("--scene", nargs="*", type=Path, default=[], help="with poses that are known well")
     parser.add_argument("--kinds", nargs="*", choices=KINDS, default=["photographs", "shuffled", "video"])
-    parser.add_argument("--colmap", action="store_true", help="also COLMAP's defaults, both mappers")
     parser.add_argument("--bare", action="store_true", help="no texture on ground and sky")
     parser.add_argument("--width", type=int, default=1024)
     parser.add_argument("--seed", type=int, default=0)
@@ -184,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def work() -> report.Report:
         found = [outcome for name, walk in _walks(options) for outcome in _tried(name, walk(), options)]
         table = report.markdown(HEAD, [tuple(asdict(it).values())[: len(HEAD)] for it in found])
-        passed = all(it.outcome != "wrong" for it in found if it.way == "scene sfm")
+        passed = all(it.outcome != "wrong" for it in found)
         return report.Report({"results": [asdict(it) for it in found]}, table, passed)
 
     return report.run("places.captures", options, work)
@@ -213,9 +165,8 @@ def _name(place: str, options: argparse.Namespace) -> str:
 def _tried(name: str, walk: Walk, options: argparse.Namespace) -> list[Outcome]:
     found = []
     for kind in options.kinds:
-        for outcome in try_capture(name, kind, walk, options.folder / name / kind, options.colmap):
-            print(json.dumps(asdict(outcome)), file=sys.stderr, flush=True)
-            found.append(outcome)
+        found.append(try_capture(name, kind, walk, options.folder / name / kind))
+        print(json.dumps(asdict(found[-1])), file=sys.stderr, flush=True)
     return found
 
 
