@@ -1,7 +1,6 @@
 """The driver's order and placement of blocks against the best possible, on costs recorded from real runs.
 
-    python -m benchmarks.scheduling                   # the table
-    python -m benchmarks.scheduling RUN ... --json    # block costs of finished runs, as in block_costs.json
+    python -m benchmarks.scheduling [--json]
 
 The driver's own decisions (`placement` and `costs` in the engine) are simulated on a clock that jumps from
 one event to the next. They know cameras and Gaussians of all blocks, and the duration of a block once 5 % of
@@ -16,7 +15,7 @@ of more than ten.
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +24,7 @@ from scipy.optimize import LinearConstraint, milp
 from benchmarks import report
 from panolog.orchestrator.engine.estimates import costs
 from panolog.orchestrator.engine.scheduling import placement
-from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines.nodes import Gpu, Node, Placement
-from panolog.orchestrator.runs.state import replay
-from panolog.orchestrator.runs.store import read_milestones
 from panolog.workers.tasks import TaskId
 
 RECORDED = Path(__file__).with_name("block_costs.json")
@@ -139,17 +135,6 @@ def excess(blocks: Sequence[Block], machines: Machines) -> float:
     return simulate(blocks, machines) / best_possible([block.seconds for block in blocks], machines) - 1
 
 
-def costs_of(root: Path) -> list[Block]:
-    """The trained blocks of a finished run. Raises InputError if there is no run."""
-    state = replay(read_milestones(RunFolder(root).database))
-    tasks = [(block, state.task(TaskId.block(block.block))) for block in state.plan or ()]
-    return [
-        Block(block.cameras, block.gaussians, round(seconds, 3))
-        for block, task in tasks
-        if (seconds := costs.whole_seconds(task)) is not None
-    ]
-
-
 def _request(name: int, block: Block, model: costs.CostModel) -> placement.Demand:
     seconds = costs.predictor(model, block.cameras, block.gaussians)
     return placement.Demand(TaskId.block(name), int(0.6 * MEMORY), seconds)
@@ -170,13 +155,9 @@ def _running(
 def main(arguments: Sequence[str] | None = None) -> int:
     """The program; returns its exit code."""
     parser = report.parser("scheduling", __doc__, quick=False)
-    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="print its block costs instead")
     options = parser.parse_args(arguments)
 
     def work() -> report.Report:
-        if options.runs:
-            by_run = {root.name: [asdict(block) for block in costs_of(root)] for root in options.runs}
-            return report.Report({"runs": by_run}, json.dumps(by_run, indent=1))
         runs = recorded() | generated()
         found = {
             name: {case: excess(blocks, machines) for case, machines in MACHINES.items()}
