@@ -1,15 +1,16 @@
 """The speed of an iteration, and of gsplat on the same Gaussians."""
 
+import time
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import torch
 
-from benchmarks import performance
 from benchmarks.first_hour.outcome import NO_CARD, ROOT, Context, Outcome, shown
+from benchmarks.rasterizer import __main__ as rasterizer
 from benchmarks.rasterizer import peers, roofline
 from benchmarks.rasterizer.cases import CaseSpec
-from benchmarks.rasterizer.rows import Row, tables
+from benchmarks.rasterizer.page import page
+from benchmarks.rasterizer.rows import COUNTS, Row, benchmark, tables
 from panolog.orchestrator.runs.machines.machine import cores
 from panolog.renderer.process import prepare
 from panolog.scene.errors import DeviceError
@@ -18,28 +19,34 @@ from panolog.scene.files import write_bytes
 PAGE = "performance-cuda.md"
 _SHARE = 0.6  # of a step's time, after which no further row is begun: a row of a million takes long
 _REPEATS = 10
+_FIGURE = CaseSpec(1920, 1_000_000)  # of the summary, so the first
 
 
 def iterations(context: Context) -> Outcome:
-    """`benchmarks.performance`, as many rows as there is time for; on a card its page is in docs/ too."""
+    """`benchmarks.rasterizer`, as many rows as there is time for; on a card its page is in docs/ too."""
+    ends = time.monotonic() + _SHARE * context.seconds
     prepare(cores())
-    trained = ["--scene", context.scene, "--model", context.model] if context.scene and context.model else []
-    output = f"docs/{PAGE}" if context.cuda else context.work / PAGE
-    options = ["--device", context.device, *trained, *["--quick"] * (not context.cuda), "-o", str(output)]
-    command = shown(["python", "-m", "benchmarks.performance", *options])
+    arguments = ["--device", context.device, *["--quick"] * (not context.cuda)]
+    if context.scene and context.model:
+        counts = ",".join(map(str, COUNTS))
+        arguments += ["--scene", context.scene, "--model", context.model, "--gaussians", counts]
+    options = rasterizer.parse(arguments)
+    cases = [*([_FIGURE] if context.cuda else []), *rasterizer.specs(options)]
+    output = f"docs/{PAGE}" if context.cuda else str(context.work / PAGE)
+    command = shown(["python", "-m", "benchmarks.rasterizer", *arguments, "-o", output])
     rows: list[Row] = []
     outcome = Outcome("failed", reason="no row was measured")
-    scene, model = map(Path, trained[1::2]) if trained else (None, None)
-    limit = _SHARE * context.seconds
-    for row in performance.measure(scene, model, context.device, quick=not context.cuda, seconds=limit):
+    for row in benchmark(cases, context.device, options.threads, options.repeats):
         rows.append(row)
         content = {"rows": [each.content() for each in rows]}
         outcome = Outcome("passed", _figure(rows[0]), "", (command,), content, tables(rows))
         context.save(outcome)
-    page = performance.page(rows).encode()
-    write_bytes(context.work / PAGE, page)
+        if time.monotonic() > ends:
+            break
+    written = page(rows).encode()
+    write_bytes(context.work / PAGE, written)
     if context.cuda:
-        write_bytes(ROOT / "docs" / PAGE, page)
+        write_bytes(ROOT / "docs" / PAGE, written)
     return outcome
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
+from panolog.scene.errors import InputError
 from panolog.scene.gaussians import SH_C0, Gaussians
 from panolog.scene.images import load_view
 from panolog.scene.ply import read_ply
@@ -64,6 +65,11 @@ class CaseSpec:
     views: int = 3  # number of the scene's training panoramas
     exact: bool = False  # seen along rays, however the model was trained
     block: str | None = None  # of the model this slab alone, of `BLOCKS`, within a baked exterior
+
+    def __post_init__(self) -> None:
+        """Raises InputError if there is a model without a scene, or a scene without a model."""
+        if (self.model is None) != (self.scene is None):
+            raise InputError("--model and --scene go together: the views of a model are those of its scene")
 
     def make(self) -> Case:
         """The case; panoramas that are smaller than it are enlarged.

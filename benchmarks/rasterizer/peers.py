@@ -172,8 +172,6 @@ def main() -> int:
     parser.add_argument("--repeats", type=int, default=10)
     options = parser.parse_args()
     options.device = "cuda"
-    if (options.model is None) != (options.scene is None):
-        parser.error("--model and --scene go together")
     if options.quick:
         options.width, options.gaussians, options.repeats = 256, 5_000, 1
 

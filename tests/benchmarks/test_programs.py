@@ -48,8 +48,9 @@ def paper(found: Found, folder: Path) -> None:
     assert not list((folder / "scene").glob("*.states"))
 
 
-def performance(found: Found, _: Path) -> None:
-    assert "street" in Path(found["page"]).read_text()
+def rasterizer(found: Found, folder: Path) -> None:
+    assert {row["model"] for row in found["rows"]} == {"street"}
+    assert "street" in (folder / "performance.md").read_text()
 
 
 def driver(found: Found, _: Path) -> None:
@@ -93,7 +94,7 @@ PAPER = (
 PROGRAMS: list[tuple[Callable[[Found, Path], None], str, str]] = [
     (chaos, "chaos", "--runs 1 --seed 4 --faults driver,eio"),
     (paper, "paper", PAPER),
-    (performance, "performance", "--quick -o {folder}/performance.md"),
+    (rasterizer, "rasterizer", "--quick -o {folder}/performance.md"),
     (driver, "driver", "--quick"),
     (captures, "places.captures", "{folder} --places --scene {street} --kinds photographs"),
 ]

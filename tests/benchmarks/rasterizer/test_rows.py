@@ -4,12 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import performance
 from benchmarks.rasterizer import rows as module
 from benchmarks.rasterizer.__main__ import parse, specs
 from benchmarks.rasterizer.cases import CaseSpec, street
 from benchmarks.rasterizer.iteration import Times
+from benchmarks.rasterizer.page import TEMPLATE, goals, page
 from benchmarks.rasterizer.rows import Row, benchmark
+from panolog.scene.errors import InputError
 from panolog.scene.ply import write_ply
 from tests.deploy.files import ROOT
 from tests.scenes import write_scene
@@ -28,7 +29,7 @@ def test_one_row_for_each_number_of_threads_and_the_page_of_all(
     gain = rows[0].times.iteration / rows[1].times.iteration
     assert rows[0].speed_up is None and rows[1].speed_up == pytest.approx(gain)
     assert rows[0].content()["shares"] == {"rasterization": rows[0].times.share}
-    text = performance.page(rows)
+    text = page(rows)
     first, details = text.split("<details>")
     assert "trained on tiny" in first
     assert len([line for line in first.splitlines() if line.startswith("|")]) <= 10
@@ -36,7 +37,7 @@ def test_one_row_for_each_number_of_threads_and_the_page_of_all(
     shown = [line.split("|")[-3].strip() for line in details.splitlines() if line.startswith("| street ")]
     assert shown[0] == "–" and float(shown[1]) == pytest.approx(gain, rel=1e-2)
     kept = (ROOT / "docs/performance.md").read_text().splitlines()
-    fixed = set(performance.TEMPLATE.read_text().splitlines()) & set(text.splitlines())
+    fixed = set(TEMPLATE.read_text().splitlines()) & set(text.splitlines())
     assert len(fixed) > 20 and fixed <= set(kept)
 
 
@@ -44,7 +45,7 @@ def test_a_goal_says_whether_it_is_met() -> None:
     times = Times(forward=30, loss=10, backward=60, iteration=120)
     row = Row("flat", 64, 32, 9, "cpu", 2, times, memory=1, stages=None, speed_up=1.7)
     where = "trained model at 64×32"
-    assert list(performance.goals([row])) == [
+    assert list(goals([row])) == [
         (f"share of rasterization and Adam in an iteration, {where}", "≥ 0.7", 0.9, "yes"),
         (f"speed-up of two threads, {where}", "≥ 1.8", 1.7, "no"),
     ]
@@ -58,7 +59,8 @@ def test_the_command_line_requests_streets_a_model_or_both(capsys: pytest.Captur
     assert [(spec.exact, spec.block) for spec in specs(parse(blocks))] == [
         (exact, block) for exact in (False, True) for block in ("far", "middle")
     ]
-    for wrong, message in ((["--block", "near"], "far and middle"), (both[:2], "go together")):
-        with pytest.raises(SystemExit):
-            parse(wrong)
-        assert message in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        parse(["--block", "near"])
+    assert "far and middle" in capsys.readouterr().err
+    with pytest.raises(InputError, match="go together"):
+        list(specs(parse(both[:2])))
