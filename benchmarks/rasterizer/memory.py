@@ -1,21 +1,17 @@
 """Peak memory of one case, measured in a fresh process.
 
-On the CPU it is the growth of the resident set (VmHWM after /proc/self/clear_refs, so Linux only). The C
-library must return freed blocks to the system at once: otherwise blocks that were freed before would hide
-a part of the growth.
+On the CPU it is the growth of the resident set. The C library must return freed blocks to the system at once:
+otherwise blocks that were freed before would hide a part of the growth.
 """
 
 import ctypes
 import functools
-from collections.abc import Callable
-from pathlib import Path
 
-import torch
-
-from benchmarks.processes import in_fresh_process, peak_memory
+from benchmarks.processes import in_fresh_process
 from benchmarks.rasterizer.cases import CaseSpec, street_case
 from benchmarks.rasterizer.iteration import TrainingStep
 from panolog.renderer import ops
+from panolog.workers.meter import host_peak, memory_in_use, reset_peaks
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt(3)
 
@@ -40,21 +36,7 @@ def peak(spec: CaseSpec, device: str, threads: int) -> int:
     case = spec.make().to(device)
     step = TrainingStep(case, case.views[0])
     libc.malloc_trim(0)
-    rise = _rise_cuda if device == "cuda" else _rise_cpu
-    return rise(step.iteration)
-
-
-def _rise_cuda(work: Callable[[], None]) -> int:
-    torch.cuda.synchronize()
-    torch.cuda.reset_peak_memory_stats()
-    before = torch.cuda.memory_allocated()
-    work()
-    torch.cuda.synchronize()
-    return torch.cuda.max_memory_allocated() - before
-
-
-def _rise_cpu(work: Callable[[], None]) -> int:
-    Path("/proc/self/clear_refs").write_text("5")  # resets the peak to the present size
-    before = peak_memory()
-    work()
-    return peak_memory() - before
+    reset_peaks(device)
+    before = memory_in_use(device)
+    step.iteration()
+    return (memory_in_use(device) if device == "cuda" else host_peak()) - before
