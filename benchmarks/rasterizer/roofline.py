@@ -6,8 +6,7 @@ NVRTC's PTX says how many instructions each loop of a kernel has (`tests/rendere
 forward pass of a random street how often warps of a card go through them. A kernel takes as long as the
 slowest of these: issuing, the lanes for floats, special functions, shared memory with shuffles, and the bytes
 of its arrays. All run at their peak, so a card takes longer, most of all where atomic sums meet in one place
-or a kernel is short; sorting is torch's, of which only bytes are counted. `--check` compares the ratio of the
-backward to the forward compositing with that of this machine's CPU.
+or a kernel is short; sorting is torch's, of which only bytes are counted.
 """
 
 import math
@@ -23,7 +22,7 @@ import torch
 
 from benchmarks import report
 from benchmarks.rasterizer.cases import Case, CaseSpec
-from benchmarks.rasterizer.iteration import TrainingStep, stages
+from benchmarks.rasterizer.iteration import TrainingStep
 from panolog.renderer import ops
 from panolog.renderer.baked import bake
 from panolog.renderer.cuda.parts import Argument, Launch
@@ -275,7 +274,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--cards", type=lambda text: text.split(","), default=list(CARDS), help="of the table"
     )
-    parser.add_argument("--check", action="store_true", help="measure the CPU's ratio too")
     options = parser.parse_args(arguments)
     if unknown := set(options.cards) - set(CARDS):
         parser.error(f"no card {min(unknown)}: there are {', '.join(CARDS)}")
@@ -297,25 +295,9 @@ def main(arguments: list[str] | None = None) -> int:
         text += report.markdown(("kernel", *options.cards), rows)
         content: dict[str, object] = {"model": True, "work": asdict(work), "total_ms": totals}
         content["kernels_ms"] = {card: {n: took for n, took, _ in each} for card, each in found.items()}
-        if options.check:
-            ratios = checked(spec, found)
-            content["ratios"] = ratios
-            text += "\n\ncomposite backward / forward: " + ", ".join(
-                f"{k} {v:.2f}" for k, v in ratios.items()
-            )
         return report.Report(content, text)
 
     return report.run("rasterizer.roofline", options, made)
-
-
-def checked(spec: CaseSpec, found: Mapping[str, list[tuple[str, float, str]]]) -> dict[str, float]:
-    """The backward over the forward compositing, by the model and as measured on this CPU."""
-    here = stages(spec.make(), 1, 3)
-    ratios = {}
-    for card, kernels_of in found.items():
-        took = {name: ms for name, ms, _ in kernels_of}
-        ratios[card] = took["composite_backward"] / took["composite_forward"]
-    return ratios | {"measured on this CPU": here.composite_backward / here.composite}
 
 
 if __name__ == "__main__":
