@@ -23,7 +23,7 @@ from benchmarks.chaos.faults import Kind, plans
 from benchmarks.chaos.runs import ChaosRuns, Run
 from panolog.scene.errors import RunError
 
-HEAD = ("run", "faults at s", "run took s", "allowed s", "bytes")
+HEAD = ("run", "faults", "run took s", "allowed s", "bytes")
 _FAULTS = f"all, kill, {', '.join(Kind)}"
 KILLS = (Kind.DRIVER, Kind.WORKER, Kind.RAYLET)
 SLOWER = 2.0  # times the undisturbed run: half of the cluster may be in quarantine, and the machine is shared
@@ -42,7 +42,7 @@ class Outcome:
 
     def allowed(self, run: Run) -> float:
         """Seconds that a run may take."""
-        return SLOWER * self.undisturbed.seconds + sum(fault.allowed for fault in run.faults)
+        return SLOWER * self.undisturbed.seconds + sum(fault.planned.allowed for fault in run.faults)
 
     def failures(self) -> list[str]:
         """One line for each run with other bytes, and for each that took too long."""
@@ -58,7 +58,7 @@ class Outcome:
         """One for each disturbed run, in the order of HEAD."""
         for run in self.runs[1:]:
             same = "failed" if run.end else "same" if run.digest == self.undisturbed.digest else "OTHER"
-            what = ", ".join(f"{fault.what} {fault.time - run.began:.1f}" for fault in run.faults)
+            what = ", ".join(f"{fault.planned.what} at {fault.at:.1f} s" for fault in run.faults)
             yield run.number, what, run.seconds, self.allowed(run), same
 
 
@@ -78,7 +78,7 @@ def chaos(root: Path, runs: int, seed: int, kinds: Sequence[Kind]) -> Outcome:
 
 def _line(run: Run, runs: int) -> str:
     """The progress of the benchmark."""
-    causes = ", ".join(fault.what for fault in run.faults)
+    causes = ", ".join(fault.planned.what for fault in run.faults)
     return f"run {run.number} of {runs}: {causes}: {run.end or f'{run.seconds:.0f} s'}"
 
 

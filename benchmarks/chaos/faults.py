@@ -104,6 +104,16 @@ class Planned:
         lasts = LIMITS[self.kind].lasts
         return lasts[int(self.choice * len(lasts))]
 
+    @property
+    def allowed(self) -> float:
+        """Seconds that it may cost a run."""
+        return LIMITS[self.kind].costs + self.lasts
+
+    @property
+    def what(self) -> str:
+        """The kind and how long it takes, in words."""
+        return f"{self.kind} {self.lasts:g} s" if self.lasts else str(self.kind)
+
 
 def plans(runs: int, seed: int, seconds: float, kinds: Sequence[Kind]) -> Iterator[list[Planned]]:
     """For each run one or two faults, in order, within the time that an undisturbed run takes.
@@ -121,17 +131,6 @@ def plans(runs: int, seed: int, seconds: float, kinds: Sequence[Kind]) -> Iterat
         yield plan
 
 
-_SIGNALS = {
-    Kind.DRIVER: ("kill driver", signal.SIGKILL),
-    Kind.MIRROR: ("kill mirror", signal.SIGKILL),
-    Kind.WORKER: ("kill worker", signal.SIGKILL),
-    Kind.RAYLET: ("kill raylet", signal.SIGKILL),
-    Kind.HANG: ("hang worker", signal.SIGSTOP),
-    Kind.PAUSE: ("pause raylet", signal.SIGSTOP),
-    Kind.GCS: ("kill GCS", signal.SIGKILL),
-}
-
-
 @dataclass(frozen=True)
 class Victim:
     """A run at work."""
@@ -145,45 +144,42 @@ class Victim:
     terminal: subprocess.Popen[bytes]  # reads the output of both
 
 
-def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
-    """Makes it happen; returns what it was and what ends it. None if there is nothing to hit now."""
-    cluster, choice, lasts = victim.cluster, planned.choice, planned.lasts
+def cause(planned: Planned, victim: Victim) -> Undo | None:
+    """Makes it happen; returns what ends it. None if there is nothing to hit now."""
+    cluster, choice = victim.cluster, planned.choice
     match planned.kind:
         case Kind.DRIVER | Kind.MIRROR | Kind.WORKER | Kind.RAYLET | Kind.HANG | Kind.PAUSE | Kind.GCS:
             return _signal(planned, victim)
         case Kind.BADNODE:
-            return "bad node", _fail(cluster, (SECOND,), Rule(victim.scene, READ, errno.EIO))
+            return _fail(cluster, (SECOND,), Rule(victim.scene, READ, errno.EIO))
         case Kind.EIO:
             error = errno.EIO if choice < 1 / 2 else errno.ESTALE
             group = SECOND if int(choice * 4) % 2 else HEAD
-            once = Rule(victim.scene, READ, error, times=1)
-            return f"{errno.errorcode[error]} {group}", _fail(cluster, (group,), once)
+            return _fail(cluster, (group,), Rule(victim.scene, READ, error, times=1))
         case Kind.ENOSPC:
             if not RunFolder(victim.root).presence.exists():
                 return None  # on a full disk no run has to begin
-            return f"disk full {lasts:g} s", _fail(cluster, GROUPS, Rule(victim.root, WRITE, errno.ENOSPC))
+            return _fail(cluster, GROUPS, Rule(victim.root, WRITE, errno.ENOSPC))
         case Kind.SLOW | Kind.STORE:
             slow = (victim.store,) if planned.kind == Kind.STORE else (victim.scene, victim.root)
-            rules = (Rule(folder, READ | WRITE, delay=_DELAY_S) for folder in slow)
-            return f"{planned.kind} {lasts:g} s", _fail(cluster, GROUPS, *rules)
+            return _fail(cluster, GROUPS, *(Rule(it, READ | WRITE, delay=_DELAY_S) for it in slow))
         case Kind.LOCKED:
-            return _lock(f"lock {lasts:g} s", RunFolder(victim.root).database)
+            return _lock(RunFolder(victim.root).database)
         case Kind.CLOCK:
-            jump = DAY_S if choice < 1 / 2 else -DAY_S
-            return f"clock {jump:+d} s", _move_clocks(cluster, jump)
+            return _move_clocks(cluster, DAY_S if choice < 1 / 2 else -DAY_S)
         case Kind.TERMINAL:
             victim.terminal.kill()
-            return "dead terminal", nothing
+            return nothing
         case Kind.DAMAGE:
             return _damage(planned, victim)
         case Kind.VANISH:
-            return _move_away(f"no folder {lasts:g} s", victim.root)
+            return _move_away(victim.root)
         case _:
             assert_never(planned.kind)
 
 
-def _signal(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
-    """Sends a signal; the end is a SIGCONT."""
+def _signal(planned: Planned, victim: Victim) -> Undo | None:
+    """Sends SIGSTOP to what hangs or pauses, SIGKILL to all else; the end is a SIGCONT."""
     kind, cluster = planned.kind, victim.cluster
     if kind in (Kind.DRIVER, Kind.MIRROR):
         process = victim.driver if kind == Kind.DRIVER else victim.mirror
@@ -195,9 +191,8 @@ def _signal(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
         process = cluster.busy_worker(planned.choice)
     if process is None:
         return None
-    what, number = _SIGNALS[kind]
     try:
-        process.send_signal(number)
+        process.send_signal(signal.SIGSTOP if kind in (Kind.HANG, Kind.PAUSE) else signal.SIGKILL)
     except psutil.NoSuchProcess:
         return None
 
@@ -205,14 +200,14 @@ def _signal(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
         with suppress(psutil.NoSuchProcess):
             process.send_signal(signal.SIGCONT)
 
-    return f"{what} {planned.lasts:g} s" if planned.lasts else what, undo
+    return undo
 
 
 def nothing() -> None:
     """What ends a fault that stays, or has ended."""
 
 
-def _damage(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
+def _damage(planned: Planned, victim: Victim) -> Undo | None:
     """Overwrites the middle of each checkpoint that there is, and kills a worker."""
     found = list(victim.root.rglob("checkpoint.safetensors"))
     worker = victim.cluster.busy_worker(planned.choice) if found else None
@@ -226,10 +221,10 @@ def _damage(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
             file.write(bytes(64))
     with suppress(psutil.NoSuchProcess):
         worker.kill()
-    return "damage checkpoints, kill worker", nothing
+    return nothing
 
 
-def _move_away(what: str, root: Path) -> tuple[str, Undo] | None:
+def _move_away(root: Path) -> Undo | None:
     """Renames the folder of a run that has begun; the end is its old name."""
     if not RunFolder(root).presence.exists():
         return None
@@ -240,7 +235,7 @@ def _move_away(what: str, root: Path) -> tuple[str, Undo] | None:
         if not root.exists():
             away.rename(root)
 
-    return what, undo
+    return undo
 
 
 def _fail(cluster: LocalCluster, groups: Sequence[str], *rules: Rule) -> Undo:
@@ -254,7 +249,7 @@ def _fail(cluster: LocalCluster, groups: Sequence[str], *rules: Rule) -> Undo:
     return undo
 
 
-def _lock(what: str, database: Path) -> tuple[str, Undo] | None:
+def _lock(database: Path) -> Undo | None:
     """Another process locks a database that exists."""
     if not database.exists():
         return None
@@ -262,7 +257,7 @@ def _lock(what: str, database: Path) -> tuple[str, Undo] | None:
     locker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert locker.stdout is not None
     locker.stdout.readline()
-    return what, locker.communicate
+    return locker.communicate
 
 
 def _move_clocks(cluster: LocalCluster, seconds: int) -> Undo:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from math import inf
 from pathlib import Path
 from shutil import rmtree
 
@@ -14,17 +15,7 @@ import psutil
 
 from benchmarks.chaos import faults
 from benchmarks.chaos.cluster import DRIVER, LocalCluster
-from benchmarks.chaos.faults import (
-    HELLO_S,
-    LIMITS,
-    QUARANTINE,
-    RETRY_S,
-    SILENCE_S,
-    Kind,
-    Planned,
-    Undo,
-    Victim,
-)
+from benchmarks.chaos.faults import HELLO_S, QUARANTINE, RETRY_S, SILENCE_S, Planned, Undo, Victim
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.synthetic.make import make_town
 
@@ -43,15 +34,8 @@ _POLL_S = 0.1  # between two looks at the run
 class Fault:
     """One that was caused."""
 
-    time: float  # seconds since the epoch
-    kind: Kind
-    what: str
-    until: float = 0.0  # when it was ended; 0 = nothing did before the run's end
-
-    @property
-    def allowed(self) -> float:
-        """Seconds that it may cost."""
-        return LIMITS[self.kind].costs + max(0.0, self.until - self.time)
+    at: float  # seconds since the beginning of the run
+    planned: Planned
 
 
 @dataclass(frozen=True)
@@ -59,7 +43,6 @@ class Run:
     """One run and its faults."""
 
     number: int  # 0 is the undisturbed one
-    began: float  # seconds since the epoch
     seconds: float
     faults: tuple[Fault, ...]
     digest: str  # of the PLY; empty if the run failed
@@ -73,28 +56,23 @@ class _Causing:
     plan: list[Planned]  # that are still to come
     began: float
     caused: list[Fault] = field(default_factory=list)
-    undoes: list[Undo] = field(default_factory=list)  # of `caused`
+    lasting: list[tuple[float, Undo]] = field(default_factory=list)  # when each is to end, and how
 
     def step(self, victim: Victim) -> None:
         """Causes what is due, unless there is nothing to hit yet, and ends what has lasted long enough."""
         now = time.time()
-        if self.plan and self.began + self.plan[0].after <= now:
-            planned = self.plan[0]
-            if made := faults.cause(planned, victim):
-                what, undo = made
-                now = time.time()
-                self.plan.pop(0)
-                until = now + planned.lasts if planned.lasts else 0.0
-                self.caused.append(Fault(now, planned.kind, what, until))
-                self.undoes.append(undo)
-        for number, fault in enumerate(self.caused):
-            if fault.until and fault.until <= now:
-                self.undoes[number]()
-                self.undoes[number] = faults.nothing
+        due = self.plan and self.began + self.plan[0].after <= now
+        if due and (undo := faults.cause(self.plan[0], victim)):
+            planned, now = self.plan.pop(0), time.time()
+            self.caused.append(Fault(now - self.began, planned))
+            self.lasting.append((now + (planned.lasts or inf), undo))
+        for ending in [it for it in self.lasting if it[0] <= now]:
+            self.lasting.remove(ending)
+            ending[1]()
 
     def end(self) -> None:
         """Ends all faults."""
-        for undo in self.undoes:
+        for _, undo in self.lasting:
             undo()
 
 
@@ -118,7 +96,7 @@ class ChaosRuns:
             causing.end()
         seconds = time.time() - began
         digest = "" if end else hashlib.sha256(RunFolder(folder).point_cloud.read_bytes()).hexdigest()
-        return Run(number, began, seconds, tuple(causing.caused), digest, end)
+        return Run(number, seconds, tuple(causing.caused), digest, end)
 
     def disturbed(self, number: int, plan: Sequence[Planned]) -> Run:
         """A run with at least one fault: one that ended before the first is repeated with earlier ones."""

@@ -3,7 +3,7 @@
 from collections import Counter
 
 from benchmarks.chaos.__main__ import Outcome
-from benchmarks.chaos.faults import LIMITS, Kind, plans
+from benchmarks.chaos.faults import LIMITS, Kind, Planned, plans
 from benchmarks.chaos.runs import Fault, Run
 
 
@@ -18,13 +18,13 @@ def test_equal_seeds_give_equal_plans_with_every_kind_equally_often() -> None:
 
 
 def test_other_bytes_and_runs_that_take_too_long_are_reported() -> None:
-    full = (Fault(5.0, Kind.ENOSPC, "disk full", until=8.0), Fault(9.0, Kind.WORKER, "kill worker"))
+    faults = (Fault(5.0, Planned(4.0, Kind.ENOSPC, 0.0)), Fault(9.0, Planned(8.0, Kind.WORKER, 0.0)))
     allowed = 2 * 30.0 + 3.0 + LIMITS[Kind.ENOSPC].costs + LIMITS[Kind.WORKER].costs
-    undisturbed = Run(0, 0.0, 30.0, (), "a", "")
+    undisturbed = Run(0, 30.0, (), "a", "")
     runs = [
-        Run(1, 0.0, allowed - 1, full, "a", ""),
-        Run(2, 0.0, allowed + 1, full, "b", ""),
-        Run(3, 0.0, 9.0, (), "", "exit code 1: no"),
+        Run(1, allowed - 1, faults, "a", ""),
+        Run(2, allowed + 1, faults, "b", ""),
+        Run(3, 9.0, (), "", "exit code 1: no"),
     ]
     outcome = Outcome((undisturbed, *runs))
     assert outcome.failures() == [
@@ -33,4 +33,4 @@ def test_other_bytes_and_runs_that_take_too_long_are_reported() -> None:
         "run 3: exit code 1: no",
     ]
     assert [row[-1] for row in outcome.rows()] == ["same", "OTHER", "failed"]
-    assert next(outcome.rows())[1] == "disk full 5.0, kill worker 9.0"
+    assert next(outcome.rows())[1] == "enospc 3 s at 5.0 s, worker at 9.0 s"
