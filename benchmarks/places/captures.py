@@ -12,9 +12,8 @@ import json
 import resource
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -134,7 +133,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     def work() -> report.Report:
-        found = [outcome for name, walk in _walks(options) for outcome in _tried(name, walk(), options)]
+        found = []
+        for name, walk in _walks(options):
+            for kind in options.kinds:
+                found.append(try_capture(name, kind, walk, options.folder / name / kind))
+                print(json.dumps(asdict(found[-1])), file=sys.stderr, flush=True)
         table = report.markdown(HEAD, [tuple(asdict(it).values())[: len(HEAD)] for it in found])
         passed = all(it.outcome != "wrong" for it in found)
         return report.Report({"results": [asdict(it) for it in found]}, table, passed)
@@ -142,32 +145,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return report.run("places.captures", options, work)
 
 
-def _walks(options: argparse.Namespace) -> list[tuple[str, Callable[[], Walk]]]:
-    """The names of the places, and what makes the walk through each."""
-
-    def rendered(place: str) -> Walk:
-        folder = options.folder / _name(place, options)
-        return shoot(place, folder, bare=options.bare, width=options.width, seed=options.seed)
-
-    def known(scene: Path) -> Walk:
-        made = read_scene(scene)
+def _walks(options: argparse.Namespace) -> Iterator[tuple[str, Walk]]:
+    """The name of each place, and the walk through it, which is rendered when it is its turn."""
+    for place in options.places:
+        name = f"{place}{'-bare' if options.bare else ''}-{options.width}-{options.seed}"
+        folder = options.folder / name
+        yield name, shoot(place, folder, bare=options.bare, width=options.width, seed=options.seed)
+    for path in options.scene:
+        made = read_scene(path)
         rotations = np.stack([it.rotation for it in made.panoramas])
-        return Walk(tuple(it.image for it in made.panoramas), made.centers, rotations)
-
-    places = [(_name(it, options), partial(rendered, it)) for it in options.places]
-    return places + [(it.resolve().name, partial(known, it)) for it in options.scene]
-
-
-def _name(place: str, options: argparse.Namespace) -> str:
-    return f"{place}{'-bare' if options.bare else ''}-{options.width}-{options.seed}"
-
-
-def _tried(name: str, walk: Walk, options: argparse.Namespace) -> list[Outcome]:
-    found = []
-    for kind in options.kinds:
-        found.append(try_capture(name, kind, walk, options.folder / name / kind))
-        print(json.dumps(asdict(found[-1])), file=sys.stderr, flush=True)
-    return found
+        yield path.resolve().name, Walk(tuple(it.image for it in made.panoramas), made.centers, rotations)
 
 
 if __name__ == "__main__":
