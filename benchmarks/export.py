@@ -9,12 +9,10 @@ those of the PLY.
 
 import argparse
 import hashlib
-import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -87,8 +85,10 @@ def measure(options: argparse.Namespace) -> report.Report:
         raise InputError(f"{unknown[0]}: write some of {', '.join(FORMATS)}")
     folder = RunFolder(options.run)
     scene = scene_of(read_info(folder), folder)
-    with TemporaryDirectory(dir=options.folder, prefix="panolog-export-") as name:
-        found = [_format(folder, scene, kind, Path(name)) for kind in wanted]
+    found = []
+    for kind in wanted:
+        with TemporaryDirectory(dir=options.folder, prefix="panolog-export-") as scratch:
+            found.append(_format(folder, scene, kind, Path(scratch)))
     table = report.markdown(
         [field.name for field in fields(FormatMeasurement)], [astuple(row) for row in found]
     )
@@ -98,11 +98,10 @@ def measure(options: argparse.Namespace) -> report.Report:
 def _format(folder: RunFolder, scene: Scene, kind: str, scratch: Path) -> FormatMeasurement:
     """A format of a run's model, and what it still shows."""
     arguments, ending, readable = FORMATS[kind]
-    with _export(folder.root, scratch / f"first{ending}", arguments) as first:
-        size, digest = sum(map(size_of, first.paths)), _digest(first.paths)
-        psnrs = _compare(folder, scene, scratch / f"first{ending}") if readable else []
-    with _export(folder.root, scratch / f"second{ending}", arguments) as second:
-        same = _digest(second.paths) == digest
+    first, second = (_export(folder.root, scratch / name / f"out{ending}", arguments) for name in "ab")
+    size = sum(map(size_of, first.output.parent.iterdir()))
+    psnrs = _compare(folder, scene, first.output) if readable else []
+    same = _digest(first.output.parent) == _digest(second.output.parent)
     ply = folder.point_cloud
     return FormatMeasurement(
         kind,
@@ -119,14 +118,14 @@ def _format(folder: RunFolder, scene: Scene, kind: str, scratch: Path) -> Format
 
 @dataclass(frozen=True)
 class _Exported:
-    paths: list[Path]
+    output: Path
     seconds: float
     peak: int  # bytes
 
 
-@contextmanager
-def _export(source: Path, output: Path, arguments: list[str]) -> Iterator[_Exported]:
-    """What the public command writes, until the context ends. Raises RunError if it fails."""
+def _export(source: Path, output: Path, arguments: list[str]) -> _Exported:
+    """Runs the public command, whose output has a folder of its own. Raises RunError if it fails."""
+    output.parent.mkdir()
     command = [sys.executable, "-c", _MEASURED, "export", source, "-o", output, *arguments]
     began = time.monotonic()
     ended = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
@@ -134,26 +133,14 @@ def _export(source: Path, output: Path, arguments: list[str]) -> Iterator[_Expor
     *said, peak = ended.stderr.strip().splitlines()
     if ended.returncode:
         raise RunError(said[-1])
-    paths = sorted(
-        path for path in output.parent.iterdir() if path.name.startswith(output.name.split(".")[0])
-    )
-    try:
-        yield _Exported(paths, seconds, int(peak))
-    finally:
-        for path in paths:
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
+    return _Exported(output, seconds, int(peak))
 
 
-def _digest(paths: Sequence[Path]) -> str:
-    """Of all bytes of some files and folders, and the names in these."""
+def _digest(folder: Path) -> str:
+    """Of the names and bytes of all files in a folder."""
     found = hashlib.sha256()
-    for path in paths:
-        files = sorted(path.rglob("*")) if path.is_dir() else [path]
-        for file in filter(Path.is_file, files):
-            found.update(str(file.relative_to(path)).encode() + file.read_bytes())
+    for file in sorted(filter(Path.is_file, folder.rglob("*"))):
+        found.update(str(file.relative_to(folder)).encode() + file.read_bytes())
     return found.hexdigest()
 
 
