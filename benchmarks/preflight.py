@@ -46,8 +46,13 @@ class Comparison:
 
     @property
     def time_error(self) -> float:
-        """The same for the time."""
+        """Error of the estimate of the time, as a fraction of the measurement."""
         return self.seconds[0] / self.seconds[1] - 1
+
+    def cells(self) -> tuple[object, ...]:
+        """The comparison in the order of HEAD."""
+        memory = (*(round(value / 2**20) for value in self.memory), f"{self.memory_error:+.0%}")
+        return (self.scene, self.stage, *self.gaussians, *memory, *self.seconds, f"{self.time_error:+.0%}")
 
 
 def compare(name: str, root: Path) -> list[Comparison]:
@@ -86,26 +91,6 @@ def scenes(data: Path, folder: Path) -> dict[str, Path]:
     return found | {"town": make_town(folder / "town")}
 
 
-def table(rows: Sequence[Comparison]) -> str:
-    """In Markdown."""
-    mebi = 2**20
-    return report.markdown(
-        HEAD,
-        [
-            (
-                row.scene,
-                row.stage,
-                *row.gaussians,
-                *(round(value / mebi) for value in row.memory),
-                f"{row.memory_error:+.0%}",
-                *row.seconds,
-                f"{row.time_error:+.0%}",
-            )
-            for row in rows
-        ],
-    )
-
-
 def summary(rows: Sequence[Comparison]) -> str:
     """How many scenes meet the goals."""
     whole = [row for row in rows if row.stage == WHOLE]
@@ -142,7 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{options.width} pixels, {options.iterations} iterations",
             f"load of this machine in the last 15 minutes: {os.getloadavg()[2]:.1f}",
             "each pair: estimated, measured",
-            table(rows),
+            report.markdown(HEAD, [row.cells() for row in rows]),
             summary(rows),
         ]
         return report.Report({"rows": [asdict(row) for row in rows]}, "\n\n".join(parts))
