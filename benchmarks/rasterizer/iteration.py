@@ -177,17 +177,10 @@ def measure(case: Case, threads: int, repeats: int) -> Times:
     medians = []
     for view in case.views:
         step = TrainingStep(case, view)
-        step.iteration()  # warm-up: pages, caches, kernels compiled on first use
+        whole = step.milliseconds(step.iteration, repeats)  # warms up: pages, caches, kernels
         parts = zip(*(tuple(step.parts()) for _ in range(repeats)), strict=True)
-        whole = [_seconds(step, step.iteration) for _ in range(repeats)]
-        medians.append([median(part) * 1e3 for part in (*parts, whole)])
+        medians.append([*(median(part) * 1e3 for part in parts), whole])
     return Times(*(fmean(part) for part in zip(*medians, strict=True)))
-
-
-def _seconds(step: TrainingStep, work: Callable[[], None]) -> float:
-    start = step.now()
-    work()
-    return step.now() - start
 
 
 def stages(case: Case, threads: int, repeats: int) -> Stages:
