@@ -21,12 +21,7 @@ from typing import Any
 
 from benchmarks.first_hour.steps import STEPS, limit
 
-INSTALL = """\
-PanoLOG is not installed for this Python. From the root of the repository, where torch with CUDA is installed:
-    python -m pip install scikit-build-core nanobind setuptools-scm cmake ninja pytest pytest-timeout \\
-        hypothesis
-    python -m pip install --no-build-isolation --editable '.[all]'
-benchmarks/README.md has more, for machines without network."""
+INSTALL = "PanoLOG is not installed for this Python; benchmarks/README.md says how, also without network"
 _LEAST_S = 2.0  # in which no step can do anything
 _LINE = 100  # characters of a log on stderr
 OUTPUT = Path("runs/first-hour")
@@ -38,7 +33,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.first_hour",
         description=(__doc__ or "").partition("\n")[0],
-        epilog=f"steps, the most important first:\n{steps}\n{INSTALL.partition('. ')[2]}",
+        epilog=f"steps, the most important first:\n{steps}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("-o", "--output", type=Path, default=OUTPUT, metavar="FOLDER", help="of all results")
@@ -51,7 +46,6 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--only", type=_steps, metavar="STEP,...", default=list(STEPS), help="run these steps"
     )
-    parser.add_argument("--skip", type=_steps, metavar="STEP,...", default=[], help="do not run these")
     options = parser.parse_args(arguments)
     if not options.minutes > 0:
         parser.error(f"--minutes {options.minutes:g}: must be above 0")
@@ -59,9 +53,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
         parser.error(f"--scene {options.scene}: there is no such folder")
     if options.model is not None and (options.scene is None or not options.model.is_file()):
         parser.error(f"--model {options.model}: must be a file, and needs the --scene it was trained on")
-    options.steps = [name for name in STEPS if name in options.only and name not in options.skip]
-    if not options.steps:
-        parser.error("--only and --skip leave no step")
+    options.steps = [name for name in STEPS if name in options.only]
     return options
 
 

@@ -1,4 +1,4 @@
-"""A town and a scene, reconstructed from images to metrics on the card and on the CPU."""
+"""A town, reconstructed from images to metrics on the card and on the CPU, and a scene on the card."""
 
 import json
 import shlex
@@ -16,7 +16,6 @@ from panolog.orchestrator.cli.commands.demo import SETTINGS
 from panolog.orchestrator.engine.driver.local_pool import local_pool
 from panolog.orchestrator.runs.config import load_config
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.scene.errors import RunError
 from panolog.synthetic.make import make_town
 
 HEAD = ("device", "PSNR", "SSIM", "WS-PSNR", "Gaussians", "seconds")
@@ -44,46 +43,31 @@ def demo(context: Context) -> Outcome:
     town = make_town(context.work / "town", **size)
     settings = SETTINGS if context.cuda else SETTINGS | _TINY
     command = "panolog demo" if context.cuda else _command(town, settings, "cpu")
-    return _compared(context, town, settings, (command,))
+    results = [reconstruct(context, town, context.device, settings)]
+    if context.cuda:
+        context.save(outcome_of(results, command))
+        results.append(reconstruct(context, town, "cpu", settings))
+    return outcome_of(results, command)
 
 
 def scene(context: Context) -> Outcome:
-    """The scene of the options, with few iterations; also on the CPU if there is time for it."""
+    """The scene of the options, with few iterations."""
     if context.scene is None:
         return Outcome("skipped", reason="no --scene DIR was given")
     settings = _SCENE if context.cuda else _SCENE | _TINY | {"width": 64}
-    command = _command(Path(context.scene), settings, context.device)
-    return _compared(context, Path(context.scene), settings, (command,), if_time=True)
+    place = Path(context.scene)
+    result = reconstruct(context, place, context.device, settings)
+    return outcome_of([result], _command(place, settings, context.device))
 
 
-def _compared(
-    context: Context,
-    place: Path,
-    settings: Settings,
-    commands: tuple[str, ...],
-    *,
-    if_time: bool = False,
-) -> Outcome:
-    """A run on the device and one on the CPU. Args: if_time, estimate the second before it is begun."""
-    ends = time.monotonic() + context.seconds
-    results = [reconstruct(context, place, context.device, settings)]
-    outcome = outcome_of(results, commands)
-    if not context.cuda:
-        return outcome
-    context.save(outcome)
-    if if_time and (why := _too_long(place, settings, ends - time.monotonic())):
-        return Outcome(**asdict(outcome) | {"reason": f"not run on the CPU: {why}"})
-    return outcome_of([*results, reconstruct(context, place, "cpu", settings)], commands)
-
-
-def outcome_of(results: list[Result], commands: tuple[str, ...]) -> Outcome:
+def outcome_of(results: list[Result], command: str) -> Outcome:
     """The outcome of runs on some devices: failed if the first is much worse than the last, the CPU."""
     figure = "PSNR " + ", ".join(f"{result.psnr:.2f} dB on {result.device}" for result in results)
     content = {"runs": [asdict(result) for result in results]}
     text = markdown(HEAD, [tuple(asdict(result).values()) for result in results])
     if results[0].psnr < results[-1].psnr - _WORSE:
-        return Outcome("failed", figure, f"more than {_WORSE:g} dB below the CPU", commands, content, text)
-    return Outcome("passed", figure, "", commands, content, text)
+        return Outcome("failed", figure, f"more than {_WORSE:g} dB below the CPU", (command,), content, text)
+    return Outcome("passed", figure, "", (command,), content, text)
 
 
 def reconstruct(context: Context, place: Path, device: str, settings: Settings) -> Result:
@@ -110,17 +94,3 @@ def _options(settings: Settings, device: str) -> list[str]:
     """Settings as options of `panolog run`."""
     sets = [part for key, value in settings.items() for part in ("--set", f"{key}={json.dumps(value)}")]
     return ["--device", device, *sets]
-
-
-def _too_long(place: Path, settings: Settings, left: float) -> str:
-    """Why a run on the CPU does not end within so many seconds; empty if it does."""
-    if not find_spec("ray"):
-        return "its time cannot be estimated without Ray"
-    try:
-        found = json.loads(runs.panolog("doctor", str(place), *_options(settings, "cpu"), "--json"))
-    except RunError as error:
-        return str(error)
-    needed = (found["preflight"] or {}).get("estimate", {}).get("seconds")
-    if needed is None:
-        return "its time is not known"
-    return "" if needed < left else f"it needs about {needed:.0f} s, and {left:.0f} s were left"

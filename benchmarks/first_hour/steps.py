@@ -28,7 +28,7 @@ STEPS = {
     "performance": Step("a training iteration and its parts", 12, "speed", "iterations"),
     "kernels": Step("each kernel, and what the model of cards expects", 4, "speed", "kernels", card=True),
     "demo": Step("the demo's town, trained on card and CPU", 15, "quality", "demo"),
-    "scene": Step("a scene, trained on card and CPU", 10, "quality", "scene"),
+    "scene": Step("a scene, trained on the card", 10, "quality", "scene"),
     "gsplat": Step("gsplat on the same Gaussians", 8, "speed", "gsplat"),
 }
 

@@ -28,7 +28,6 @@ class Ran:
 
     outcome: Outcome
     seconds: float
-    limit: float  # seconds
 
 
 def run(
@@ -60,7 +59,7 @@ def run(
             )
         finally:
             _end(process)
-    return Ran(_outcome(context, code, log), clock() - began, context.seconds)
+    return Ran(_outcome(context, code, log), clock() - began)
 
 
 def log_file(context: Context) -> Path:

@@ -16,7 +16,7 @@ def test_a_card_that_reconstructs_worse_fails(on_card: float, ending: str) -> No
     results = [
         Result(device, psnr, 0.8, psnr, 900, 30.0) for device, psnr in (("cuda", on_card), ("cpu", 22.0))
     ]
-    outcome = quality.outcome_of(results, ())
+    outcome = quality.outcome_of(results, "")
     assert outcome.ending == ending
     assert outcome.figure == f"PSNR {on_card:.2f} dB on cuda, 22.00 dB on cpu"
 

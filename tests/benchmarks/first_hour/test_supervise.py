@@ -130,7 +130,6 @@ def test_the_page_has_every_step_and_the_exit_code_is_that_of_a_failure(tmp_path
     ("options", "message"),
     [
         (["--only", "demo,tets"], "'tets' is none of machine, tests"),
-        (["--only", "demo", "--skip", "demo"], "leave no step"),
         (["--minutes", "0"], "--minutes 0: must be above 0"),
         (["--scene", "nowhere"], "--scene nowhere: there is no such folder"),
         (["--model", "model.ply"], "needs the --scene"),
