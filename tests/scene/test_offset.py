@@ -13,7 +13,7 @@ from panolog.scene.colmap import read_colmap, read_panoramas, write_colmap
 from panolog.scene.errors import PlyError
 from panolog.scene.image_files import decode_panorama
 from panolog.scene.model import NO_OFFSET, Scene
-from panolog.scene.ply import join_ply, ply_offset, read_ply, write_ply
+from panolog.scene.ply import ply_offset, read_ply, write_ply
 from panolog.scene.read import FAR, find_offset, read_scene
 from panolog.workers.training.initialise import scene_gaussians
 from tests.scenes import WIDTH, write_scene
@@ -84,8 +84,6 @@ def test_a_ply_notes_the_offset_and_only_where_there_is_one(tmp_path: Path, near
     assert ply_offset(tmp_path / "moved.ply") == UTM
     assert b"offset" not in (tmp_path / "plain.ply").read_bytes()[:2000]
     assert torch.equal(read_ply(tmp_path / "moved.ply").means, model.means)
-    join_ply(tmp_path / "joined.ply", [(tmp_path / "moved.ply", range(len(model)))], sky=0, offset=UTM)
-    assert (tmp_path / "joined.ply").read_bytes() == (tmp_path / "moved.ply").read_bytes()
 
 
 @pytest.mark.parametrize("comment", ["1 2", "a b c", "1 2 nan"])

@@ -42,7 +42,7 @@ def block(scene: Scene) -> TrainSpec:
     coarse, path = coarse_of(scene, CONFIG, iterations=3), scene.root / "coarse.ply"
     model = trained(coarse)
     write_ply(path, model)
-    return replace(block_of(coarse, model), initial=ModelFile(path), compared=(3, 1), iterations=30)
+    return replace(block_of(coarse, model), initial=ModelFile(path), compared=(3, 1), iterations=10)
 
 
 @pytest.fixture

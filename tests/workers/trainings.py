@@ -134,6 +134,16 @@ def end(found: TrainSpec | list[Event]) -> Trained:
     return last
 
 
+def until_saved(spec: TrainSpec) -> Event:
+    """The first checkpoint of a task, with which its training stops, or the last event."""
+    stream = train(spec)
+    for event in stream:
+        if isinstance(event, Checkpoint):
+            break
+    stream.close()  # type: ignore[attr-defined]
+    return event
+
+
 def content(event: Event) -> object:
     """What can be compared of an event: the bytes of a checkpoint, or all that a task ends with."""
     match event:

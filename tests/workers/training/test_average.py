@@ -12,8 +12,6 @@ from panolog.scene.model import Scene
 from panolog.workers.specs import Value
 from panolog.workers.training.checkpoint import SavedModel, save
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.initialise import scene_gaussians
-from panolog.workers.training.optimizer import Average
 from panolog.workers.training.schedule import AVERAGED, Schedule
 from panolog.workers.training.trainer import train
 from tests.renderer.cuda.emulation import EmulatedLaunch
@@ -89,11 +87,3 @@ def test_it_is_averaged_on_a_card_as_on_the_cpu(scene: Scene) -> None:
         found = trained(spec)
     assert len(found) == len(expected)
     assert torch.allclose(found.means, expected.means, atol=1e-3)
-
-
-def test_without_models_the_average_is_the_latest(scene: Scene) -> None:
-    average, last = Average(), scene_gaussians(scene)
-    assert average.take(last) is last and not average.tensors()
-    average.add(last)
-    average.clear()
-    assert average.take(last) is last

@@ -1,7 +1,6 @@
 """A training that continues from a checkpoint ends with the bytes of an undisturbed one, for any threads."""
 
 import pickle
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +8,6 @@ import pytest
 
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
-from panolog.workers.events import Checkpoint, Event
 from panolog.workers.specs import Value
 from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.trainings import (
@@ -23,6 +21,7 @@ from tests.workers.trainings import (
     settings,
     threads,
     trained,
+    until_saved,
 )
 
 pytestmark = pytest.mark.system
@@ -45,7 +44,6 @@ COARSE: dict[str, Groups] = {
 }
 BLOCKS: dict[str, Groups] = {
     "full": {},
-    "full, relocated, exact": {"densify": RELOCATED, "projection": "exact"},
     "frozen": {"stage2": {"exterior": "frozen"}},
     "frozen, relocated": {"stage2": {"exterior": "frozen"}, "densify": RELOCATED},
     "baked": {"stage2": {"exterior": "baked"}},
@@ -63,15 +61,6 @@ def initial(scene: Scene) -> Gaussians:
     return trained(coarse_of(scene))
 
 
-def until_saved(stream: Iterator[Event]) -> Event:
-    """The next checkpoint, or the end."""
-    for event in stream:
-        if isinstance(event, Checkpoint):
-            break
-    stream.close()  # type: ignore[attr-defined]
-    return event
-
-
 def resumed(spec: TrainSpec) -> Gaussians:
     """The end of a task, which resumes from each checkpoint to the next, and from the last one to it."""
     events = list(train(spec))
@@ -79,7 +68,7 @@ def resumed(spec: TrainSpec) -> Gaussians:
     assert [event.iteration for event in saved] == [5, 10, 15, 20]
     for checkpoint, following in zip(saved, [*saved[1:], events[-1]], strict=True):
         again: TrainSpec = pickle.loads(pickle.dumps(replace(spec, checkpoint=Value(checkpoint))))
-        assert content(until_saved(train(again))) == content(following), checkpoint.iteration
+        assert content(until_saved(again)) == content(following), checkpoint.iteration
     return trained(events)
 
 

@@ -120,20 +120,6 @@ def test_a_block_may_have_a_budget_and_a_decay_of_its_own() -> None:
     )
 
 
-def test_the_budget_follows_the_root_of_the_length_of_a_long_stage_one() -> None:
-    densify = {"method": "relocate", "long_runs": 0.5}
-
-    def added(iterations: int, *, refine: bool = False) -> int:
-        run = schedule(iterations, refine=refine, densify=densify)
-        return run.budget(iterations, 10_000, 32_768) - 10_000
-
-    lengths = (500, 1_500, 6_000, 30_000, 90_000)
-    assert [added(it) / added(1_500) for it in lengths] == pytest.approx(
-        [1, 1, 2, 20**0.5, 20**0.5], rel=1e-3
-    )
-    assert added(30_000, refine=True) == added(1_500)
-
-
 @pytest.mark.parametrize("iterations", [500, 30_000])
 def test_noise_cools_from_one_with_the_rate_of_positions(iterations: int) -> None:
     run = schedule(iterations, optimizer={"short_runs": 0.5})
