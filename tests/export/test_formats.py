@@ -27,10 +27,10 @@ READABLE: dict[str, tuple[Callable[[Path, InMemory], object], int]] = {  # with 
     "SPZ 3": (partial(write_spz, version=3), MORE_THAN_A_PIECE),
     "SPZ 4": (partial(write_spz, version=4), MORE_THAN_A_PIECE),
     "compressed PLY": (write_compressed_ply, MORE_THAN_A_PIECE),
-    "SOG": (write_sog, 3000),
-    "SOG as a folder": (write_unpacked, 3000),
+    "SOG": (write_sog, 1000),
+    "SOG as a folder": (write_unpacked, 1000),
 }
-WRITERS = READABLE | {
+WRITERS = {name: writer for name, writer in READABLE.items() if name != "SOG as a folder"} | {
     "GLB": (write_glb, 1000),
     "3D Tiles": (partial(write_tiles, to_ecef=PLACE, side=30, levels=3), 3000),
     "streamed": (partial(write_streamed, side=30, most=800, levels=2), 3000),

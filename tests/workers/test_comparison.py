@@ -1,6 +1,5 @@
 """A block that has become worse for the panoramas of other blocks leaves its cell as Stage I has it."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from panolog.workers.specs import ModelFile, Value
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
-from tests.workers.trainings import block_of, bytes_of, coarse_of, notices, trained
+from tests.workers.trainings import block_of, bytes_of, coarse_of, notices, stop_at, trained
 
 pytestmark = pytest.mark.system
 
@@ -64,11 +63,6 @@ def kept(spec: TrainSpec) -> Gaussians:
     """What the merge takes for a block that is not trained."""
     assert spec.cell is not None
     return retained(before(spec), spec.cell, 0.0)
-
-
-def stop_at(call: int) -> Callable[[], bool]:
-    calls = iter(range(10_000))
-    return lambda: next(calls) >= call
 
 
 def test_a_block_that_is_better_elsewhere_stays(block: TrainSpec) -> None:

@@ -1,6 +1,6 @@
 """Trainings of the small scene, and what they end with."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import Any
@@ -132,6 +132,12 @@ def end(found: TrainSpec | list[Event]) -> Trained:
     *_, last = train(found) if isinstance(found, TrainSpec) else found
     assert isinstance(last, Trained)
     return last
+
+
+def stop_at(call: int) -> Callable[[], bool]:
+    """What stops a task from one of its calls on, of which the first is 0."""
+    calls = iter(range(10_000))
+    return lambda: next(calls) >= call
 
 
 def until_saved(spec: TrainSpec) -> Event:

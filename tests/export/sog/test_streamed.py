@@ -63,7 +63,7 @@ def test_each_leaf_is_where_the_index_says(streamed: Path, tmp_path: Path) -> No
 
 def test_it_replaces_its_own_only(tmp_path: Path) -> None:
     folder = tmp_path / "web"
-    write_streamed(folder, source(3000, 1), source(20, 0), most=1000, levels=2)
+    write_streamed(folder, source(300, 1), source(20, 0), most=100, levels=2)
     write_streamed(folder, source(10, 0))
     assert sorted(path.name for path in folder.iterdir()) == ["0_0", "lod-meta.json"]
     assert json.loads((folder / "lod-meta.json").read_text())["counts"] == [10]

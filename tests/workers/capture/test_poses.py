@@ -92,7 +92,7 @@ def test_steps_find_what_gradients_point_to(scene: Scene) -> None:
     assert np.linalg.norm(made._motion - share * wanted._motion) < 0.25 * np.linalg.norm(wanted._motion)
 
 
-@pytest.mark.parametrize("steep", [20.0, 200.0, 20_000.0])
+@pytest.mark.parametrize("steep", [20.0, 20_000.0])
 def test_steps_do_not_overshoot_however_steep_the_loss_is(steep: float, scene: Scene) -> None:
     target, made = motions(2, 2e-3), poses(scene, rate=0.2, decay=0.1)
     lengths = pulled(made, target, 60, steep, last=60 * VIEWS)

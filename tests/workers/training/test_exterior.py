@@ -35,7 +35,7 @@ from panolog.workers.training.task_config import CacheConfig
 from panolog.workers.training.trainer import TrainSpec, train
 from tests.renderer.cuda.fake_cuda import Torch
 from tests.workers.small import WIDTH, small_scene
-from tests.workers.trainings import block_of, coarse_of, notices, same, trained
+from tests.workers.trainings import block_of, coarse_of, notices, same, stop_at, trained
 
 USUAL: dict[str, Any] = {
     "projection": "exact",
@@ -99,9 +99,8 @@ def test_a_stop_while_it_bakes_leaves_a_checkpoint(scene: Scene, initial: Gaussi
     assert same(trained(replace(task, checkpoint=Value(last))), part)
 
 
-@pytest.mark.parametrize("iterations", [1, 5])
 def test_a_block_that_ends_early_leaves_neither_its_thread_nor_its_file(
-    scene: Scene, initial: Gaussians, iterations: int, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, initial: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Although the garbage collector does not run: stopped, or failed while its error is in use."""
     files: list[Any] = []
@@ -115,18 +114,19 @@ def test_a_block_that_ends_early_leaves_neither_its_thread_nor_its_file(
         return [it.name for it in threading.enumerate() if it.name.startswith("baked")]
 
     monkeypatch.setattr("panolog.workers.training.exterior.tempfile.TemporaryFile", made)
-    task, calls = block(scene, initial, cache={"memory": 1e-6}), iter(range(99))
+    task = block(scene, initial, cache={"memory": 1e-6})
     gc.disable()
     try:
-        list(train(task, stop=lambda: next(calls) == len(task.views) + iterations))
-        assert not readers() and [file.closed for file in files] == [True]
+        for iterations in (1, 5):
+            list(train(task, stop_at(len(task.views) + iterations)))
+            assert not readers() and files.pop().closed and not files
         events = train(task)
         while not readers():
             next(events)
         monkeypatch.setattr(pipeline, "take", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             list(events)
-        assert not readers() and [file.closed for file in files] == [True, True]
+        assert not readers() and files.pop().closed and not files
     finally:
         gc.enable()
 

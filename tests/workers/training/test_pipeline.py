@@ -33,6 +33,7 @@ from tests.workers.trainings import (
     end,
     progress_of,
     settings,
+    stop_at,
     trained,
     until_saved,
 )
@@ -215,7 +216,7 @@ def test_a_loss_that_is_not_finite_once_is_put_right(spec: TrainSpec, events: li
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("iteration", [1, 5, ITERATIONS])
+@pytest.mark.parametrize("iteration", [1, 2, 5, ITERATIONS])
 def test_what_stays_not_finite_ends_the_run_with_a_name(
     iteration: int, spec: TrainSpec, events: list[Event]
 ) -> None:
@@ -239,7 +240,7 @@ def test_a_stop_saves_iterations_that_had_to_be_repeated(
     spec: TrainSpec, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with stubbed(Emulated()), small_room(monkeypatch):
-        *_, saved = train(spec, stop=iter([False] * 6 + [True]).__next__)
+        *_, saved = train(spec, stop_at(6))
     assert isinstance(saved, Checkpoint) and saved.iteration == 7
     resumed = contents(on_card(replace(spec, checkpoint=Value(saved))))
     assert resumed[-1] == contents(events)[-1]
