@@ -1,19 +1,17 @@
-"""The config: nothing unknown or infinite, every field explained."""
+"""The config: nothing infinite or contradictory; tests/orchestrator/runs/test_config.py has the rest."""
 
 import math
 
 import pytest
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from panolog.workers.training.config import TrainConfig
 
 ENDLESS = [{"near": math.inf}, {"cache": {"memory": math.inf}}, {"sky": {"kappa": math.inf}}]
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"skye": {}}, {"sky": {"kapa": 3}}, {"loss": {"lambda_ssim": 1.5}}, *ENDLESS]
-)
-def test_unknown_and_impossible_settings_are_refused(wrong: dict[str, object]) -> None:
+@pytest.mark.parametrize("wrong", [{"loss": {"lambda_ssim": 1.5}}, *ENDLESS])
+def test_impossible_settings_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         TrainConfig.model_validate(wrong)
 
@@ -27,11 +25,3 @@ def test_absolute_gradients_are_of_affine_splats() -> None:
 def test_bounds_of_sizes_need_distances(name: str) -> None:
     with pytest.raises(ValidationError, match=f"{name} needs distances: set it to 0, or "):
         TrainConfig.model_validate({"optimizer": {name: 0.3}})
-
-
-def test_every_field_is_described() -> None:
-    for name, group in TrainConfig.model_fields.items():
-        value = getattr(TrainConfig(), name)
-        fields = type(value).model_fields if isinstance(value, BaseModel) else {name: group}
-        for key, field in fields.items():
-            assert field.description and not field.is_required(), f"{name}.{key}"

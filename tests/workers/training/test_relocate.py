@@ -60,8 +60,7 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
     return -10 * math.log10(float(((a - b) ** 2).mean()))
 
 
-@pytest.mark.parametrize("long_axis", [False, True])
-@pytest.mark.parametrize("weight", ["opacity", "gradient"])
+@pytest.mark.parametrize(("weight", "long_axis"), [("opacity", False), ("gradient", True)])
 @pytest.mark.parametrize("target", [0, 79, 80, 81, 97, 160, 500])
 def test_there_are_as_many_as_the_budget_says(target: int, weight: str, long_axis: bool) -> None:
     state, statistics = random_state(103), Statistics(torch.rand(100), torch.ones(100), DensifyConfig())
