@@ -10,13 +10,13 @@ from panolog.scene.errors import ConfigError, DeviceError
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
-from panolog.synthetic.make import make_town
 from panolog.workers.loop.views import initial_gaussians, load_views
 from panolog.workers.training.config import DepthConfig
 from panolog.workers.training.initialise import scene_gaussians
 from panolog.workers.training.loss import DepthTargets
 from panolog.workers.training.schedule import order
 from tests.scenes import write_scene
+from tests.workers.small import small_scene
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +64,9 @@ def test_the_first_model_has_points_then_a_sky(scene: Scene) -> None:
 
 
 def test_depth_is_the_target_of_the_trainer(tmp_path: Path) -> None:
-
-    town = read_scene(make_town(tmp_path / "town", panoramas=6, width=128, points=400))
-    (view,) = load_views(town, 64, 1, depth=True)
-    found = DepthTargets(town, DepthConfig(), 0).target(load_view(town.panoramas[view.row], view.row, 64))
+    place = small_scene(tmp_path)
+    (view,) = load_views(place, 64, 1, depth=True)
+    found = DepthTargets(place, DepthConfig(), 0).target(load_view(place.panoramas[view.row], view.row, 64))
     assert view.depth is not None and found is not None
     assert torch.equal(view.depth[0], found[0]) and torch.equal(view.depth[1], found[1])
     assert view.depth[1].any()
