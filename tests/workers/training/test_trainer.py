@@ -18,6 +18,7 @@ from panolog.workers.events import Checkpoint, Event, Preview
 from panolog.workers.specs import Value
 from panolog.workers.tasks import TaskId
 from panolog.workers.training.exterior import inside
+from panolog.workers.training.optimizer import AVERAGE
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.on_device import ToDevice
 from tests.workers.small import WIDTH
@@ -63,6 +64,7 @@ def test_stage_one_reports_its_events(coarse: TrainSpec, events: list[Event]) ->
     assert progress[-1].iteration == progress[-1].iterations == 24
     assert progress[-1].gaussians == len(trained(events)) and progress[-1].rates["sh0"] == 2.5e-3
     assert [event.iteration for event in checkpoints(events)] == [5, 10, 15, 20]
+    assert not any(name.startswith(AVERAGE) for event in checkpoints(events) for name in event.tensors)
     assert not notices(events) and end(events).captured is None
 
 
