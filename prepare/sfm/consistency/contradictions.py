@@ -6,7 +6,8 @@ on, and from there everything fits again, one window off. Neither residuals nor 
 
 In the order of capture, neighbours are known. A pair that is farther off than a walk along them can drift
 only looks alike, but for where the order was followed only by a guess on the way from one to the other; and
-so does one if more is shared by pairs that agree across each step of that way.
+so does one if more is shared by pairs that agree across each step of that way, but for a guess: what agrees
+across one may be misled as the guess is.
 Without an order, a pair only looks alike if it covers clearly less than each pair on the best way from one
 to the other along pairs that agree.
 
@@ -89,7 +90,7 @@ def find_contradictions(
         elif counts and pair.share >= _SHARED * usual_share * np.sqrt(nearer):
             likely.append((pair, fit))
     if likely and skeleton.ordered:
-        doubted = _outvoted(skeleton, agreeing, [pair for pair, _ in likely])
+        doubted = _outvoted(skeleton, agreeing, [pair for pair, _ in likely]) | skeleton.guessed
         ways = [tree_path(skeleton.edges, pair.between) for pair, _ in likely]
         likely = [it for it, way_ in zip(likely, ways, strict=True) if not way_ or doubted & set(way_)]
     contradictions += [fit for _, fit in likely]

@@ -1,7 +1,9 @@
 """The pairs that carry a reconstruction: neighbours of a walk, or the strongest tree of unordered panoramas.
 
-Neighbours in the order of capture show the same place. Where panoramas were not taken in order, those that
-share most of the sphere do: `Evidence` measures how much of it they share, not by the number of matches.
+Neighbours in the order of capture show the same place. Where two share much less than others do, in
+directions or in features, the walk may have jumped to where it looks alike. Where panoramas were not taken in
+order, those that share most of the sphere do: `Evidence` measures how much of it they share, not by the
+number of matches.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -73,7 +75,7 @@ def find_skeleton(
         return Skeleton(True, frozenset(tree))
     own = [pair for pair in pairs if not set(pair.between) & set(given)]
     ordered = is_ordered(own, count - len(given))
-    firm = _chain(own, LIKE_OTHERS) if ordered else frozenset()
+    firm = _chain(own, LIKE_OTHERS, LIKE_OTHERS) if ordered else frozenset()
     weak = _chain(own, _WEAK) - firm if ordered else frozenset()
     tree = _strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], weak, given)
     return Skeleton(
@@ -93,11 +95,13 @@ def is_ordered(pairs: Sequence[Pair], count: int) -> bool:
     return count > 2 and len(fit) >= _ORDERED * (count - 1)
 
 
-def _chain(pairs: Sequence[Pair], share: float) -> frozenset[Edge]:
-    """Neighbours in order with at least that share of others' coverage: below, the walk was interrupted."""
+def _chain(pairs: Sequence[Pair], covered: float, shared: float = 0.0) -> frozenset[Edge]:
+    """Neighbours in order with at least these parts of others' coverage and share: below, the walk jumped."""
     near = [pair for pair in pairs if pair.apart == 1]
-    usual = float(np.median([pair.coverage for pair in near]))
-    return frozenset(pair.between for pair in near if pair.coverage >= share * usual)
+    coverage, share = np.median([[pair.coverage, pair.share] for pair in near], axis=0).tolist()
+    return frozenset(
+        it.between for it in near if it.coverage >= covered * coverage and it.share >= shared * share
+    )
 
 
 def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> list[tuple[Edge, float]]:

@@ -35,13 +35,10 @@ def square(
     count: int = 32,
     ground: bool = True,
     order: NDArray[np.int64] | None = None,
-    points_by: int = 1,
 ) -> Square:
-    """Args: ground, whether there are points that do not repeat; order, of the names (count,); points_by, how
-    many times as many points there are.
-    """
+    """Args: ground, whether there are points that do not repeat; order, of the names (count,)."""
     random = np.random.default_rng(1)
-    points, copy_of = _points(random, _FRONT * points_by, _FLOOR * points_by * ground)
+    points, copy_of = _points(random, _FRONT, _FLOOR * ground)
     centers, rotations = _way(random, count)
     if order is not None:
         centers, rotations = centers[order], rotations[order]

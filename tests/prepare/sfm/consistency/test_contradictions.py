@@ -17,11 +17,12 @@ def _contradictions(
     ordered: bool,
     covers: float,
     shared: tuple[float, float] = (0.3, 0.3),
+    guessed: frozenset[Edge] = frozenset(),
 ) -> set[Edge]:
     """Of a walk within a ring of houses, each of which looks as that ten degrees further on.
 
     Args: pairs that agree besides the neighbours, and pairs with copies; covers, the coverage of the latter;
-        shared, of the features by these, and by the neighbours 2 and 3.
+        shared, of the features by these, and by the neighbours 2 and 3; guessed, of the walk.
     """
     random = np.random.default_rng(0)
     turn = np.deg2rad(np.arange(AROUND))
@@ -37,7 +38,7 @@ def _contradictions(
     unit = tuple(ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
     poses = {row: (np.eye(3), shift) for row, shift in enumerate(shifts)}
     found = Posed(poses, dict.fromkeys(range(COUNT), points))
-    skeleton = Skeleton(ordered, frozenset(walk))
+    skeleton = Skeleton(ordered, frozenset(walk), guessed)
     against_ = find_contradictions(Evidence(unit, tuple(pairs)), skeleton, found, 2.0, lambda _: None)
     return {it.between for it in against_}
 
@@ -46,6 +47,15 @@ def _contradictions(
 def test_copies_count_where_they_outvote_what_agrees(agreeing: list[Edge]) -> None:
     against: list[Edge] = [(1, 4), (2, 5)]
     assert _contradictions(agreeing, against, True, 0.9) == (set() if agreeing else set(against))
+
+
+@pytest.mark.parametrize(
+    ("guess", "counts"), [((2, 3), {(1, 4), (2, 5)}), ((1, 2), {(1, 4)}), ((0, 1), set())]
+)
+def test_across_a_guess_a_single_one_counts_whatever_agrees(guess: Edge, counts: set[Edge]) -> None:
+    """What agrees across a guess may be misled as the guess is."""
+    agreeing: list[Edge] = [(0, 2), (1, 3), (2, 4), (3, 5)]
+    assert _contradictions(agreeing, [(1, 4), (2, 5)], True, 0.9, guessed=frozenset({guess})) == counts
 
 
 @pytest.mark.parametrize(("covers", "counts"), [(0.9, True), (0.7, False)])

@@ -54,6 +54,15 @@ def test_an_interrupted_walk_is_joined_where_most_is_shared(share: float, other:
     assert joined or found.guessed == {(5, 6)}
 
 
+@pytest.mark.parametrize(("share", "guessed"), [(0.2, {(5, 6)}), (0.3, set())])
+def test_neighbours_that_share_few_features_are_a_guess(share: float, guessed: set[Edge]) -> None:
+    """Copies of houses all around cover as much as neighbours do, but the ground is not among them."""
+    pairs = tuple(Pair((row, row + 1), NOTHING, 0.8, share=share if row == 5 else 0.36) for row in range(11))
+    found = find_skeleton(Evidence(tuple(np.empty((0, 3)) for _ in range(12)), pairs))
+    assert found.tree == {pair.between for pair in pairs}
+    assert found.guessed == guessed
+
+
 def test_what_has_many_rivals_is_not_trusted_and_is_cut_at_them() -> None:
     edges = [(row, row + 1) for row in range(9)]
     evidence = _evidence(dict.fromkeys(edges, 0.9), 10, edges[:3])

@@ -44,7 +44,7 @@ def test_neighbours_in_order_outweigh_sides_that_look_the_same(tmp_path: Path) -
 def test_a_guess_where_the_walk_jumps_is_refuted_and_another_pair_joins_the_parts(tmp_path: Path) -> None:
     """The walk jumps to where the opposite side looks the same, and returns from there."""
     order = np.array([0, 1, 2, 3, 4, 5, 13, 12, 11, 10, 9, 8, 7, 6, 14, 15])
-    place = square(tmp_path, count=COUNT, order=order, points_by=2)
+    place = square(tmp_path, count=COUNT, order=order)
     found = _solve(place)
     assert found.skeleton.ordered and found.trusted
     assert _error(place, found) < 0.1
