@@ -1,6 +1,5 @@
 """The state of a model in training: its parameters with their Adam moments, row by row."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -89,11 +88,10 @@ class ModelState:
         Args: least and most; 0 = no bound.
         """
         if least > 0 or most > 0:
+            distance = self.units["means"][self.gaussians.scene, None]
+            low, high = ((distance * part).log_() if part > 0 else None for part in (least, most))
             scales = self.gaussians.scales[self.gaussians.scene]
-            distance = self.units["means"][self.gaussians.scene, None].log()
-            low = math.log(least) if least > 0 else -math.inf
-            high = math.log(most) if most > 0 else math.inf
-            torch.clamp(scales, distance + low, distance + high, out=scales)
+            torch.clamp(scales, low, high, out=scales)
 
     def rearrange(self, source: Tensor, new: Tensor, sky: int) -> None:
         """Row i becomes a copy of row source[i], with zero moments if it is `new`.
