@@ -152,15 +152,15 @@ class Schedule:
         return math.exp((1 - share) * math.log(first) + share * math.log(rates.position_final))
 
     def opacity(self, iteration: int) -> float:
-        """The rate of logit opacities of Stage I: it decays exponentially where it has a last value.
+        """The rate of logit opacities of Stage I, which decays exponentially where a last one is set.
 
-        As that of positions, the last one is larger in a shorter run, but not more than the first.
+        The last rate is larger in a shorter run, as those of positions are, but not more than the first.
         """
         rates = self.config.optimizer
         if rates.opacity_final is None or rates.opacity == 0:
             return rates.opacity
-        last = min(1.0, self.length**2 * rates.opacity_final / rates.opacity)
-        return float(rates.opacity * last ** (iteration / self.iterations))
+        last = min(rates.opacity, self.length**2 * rates.opacity_final)
+        return self._decayed(rates.opacity, last, iteration)
 
     def cooling(self, iteration: int) -> float:
         """The rate of positions over the first one of Stage I, at most 1."""
@@ -179,7 +179,11 @@ class Schedule:
         depth = self.config.depth
         if depth.w0 == 0:
             return 0.0
-        return float(depth.w0 * (depth.wT / depth.w0) ** (iteration / self.iterations))
+        return self._decayed(depth.w0, depth.wT, iteration)
+
+    def _decayed(self, first: float, last: float, iteration: int) -> float:
+        """A value that decays exponentially from the first at iteration 0 to the last at the end."""
+        return float(first * (last / first) ** (iteration / self.iterations))
 
     def sizes(self, width: int) -> tuple[float, float]:
         """The bounds of scales, as `ModelState.bound` takes them, of panoramas `width` pixels wide."""
