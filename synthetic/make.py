@@ -40,6 +40,11 @@ class Place:
     smallest: float = 0.0  # share of a pixel; shapes that look smaller are left out of a panorama
     held_out: int = 0  # how many panoramas, the last ones, are the test split and no part of the cloud
 
+    @property
+    def training(self) -> int:
+        """How many panoramas, the first ones, train and make the cloud."""
+        return len(self.centers) - self.held_out
+
     def with_between(self) -> "Place":
         """The place with panoramas half-way between neighbours on its path, which are held out."""
         ways = np.diff(self.centers, axis=0)
@@ -189,7 +194,7 @@ def make_place(
     panoramas = len(place.centers)
     for part in ("images", "depths", "skymasks"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    shoot = _Shoot(folder, place, width, 2 * points // (panoramas - place.held_out) + 1, seed)
+    shoot = _Shoot(folder, place, width, 2 * points // place.training + 1, seed)
     samples: list[SurfaceSample] = []
     rows: list[NDArray[np.int64]] = []
     progress(0, 2 * panoramas)
@@ -197,14 +202,14 @@ def make_place(
         for done, sample in enumerate(pool.map(partial(_panorama, shoot), range(panoramas)), start=1):
             samples.append(sample)
             progress(done, 2 * panoramas)
-        cloud = concatenate_samples(samples[: panoramas - place.held_out])
+        cloud = concatenate_samples(samples[: place.training])
         for seen in pool.map(
             partial(visible_rows, place.scenery, cloud.points, far=place.far), place.centers
         ):
             rows.append(seen)
             progress(panoramas + len(rows), 2 * panoramas)
     if place.held_out:
-        test = [shoot.image(row).removesuffix(".png") for row in range(panoramas - place.held_out, panoramas)]
+        test = [shoot.image(row).removesuffix(".png") for row in range(place.training, panoramas)]
         write_bytes(folder / "test.txt", "".join(f"{stem}\n" for stem in test).encode())
     _write_model(shoot, cloud, rows, points)
     return folder
@@ -242,8 +247,7 @@ def _depth_map(shoot: _Shoot, index: int, among: NDArray[np.int64] | None) -> ND
 
 def _write_model(shoot: _Shoot, cloud: SurfaceSample, rows: list[NDArray[np.int64]], points: int) -> None:
     """Keeps `points` of the cloud that two training panoramas see, adds an error, and writes sparse/0."""
-    training = len(rows) - shoot.place.held_out
-    views = np.bincount(np.concatenate(rows[:training]), minlength=len(cloud.points))
+    views = np.bincount(np.concatenate(rows[: shoot.place.training]), minlength=len(cloud.points))
     random = np.random.default_rng([shoot.seed, 5])
     kept = np.sort(random.permutation(np.flatnonzero(views >= 2))[:points])
     row_of = np.full(len(cloud.points), -1)
