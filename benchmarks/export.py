@@ -137,7 +137,7 @@ def _export(source: Path, output: Path, arguments: list[str]) -> _Exported:
 
 
 def _digest(folder: Path) -> str:
-    """Of the names and bytes of all files in a folder."""
+    """The SHA-256 of the names and bytes of all files in a folder."""
     found = hashlib.sha256()
     for file in sorted(filter(Path.is_file, folder.rglob("*"))):
         found.update(str(file.relative_to(folder)).encode() + file.read_bytes())
