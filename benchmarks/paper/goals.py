@@ -102,11 +102,11 @@ def _sooner(results: Results) -> Iterator[Goal]:
 
 
 def _sooner_than(results: Results, scene: str, base: str, names: Sequence[str]) -> Iterator[Goal]:
-    """Whether the first of some variants to reach the final quality of `base` takes a third of its time."""
+    """Whether a variant reaches the final quality of `base` in a third of its time, on the same machine."""
     slower = results.first(scene, base)
-    final = slower.metric("ws_psnr") if slower else None
-    curves = [run for name in names if (run := results.first(scene, name)) and run.curve]
-    if slower is None or final is None or not curves:
+    found = filter(None, (results.first(scene, name) for name in names))
+    curves = [run for run in found if run.curve and slower and run.machine == slower.machine]
+    if slower is None or (final := slower.metric("ws_psnr")) is None or not curves:
         return
     times = [(when, run) for run in curves if (when := reached(run.curve, final)) is not None]
     measured, met = "not reached", False

@@ -120,6 +120,8 @@ def test_the_time_to_the_quality_of_another_recipe_is_a_third_at_most() -> None:
         runs[0] = replace(runs[0], seconds={"coarse": seconds})
         found = {goal.name: (goal.measured, goal.met) for goal in goals.goals(Results(runs), {})}
         assert found[name] == (measured, seconds == 100.0)
+    runs[0] = replace(runs[0], machine="another")  # its seconds are not those of this one
+    assert name not in {goal.name for goal in goals.goals(Results(runs), {})}
 
 
 def test_the_time_at_a_level_is_between_two_states() -> None:
