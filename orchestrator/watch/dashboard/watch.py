@@ -1,6 +1,5 @@
 """One run, read once for all its clients: only what has changed since the last time is read."""
 
-import json
 import sqlite3
 import threading
 import time
@@ -10,35 +9,26 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.runs import lock, presence, reading
-from panolog.orchestrator.runs.folder import INFO_BYTES, RunFolder, shown_model
+from panolog.orchestrator.runs.folder import RunFolder, read_json, shown_model
 from panolog.orchestrator.runs.records import RunBegan, RunEnded, Stored
 from panolog.orchestrator.runs.storage.state import read_state
 from panolog.orchestrator.runs.store import as_event, read_milestones, read_news
 from panolog.orchestrator.watch.dashboard import actions
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry, require_plain
-from panolog.orchestrator.watch.dashboard.messages import Actions, Results, RunChanges, RunPage, RunRow
+from panolog.orchestrator.watch.dashboard.messages import Results, RunChanges, RunPage, RunRow
 from panolog.orchestrator.watch.views import queries
+from panolog.orchestrator.watch.views.comparison.reading import DAMAGED
 from panolog.orchestrator.watch.views.history import History, without_older_progress
 from panolog.orchestrator.watch.views.pages.encoding import encode
 from panolog.orchestrator.watch.views.pages.findings import findings_version
 from panolog.orchestrator.watch.views.preparation import stamp_of, version_of, view_preparation, with_step
 from panolog.orchestrator.watch.views.queries import LOCK_TIMEOUT_S
-from panolog.orchestrator.watch.views.run_view import view_run
+from panolog.orchestrator.watch.views.run_view import RunView, view_run
 from panolog.orchestrator.watch.views.summary import Summary
 from panolog.scene.errors import InputError
 
 # What reading a run folder raises if it is of another version, damaged, or made to do harm.
-UNREADABLE = (
-    InputError,
-    OSError,
-    sqlite3.Error,
-    ValueError,
-    TypeError,
-    KeyError,
-    AttributeError,
-    ArithmeticError,
-    RecursionError,
-)
+UNREADABLE = (InputError, OSError, sqlite3.Error, *DAMAGED)
 _BATCH = 5_000  # records that are applied one by one; after more the state is read anew
 _RECENT = 2_000  # records that are kept for clients that are a little behind
 _UNUSED_S = 60.0  # after which only the row of a run without clients is kept
@@ -178,7 +168,6 @@ class Watch:
         entry, folder = self.entry, self.entry.folder
         require_plain(entry)
         running = lock.held(folder.lock)  # before the records, so that all that an ended driver wrote is read
-        raw = folder.read(folder.info, INFO_BYTES)
         stamp = _database_stamp(folder.database)
         tasks = self._read_records(stamp)
         available = actions.available_actions(entry, self.history, self.resumed, running=running)
@@ -196,16 +185,13 @@ class Watch:
         mirror = read_state(folder.mirror, running=running)
         store = mirror.brief if mirror else ""
         files, clock = stamp_of(folder), _clock(running=running)
-        page_stamp = (running, raw, stamp, available, result, waiting, files, store, clock)
+        info = version_of(folder.info)  # before the file is read
+        page_stamp = (running, info, stamp, available, result, waiting, files, store, clock)
         if page_stamp == self._page_stamp:
             return
-        try:
-            info = json.loads(raw)
-        except ValueError as error:
-            raise InputError(f"run.json is not JSON: {error}") from error
-        if not isinstance(info, dict):
-            raise InputError("run.json holds no object")
-        page = self._page(info, available, result, waiting, store, running=running)
+        view = self._view(read_json(folder), waiting, store, running=running)
+        own = {"id": entry.id, "name": entry.name, "path": str(folder.root)}
+        page = RunPage(**dict(view), **own, actions=available, result=result)
         self._publish(page, tasks, fresh=not self._page_stamp or self._page_stamp[:2] != page_stamp[:2])
         self._page_stamp = page_stamp
 
@@ -230,21 +216,12 @@ class Watch:
         self._database = stamp
         return changed
 
-    def _page(
-        self,
-        info: dict[str, Any],
-        available: Actions,
-        result: Results,
-        waiting: str,
-        store: str,
-        *,
-        running: bool,
-    ) -> RunPage:
-        entry, folder = self.entry, self.entry.folder
+    def _view(self, info: dict[str, Any], waiting: str, store: str, *, running: bool) -> RunView:
+        folder = self.entry.folder
         usages = queries.usages(folder.database) if running and folder.database.exists() else {}
         prepared = view_preparation(folder, self.history.state, running=running)
         history = replace(self.history, state=with_step(self.history.state, prepared))
-        view = view_run(
+        return view_run(
             history,
             info,
             running=running,
@@ -253,10 +230,6 @@ class Watch:
             waiting=waiting,
             preparation=prepared,
             store=store,
-        )
-        path = str(folder.root)
-        return RunPage(
-            **dict(view), id=entry.id, name=entry.name, path=path, actions=available, result=result
         )
 
     def _publish(self, page: RunPage, tasks: set[str] | None, *, fresh: bool) -> None:
