@@ -103,6 +103,7 @@ from panolog.orchestrator.watch.views.plan_page import (
     scores_of,
     view_camera,
 )
+from panolog.orchestrator.watch.views.run_view import part_of
 from panolog.scene.errors import InputError
 from panolog.scene.stores.outline import local_folder, made_here
 from panolog.scene.stores.url import is_url
@@ -211,8 +212,7 @@ def scene_of(run: Watch) -> Path:
 
     Raises InputError if it has recorded none, or this machine has not read what is at the URL.
     """
-    scene = run.snapshot.page.info.get("scene") if run.snapshot.page else None
-    path = scene.get("path") if isinstance(scene, dict) else None
+    path = part_of(run.snapshot.page.info, "scene").get("path") if run.snapshot.page else None
     if not isinstance(path, str) or "\0" in path:
         raise InputError("run.json names no scene")
     folder = local_folder(path)

@@ -6,11 +6,12 @@ from typing import Any
 from pydantic import ConfigDict
 
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
+from panolog.orchestrator.watch.views.comparison.measured import whole
 from panolog.orchestrator.watch.views.comparison.schema import Comparison, CurvesOfRuns
 from panolog.orchestrator.watch.views.exposures import ExposureCurve
 from panolog.orchestrator.watch.views.pages.findings import Findings
 from panolog.orchestrator.watch.views.plan_page import BlockCameras, CameraView
-from panolog.orchestrator.watch.views.run_view import LiveView, RunView, scene_name
+from panolog.orchestrator.watch.views.run_view import LiveView, RunView, part_of, scene_name
 from panolog.orchestrator.watch.views.summary import STAGES, SummaryHead, TaskView, Text, ViewModel
 
 
@@ -92,9 +93,7 @@ class RunRow(ViewModel):
     @staticmethod
     def of_page(page: RunPage, cover: int | None = None) -> "RunRow":
         """The row of a run that could be read. Args: cover, the event of its picture."""
-        summary, config = page.summary, page.info.get("config")
-        model = summary.model
-        settings = config if isinstance(config, dict) else {}
+        summary, model, settings = page.summary, page.summary.model, part_of(page.info, "config")
         return RunRow(
             id=page.id,
             name=page.name,
@@ -111,8 +110,8 @@ class RunRow(ViewModel):
             created=_epoch(page.info.get("created")) or page.began,
             latest=page.latest,
             seconds=summary.seconds,
-            width=_whole(settings.get("width")),
-            iterations=_whole(settings.get("iterations")),
+            width=whole(settings.get("width")),
+            iterations=whole(settings.get("iterations")),
             blocks=len(summary.blocks) or None,
             cover=cover,
         )
@@ -121,11 +120,6 @@ class RunRow(ViewModel):
     def unread(entry: RunEntry) -> "RunRow":
         """The row of a run of which only its place is known."""
         return RunRow(id=entry.id, name=entry.name)
-
-
-def _whole(value: Any) -> int | None:
-    """A number in run.json."""
-    return value if isinstance(value, int) else None
 
 
 def _epoch(moment: Any) -> float | None:

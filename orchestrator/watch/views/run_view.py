@@ -108,10 +108,16 @@ class RunView(LiveView):
     config: tuple[SettingView, ...]
 
 
+def part_of(info: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """An object in run.json, such as its settings; {} if what run.json holds there is none."""
+    found = info.get(key)
+    return found if isinstance(found, dict) else {}
+
+
 def scene_name(run: RunView) -> str:
     """The name of a run's scene, or of what the run makes its scene of."""
-    scene, made = run.info.get("scene"), run.preparation
-    source = made.source if made else str(scene.get("path", "")) if isinstance(scene, dict) else ""
+    made = run.preparation
+    source = made.source if made else str(part_of(run.info, "scene").get("path", ""))
     return Path(source).name + (f" and {len(made.others)} more" if made and made.others else "")
 
 
@@ -161,17 +167,17 @@ def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: fl
     """The stages of a run in their order, also those to come. Args: now, epoch seconds."""
     state = history.state if running else at_rest(history.state)
     planned = {task.stage for tasks in state.between for task in tasks}
-    refines = _setting(info, "refine", default=True)
+    config = part_of(info, "config")
     shown = {
         Stage.PREPARE: Stage.PREPARE in history.spans,
         Stage.CALIBRATE: not history.spans.keys().isdisjoint((Stage.PREPARE, Stage.CALIBRATE)),
-        Stage.DISTRICT: _setting(info, "districts", default=1) != 1,
-        **dict.fromkeys((Stage.SCORE, Stage.PLAN, Stage.BLOCK), refines),
+        Stage.DISTRICT: config.get("districts", 1) != 1,
+        **dict.fromkeys((Stage.SCORE, Stage.PLAN, Stage.BLOCK), config.get("refine", True)),
         Stage.UNION: False,  # it takes next to no time
         Stage.ROUND: Stage.ROUND in planned,
         Stage.REPAIR: Stage.REPAIR in planned,
         Stage.MEASURE: bool(state.measures),
-        Stage.DELIVER: _setting(info, "deliver", default=False),  # older versions did not
+        Stage.DELIVER: config.get("deliver", False),  # older versions did not
     }
     every = tasks_of(state)
     for name in map(Stage, STAGES):
@@ -234,12 +240,6 @@ def _stage_status(
     if Status.FAILED in statuses and (not running or statuses <= {Status.DONE, Status.FAILED}):
         return Status.FAILED
     return STOPPED if statuses and begun and not running else Status.WAITING
-
-
-def _setting(info: Mapping[str, Any], key: str, *, default: Any) -> Any:
-    """A setting of run.json, whatever that holds."""
-    config = info.get("config")
-    return config.get(key, default) if isinstance(config, dict) else default
 
 
 def _nodes(

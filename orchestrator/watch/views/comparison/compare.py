@@ -5,9 +5,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
+from panolog.orchestrator.runs.folder import flat
 from panolog.orchestrator.runs.state import Status
 from panolog.orchestrator.watch.views.comparison.fairness import warnings
-from panolog.orchestrator.watch.views.comparison.measured import Measured, finite
+from panolog.orchestrator.watch.views.comparison.measured import Measured, finite, whole
 from panolog.orchestrator.watch.views.comparison.reading import ReadRun, UnreadRun
 from panolog.orchestrator.watch.views.comparison.schema import (
     LOWER_IS_BETTER,
@@ -21,7 +22,7 @@ from panolog.orchestrator.watch.views.comparison.schema import (
     Trained,
 )
 from panolog.orchestrator.watch.views.palette import block_color
-from panolog.orchestrator.watch.views.run_view import RunView, scene_name
+from panolog.orchestrator.watch.views.run_view import RunView, part_of, scene_name
 from panolog.orchestrator.watch.views.summary import STAGES, TaskView
 from panolog.scene.files import natural_key
 from panolog.workers.tasks import Stage, TaskId
@@ -64,10 +65,7 @@ def _shown(run: ReadRun | UnreadRun, color: str, first: ReadRun | None) -> Compa
     if isinstance(run, UnreadRun):
         return ComparedRun(id=run.id, name=run.name, color=color, error=run.error)
     view, summary = run.view, run.view.summary
-    scene = view.info.get("scene")
-    known = scene if isinstance(scene, dict) else {}
     settings = {setting.key: setting.value for setting in view.config}
-    versions = view.info.get("versions")
     trained = [(TaskId.parse(task.name).stage, task) for task in summary.tasks]
     blocks = [task for stage, task in trained if stage is Stage.BLOCK]
     return ComparedRun(
@@ -80,10 +78,10 @@ def _shown(run: ReadRun | UnreadRun, color: str, first: ReadRun | None) -> Compa
         stage=STAGES.get(summary.stage, ""),
         progress=finite(view.progress) or 0.0,
         scene=scene_name(view)[:_LONG] or None,
-        fingerprint=_text(known, "fingerprint"),
-        version=_text(versions if isinstance(versions, dict) else {}, "panolog"),
+        fingerprint=_text(part_of(view.info, "scene"), "fingerprint"),
+        version=_text(part_of(view.info, "versions"), "panolog"),
         recipe=_text(settings, "recipe"),
-        width=_int(settings.get("width")),
+        width=whole(settings.get("width")),
         stage_one=_trained([task for stage, task in trained if stage.trains and not stage.refines]),
         blocks=len(summary.blocks) or None,
         blocks_done=sum(task.status == Status.DONE for task in blocks) if summary.blocks else None,
@@ -106,10 +104,6 @@ def _shown(run: ReadRun | UnreadRun, color: str, first: ReadRun | None) -> Compa
 def _text(values: Mapping[str, Any], key: str) -> str | None:
     """A value of run.json as text that is not too long; None if there is none."""
     return None if values.get(key) is None else str(values[key])[:_LONG]
-
-
-def _int(value: Any) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) else None
 
 
 def _trained(tasks: Sequence[TaskView]) -> Trained | None:
@@ -172,8 +166,9 @@ def _settings(runs: Sequence[ReadRun | UnreadRun]) -> Iterator[DifferentSetting]
     read = [run.view for run in runs if isinstance(run, ReadRun)]
     keys = {setting.key: setting.unit_or_doc for view in read for setting in view.config}
     values = [{setting.key: setting.value for setting in view.config} for view in read]
+    given_by = [dict(flat(part_of(view.info, "config"))) for view in read]
     for key, doc in keys.items():
-        known = [_has(view.info.get("config"), key) for view in read]
+        known = [key in given for given in given_by]
         found = [table.get(key) for table in values]
         if len(set(known)) > 1 or any(value != found[0] for value in found):
             given = iter(zip(found, known, strict=True))
@@ -184,15 +179,6 @@ def _settings(runs: Sequence[ReadRun | UnreadRun]) -> Iterator[DifferentSetting]
                 known=tuple(there for _, there in cells),
                 doc=doc,
             )
-
-
-def _has(config: Any, key: str) -> bool:
-    """Whether run.json has a setting."""
-    for part in key.split("."):
-        if not isinstance(config, dict) or part not in config:
-            return False
-        config = config[part]
-    return True
 
 
 def _shortened(value: Any) -> Any:

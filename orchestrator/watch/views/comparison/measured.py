@@ -46,12 +46,12 @@ def read_measured(folder: RunFolder) -> Measured | None:
     items = list(given.items())[:_VIEWS] if isinstance(given, dict) else []
     views = {name: _values(values) for name, values in items}
     head = MeasuredView(
-        width=_whole(content.get("width")),
+        width=whole(content.get("width")),
         crop_bottom=_number(content.get("crop_bottom")),
         detail=_number(content.get("detail")),
         panoramas=len(views),
         left_out=len(left_out) if isinstance(left_out, dict) else 0,
-        gaussians=_whole(content.get("gaussians")),
+        gaussians=whole(content.get("gaussians")),
     )
     mean = means(views.values()) if views else _values(content.get("mean"))
     return Measured(head, views, mean)
@@ -93,7 +93,7 @@ def _number(value: Any) -> float | None:
     return finite(number)
 
 
-def _whole(value: Any) -> int | None:
+def whole(value: Any) -> int | None:
     """A whole number that is not negative; None for all else."""
     number = _number(value)
     return int(number) if number is not None and number >= 0 and number == int(number) else None
