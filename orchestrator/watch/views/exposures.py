@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.watch.views.queries import spread
 from panolog.orchestrator.watch.views.summary import Text, ViewModel
 
 _MOST = 20_000_000  # of the file: 50,000 panoramas and more
@@ -41,8 +42,7 @@ def exposure_curve(folder: RunFolder) -> ExposureCurve | None:
         return None
     if not found:
         return None
-    rows = np.unique(np.linspace(0, len(found) - 1, min(_POINTS, len(found))).round().astype(int))
-    chosen = [found[row] for row in rows]
+    chosen = spread(found, _POINTS)
     red, green, blue = np.log2([panorama.gain for panorama in chosen]).T.round(4).tolist()
     return ExposureCurve(
         name=tuple(panorama.name for panorama in chosen),

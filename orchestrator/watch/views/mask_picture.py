@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.orchestrator.watch.views.queries import spread
 from panolog.prepare.panorama_files import PanoramaFile, load_resized
 from panolog.prepare.provenance import read_mask
 from panolog.scene.files import write_bytes
@@ -24,8 +25,7 @@ def write_mask_picture(path: Path, panoramas: Sequence[PanoramaFile]) -> None:
 
     Raises SceneError if a panorama or a mask is damaged; OSError if the picture cannot be written.
     """
-    rows = np.unique(np.linspace(0, len(panoramas) - 1, min(_MOST, len(panoramas))).round().astype(int))
-    tiles = [_tile(panoramas[row]) for row in rows]
+    tiles = [_tile(panorama) for panorama in spread(panoramas, _MOST)]
     columns = min(_COLUMNS, len(tiles))
     height = -(-len(tiles) // columns)
     sheet = np.full(
