@@ -39,14 +39,15 @@ _TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Record.__args__}
 _USAGE_S = 0.5  # to wait for the locks of readers before usage, which is replaced soon
 _LATEST = (Progressed.__name__, CheckpointSaved.__name__)  # of these only the last of a task matters to state
 PICTURES = "type IN ('PreviewSaved', 'ViewEvaluated')"  # found by an index
-_MILESTONE = "type NOT IN ('Progressed', 'CheckpointSaved', 'PreviewSaved', 'ViewEvaluated')"
+EVENT = "SELECT id, time, type, payload FROM events"
+MILESTONE = "type NOT IN ('Progressed', 'CheckpointSaved', 'PreviewSaved', 'ViewEvaluated')"
 _SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS events (
     id INTEGER PRIMARY KEY, time REAL NOT NULL,
     task TEXT NOT NULL, type TEXT NOT NULL, payload TEXT NOT NULL);
 CREATE INDEX IF NOT EXISTS latest_progress ON events (task, id) WHERE type = 'Progressed';
 CREATE INDEX IF NOT EXISTS latest_checkpoint ON events (task, id) WHERE type = 'CheckpointSaved';
-CREATE INDEX IF NOT EXISTS state ON events (id) WHERE {_MILESTONE};
+CREATE INDEX IF NOT EXISTS state ON events (id) WHERE {MILESTONE};
 CREATE INDEX IF NOT EXISTS pictures ON events (type, task, id) WHERE {PICTURES};
 CREATE INDEX IF NOT EXISTS drivers ON events (id) WHERE type = 'RunBegan';
 CREATE TABLE IF NOT EXISTS latest (
@@ -68,13 +69,7 @@ SELECT id, time, type, payload FROM events WHERE id IN (
     SELECT (SELECT MAX(id) FROM events WHERE type = '{0}' AND task = name) FROM tasks WHERE name IS NOT NULL)
 """
 # What state needs of a run: thousands of rows instead of millions.
-_STATE = " UNION ALL ".join(
-    [
-        f"SELECT id, time, type, payload FROM events WHERE {_MILESTONE}",
-        *(_LAST.format(kind) for kind in _LATEST),
-    ]
-)
-_EVENT = "SELECT id, time, type, payload FROM events"
+_STATE = " UNION ALL ".join([f"{EVENT} WHERE {MILESTONE}", *(_LAST.format(kind) for kind in _LATEST)])
 # The latest progress of tasks that is not stored as an event.
 _PROGRESS = """
 SELECT id, time, 'Progressed', payload FROM latest WHERE NOT EXISTS (
@@ -252,7 +247,7 @@ def read_records(
     path: Path, after: int = 0, limit: int = 1000, *, timeout_s: float = TIMEOUT_S
 ) -> list[Stored]:
     """At most `limit` stored records that follow the id `after`. Raises as `read_milestones`."""
-    sql = f"{_EVENT} WHERE id > ? ORDER BY id LIMIT ?"
+    sql = f"{EVENT} WHERE id > ? ORDER BY id LIMIT ?"
     return _stored(query(path, sql, (after, limit), timeout_s=timeout_s))
 
 
@@ -260,7 +255,7 @@ def read_news(path: Path, after: int, limit: int, *, timeout_s: float = TIMEOUT_
     """The same with the latest progress of each task, stored or not. Raises as `read_milestones`."""
     if not has_table(path, "latest", timeout_s=timeout_s):
         return read_records(path, after, limit, timeout_s=timeout_s)
-    sql = f"SELECT * FROM ({_EVENT} WHERE id > :after ORDER BY id LIMIT :limit) UNION ALL {_PROGRESS}"
+    sql = f"SELECT * FROM ({EVENT} WHERE id > :after ORDER BY id LIMIT :limit) UNION ALL {_PROGRESS}"
     sql += " AND id > :after ORDER BY id LIMIT :limit"
     return _stored(query(path, sql, {"after": after, "limit": limit}, timeout_s=timeout_s))
 

@@ -7,24 +7,21 @@ end of the table.
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from panolog.orchestrator.runs.reading import has_table, query
-from panolog.orchestrator.runs.store import PICTURES
+from panolog.orchestrator.runs.store import EVENT, MILESTONE, PICTURES
 
 LOCK_TIMEOUT_S = 5.0  # to wait for the driver, which locks the database for milliseconds
 SEARCHED = 50_000  # records that one search for a text reads
+_query = partial(query, timeout_s=LOCK_TIMEOUT_S)
 _Item = TypeVar("_Item")
 _VIEWS = 2_000  # held-out panoramas of which the best is found
 _PREVIEWS = 200  # of a task, at most
-_EVENT = "SELECT id, time, type, payload FROM events"
-_KINDS = (  # the parts of the table that have an index by task, or are small
-    "type = 'Progressed'",
-    "type = 'CheckpointSaved'",
-    PICTURES,
-    "type NOT IN ('Progressed', 'CheckpointSaved', 'PreviewSaved', 'ViewEvaluated')",
-)
+# The parts of the table that have an index by task, or are small.
+_KINDS = ("type = 'Progressed'", "type = 'CheckpointSaved'", PICTURES, MILESTONE)
 _NAMES = """
 WITH RECURSIVE names(name) AS (
     SELECT MIN(name) FROM metrics WHERE task = :task
@@ -75,12 +72,11 @@ def series(
     Args: only, the names that are wanted; by default all.
     Raises InputError as `reading.query`.
     """
-    names = [name for (name,) in query(path, _NAMES, {"task": task}, timeout_s=LOCK_TIMEOUT_S)]
+    names = [name for (name,) in _query(path, _NAMES, {"task": task})]
     names = [name for name in names if only is None or name in only]
     curves = {}
     for name in names:
-        values = {"task": task, "name": name, "points": points}
-        rows = query(path, _SERIES, values, timeout_s=LOCK_TIMEOUT_S)
+        rows = _query(path, _SERIES, {"task": task, "name": name, "points": points})
         curves[name] = {
             "iteration": [row[0] for row in rows],
             "time": [row[1] for row in rows],
@@ -110,19 +106,19 @@ def previews(path: Path, task: str | None = None) -> list[dict[str, Any]]:
     """The latest previews: of one task newest first, or without `task` the latest of each task."""
     kind = f"{PICTURES} AND type = 'PreviewSaved'"
     if task is not None:
-        sql = f"{_EVENT} WHERE {kind} AND task = ? ORDER BY id DESC LIMIT ?"
-        rows = query(path, sql, (task, _PREVIEWS), timeout_s=LOCK_TIMEOUT_S)
+        sql = f"{EVENT} WHERE {kind} AND task = ? ORDER BY id DESC LIMIT ?"
+        rows = _query(path, sql, (task, _PREVIEWS))
     else:
         sql = f"SELECT MAX(id) FROM events WHERE {kind} GROUP BY task"
-        rows = query(path, f"{_EVENT} WHERE id IN ({sql}) ORDER BY task", timeout_s=LOCK_TIMEOUT_S)
+        rows = _query(path, f"{EVENT} WHERE id IN ({sql}) ORDER BY task")
     return [_event(row) for row in rows]
 
 
 def views(path: Path, most: int) -> list[dict[str, Any]]:
     """The latest comparisons of held-out panoramas, of whichever task, newest first."""
     last = f"SELECT id FROM events INDEXED BY pictures WHERE {PICTURES} AND type = 'ViewEvaluated'"
-    sql = f"{_EVENT} WHERE id IN ({last} ORDER BY id DESC LIMIT ?) ORDER BY id DESC"
-    return [_event(row) for row in query(path, sql, (most,), timeout_s=LOCK_TIMEOUT_S)]
+    sql = f"{EVENT} WHERE id IN ({last} ORDER BY id DESC LIMIT ?) ORDER BY id DESC"
+    return [_event(row) for row in _query(path, sql, (most,))]
 
 
 def cover(path: Path, *, evaluated: bool) -> int | None:
@@ -135,7 +131,7 @@ def cover(path: Path, *, evaluated: bool) -> int | None:
         return None
     if evaluated and (found := views(path, _VIEWS)):
         return int(max(found, key=lambda event: (event.get("metrics") or {}).get("psnr") or 0.0)["id"])
-    rows = query(path, f"SELECT MAX(id) FROM events WHERE {PICTURES}", timeout_s=LOCK_TIMEOUT_S)
+    rows = _query(path, f"SELECT MAX(id) FROM events WHERE {PICTURES}")
     return rows[0][0] if rows else None
 
 
@@ -146,13 +142,13 @@ def usages(path: Path) -> dict[str, dict[str, Any]]:
     """
     if not has_table(path, "nodes", timeout_s=LOCK_TIMEOUT_S):  # of an older version
         return {}
-    rows = query(path, "SELECT node, time, usage FROM nodes", timeout_s=LOCK_TIMEOUT_S)
+    rows = _query(path, "SELECT node, time, usage FROM nodes")
     return {node: {**json.loads(text), "time": time} for node, time, text in rows}
 
 
 def event(path: Path, number: int, kind: str) -> dict[str, Any] | None:
     """One event by its id, if there is one of that type."""
-    rows = query(path, f"{_EVENT} WHERE id = ? AND type = ?", (number, kind), timeout_s=LOCK_TIMEOUT_S)
+    rows = _query(path, f"{EVENT} WHERE id = ? AND type = ?", (number, kind))
     return _event(rows[0]) if rows else None
 
 
@@ -160,11 +156,11 @@ def _page(path: Path, wanted: Filter, limit: int) -> list[tuple[Any, ...]]:
     """The newest `limit` rows, newest first; each kind of record by its own index."""
     bounds, values = _bounds(wanted)
     if wanted.task is None and not wanted.types:
-        sql = f"{_EVENT} WHERE {bounds} ORDER BY id DESC LIMIT ?"
-        return query(path, sql, (*values, limit), timeout_s=LOCK_TIMEOUT_S)
-    part = f"SELECT * FROM ({_EVENT} WHERE {{}} AND {bounds} ORDER BY id DESC LIMIT ?)"
+        sql = f"{EVENT} WHERE {bounds} ORDER BY id DESC LIMIT ?"
+        return _query(path, sql, (*values, limit))
+    part = f"SELECT * FROM ({EVENT} WHERE {{}} AND {bounds} ORDER BY id DESC LIMIT ?)"
     sql = " UNION ALL ".join(part.format(kind) for kind in _KINDS) + " ORDER BY id DESC LIMIT ?"
-    return query(path, sql, (*(*values, limit) * len(_KINDS), limit), timeout_s=LOCK_TIMEOUT_S)
+    return _query(path, sql, (*(*values, limit) * len(_KINDS), limit))
 
 
 def _search(path: Path, wanted: Filter, limit: int) -> tuple[list[tuple[Any, ...]], int | None]:
