@@ -20,7 +20,7 @@ from panolog.orchestrator.runs.folder import RunFolder, open_below, opened
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.views import queries
 from panolog.orchestrator.watch.views.pages.findings import finding_pictures, read_findings
-from panolog.orchestrator.watch.views.preparation import picture_path
+from panolog.orchestrator.watch.views.preparation import picture_paths
 from panolog.orchestrator.watch.views.site.photographs import STORE_S, require_size, small_copy
 from panolog.scene.errors import InputError, StoreLostError
 from panolog.scene.files import natural_key
@@ -90,7 +90,7 @@ def cover(entry: RunEntry, number: int) -> Response:
 
 def of_preparation(entry: RunEntry, name: str) -> Response:
     """A picture that a step of the preparation has made. Raises InputError as `preview`."""
-    return _own(entry, picture_path(entry.folder, name))
+    return _own(entry, picture_paths(entry.folder).get(name))
 
 
 def of_findings(entry: RunEntry, name: str) -> Response:

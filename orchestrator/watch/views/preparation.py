@@ -16,7 +16,7 @@ from panolog.scene.errors import InputError
 
 STEPS = {Step.MASKS: "masks", Step.SFM: "poses and points", Step.DEPTH: "depth", Step.CHECK: "check"}
 _LINES = 12  # of a step that are shown
-PICTURES = {"sfm": "Poses from above", "masks": "Masks, in red"}
+_PICTURES = {"sfm": "Poses from above", "masks": "Masks, in red"}
 
 
 class StepView(ViewModel):
@@ -59,10 +59,9 @@ class PreparationView(ViewModel):
     pictures: tuple[PictureView, ...]
 
 
-def picture_path(folder: RunFolder, name: str) -> Path | None:
-    """Where a picture of PICTURES is; None for another name."""
-    paths = {"sfm": notes.sfm_picture(folder), "masks": notes.masks_picture(folder)}
-    return paths.get(name)
+def picture_paths(folder: RunFolder) -> dict[str, Path]:
+    """Where the pictures of `_PICTURES` are, by name."""
+    return {"sfm": notes.sfm_picture(folder), "masks": notes.masks_picture(folder)}
 
 
 def stamp_of(folder: RunFolder) -> tuple[object, ...]:
@@ -71,8 +70,7 @@ def stamp_of(folder: RunFolder) -> tuple[object, ...]:
         return ()
     files = [settings_path(folder), notes.progress_path(folder)]
     files += [notes.result_path(folder, step) for step in Step]
-    files += [path for name in PICTURES if (path := picture_path(folder, name)) is not None]
-    return tuple(_state(path) for path in files)
+    return tuple(_state(path) for path in (*files, *picture_paths(folder).values()))
 
 
 def view_preparation(folder: RunFolder, state: RunState, *, running: bool) -> PreparationView | None:
@@ -168,12 +166,9 @@ def _first(lines: Sequence[str]) -> tuple[str, ...]:
 
 
 def _pictures(folder: RunFolder) -> list[PictureView]:
-    views = []
-    for name, label in PICTURES.items():
-        path = picture_path(folder, name)
-        if path is not None and (version := version_of(path)) is not None:
-            views.append(PictureView(name=name, label=label, version=version))
-    return views
+    versions = {name: version_of(path) for name, path in picture_paths(folder).items()}
+    there = [(name, version) for name, version in versions.items() if version is not None]
+    return [PictureView(name=name, label=_PICTURES[name], version=version) for name, version in there]
 
 
 def version_of(path: Path) -> str | None:

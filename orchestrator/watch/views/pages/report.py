@@ -24,7 +24,7 @@ from panolog.orchestrator.watch.views.pages.shell import RUN, data_url, write_sn
 from panolog.orchestrator.watch.views.plan_page import cameras_of, map_of, plan_of, scores_of, view_camera
 from panolog.orchestrator.watch.views.preparation import (
     PreparationView,
-    picture_path,
+    picture_paths,
     version_of,
     view_preparation,
 )
@@ -120,8 +120,8 @@ def _answers(folder: RunFolder, view: RunView, found: Findings) -> Iterator[tupl
     for name, path in finding_pictures(folder, found).items():
         yield f"{_PATH}/findings/{name}", _picture(path)
     for picture in view.preparation.pictures if view.preparation else ():
-        if (made := picture_path(folder, picture.name)) is not None:
-            yield f"{_PATH}/preparation/{picture.name}?{picture.version}", _picture(made)
+        made = picture_paths(folder)[picture.name]
+        yield f"{_PATH}/preparation/{picture.name}?{picture.version}", _picture(made)
     if folder.exposure.is_file():
         yield f"{_PATH}/exposure", exposure_curve(folder)
     if folder.known_plan.exists():
