@@ -1,5 +1,6 @@
 """`panolog clean`: removes what of runs is superseded, under the lock of each, and says so in its history."""
 
+import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -10,14 +11,7 @@ from typing import Any
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder, removed_models, write_json
 from panolog.orchestrator.runs.records import Noticed
-from panolog.orchestrator.runs.retention.survey import (
-    Kind,
-    Removal,
-    Survey,
-    Wanted,
-    remove,
-    survey,
-)
+from panolog.orchestrator.runs.retention.survey import Kind, Removal, Survey, Wanted, survey
 from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.runs.units import DURATION, gib, seconds_of
 from panolog.scene.errors import ConfigError, PanologError, RunLockedError, in_one_line
@@ -104,16 +98,16 @@ def remove_all(folder: RunFolder, removals: Sequence[Removal]) -> Noticed | None
     Models are named in RUN/retention.json before they are removed, so that a reader of a model that is
     missing knows why. Raises OSError if that is impossible.
     """
-    names = {str(it.task) for it in removals if it.kind == Kind.MODELS}
-    if names:
+    models = [it for it in removals if it.kind == Kind.MODELS]
+    if models:
+        names = {str(it.task) for it in models}
         write_json(folder.retention, {"removed_models": sorted(names | removed_models(folder))})
     for removal in removals:
-        remove(removal)
-    return _notice(removals)
-
-
-def _notice(removals: Sequence[Removal]) -> Noticed | None:
-    models = [it for it in removals if it.kind == Kind.MODELS]
+        assert isinstance(removal.path, Path)  # `stores` removes what is in a store
+        if removal.path.is_dir() and not removal.path.is_symlink():
+            shutil.rmtree(removal.path)
+        else:
+            removal.path.unlink(missing_ok=True)
     if not models:
         return None
     size = gib(sum(it.size for it in models))

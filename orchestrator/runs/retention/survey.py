@@ -6,7 +6,6 @@ a task that is not done, the Stage I model and all results stay.
 """
 
 import os
-import shutil
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -165,12 +164,3 @@ def _file(folder: RunFolder, kind: Kind, path: Path, task: TaskId | None = None)
         return []
     below = path.parent.resolve().is_relative_to(folder.root.resolve())
     return [Removal(kind, path, status.st_size, task)] if below and stat.S_ISREG(status.st_mode) else []
-
-
-def remove(removal: Removal) -> None:
-    """Removes it, if it is still there. Raises OSError if that is impossible."""
-    assert isinstance(removal.path, Path)  # `stores` removes what is in a store
-    if removal.path.is_dir() and not removal.path.is_symlink():
-        shutil.rmtree(removal.path)
-    else:
-        removal.path.unlink(missing_ok=True)
