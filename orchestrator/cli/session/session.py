@@ -27,8 +27,8 @@ from panolog.orchestrator.runs import info as run_info
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import RunInfo
+from panolog.orchestrator.runs.money.account import lost_with_driver
 from panolog.orchestrator.runs.money.limits import Wanted
-from panolog.orchestrator.runs.money.losses import lost_with_driver
 from panolog.orchestrator.runs.money.prices import PriceList
 from panolog.orchestrator.runs.money.records import BudgetSet
 from panolog.orchestrator.runs.preparation.settings import Options, Settings, read_settings, write_settings

@@ -18,7 +18,7 @@ from panolog.orchestrator.engine.scheduling.scaling import STARTUP_S
 from panolog.orchestrator.runs.clock import Clock
 from panolog.orchestrator.runs.machines.nodes import OWN, Node
 from panolog.orchestrator.runs.money import prices
-from panolog.orchestrator.runs.money.losses import lost_at
+from panolog.orchestrator.runs.money.account import lost_at
 from panolog.orchestrator.runs.money.records import (
     BudgetNear,
     BudgetReached,

@@ -113,17 +113,17 @@ class Spending:
     @property
     def used(self) -> Used:
         """All that was reserved."""
-        return _sum(machine.used for machine in self.machines.values())
+        return sum((machine.used for machine in self.machines.values()), Used())
 
     @property
     def idle(self) -> Used:
         """What was reserved while no task ran there."""
-        return _sum(machine.idle for machine in self.machines.values())
+        return sum((machine.idle for machine in self.machines.values()), Used())
 
     @property
     def lost(self) -> Used:
         """What had to be done again."""
-        return _sum(machine.lost for machine in self.machines.values())
+        return sum((machine.lost for machine in self.machines.values()), Used())
 
     def ahead(self, seconds: float, idle: float | None = None) -> float:
         """What so many seconds more cost, in currency units.
@@ -195,10 +195,6 @@ def spend(spending: Spending, stored: Stored) -> Spending:
         machines[record.node_id] = replace(machine, tasks=machine.tasks + 1)
         running[record.task] = _Share(record.node_id, time, machine.shared)
     return spending
-
-
-def _sum(parts: Iterable[Used]) -> Used:
-    return sum(parts, Used())
 
 
 def _closed(machine: PaidMachine, time: float) -> PaidMachine:

@@ -16,7 +16,7 @@ from panolog.orchestrator.engine.estimates.costs import slowness
 from panolog.orchestrator.engine.scheduling.scaling import STARTUP_S
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines.nodes import Node
-from panolog.orchestrator.runs.money.losses import lost_with_driver
+from panolog.orchestrator.runs.money.account import lost_with_driver
 from panolog.orchestrator.runs.money.records import (
     BudgetNear,
     BudgetReached,

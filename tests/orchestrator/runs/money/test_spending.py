@@ -6,9 +6,8 @@ from datetime import datetime
 import pytest
 
 from panolog.orchestrator.runs.machines.nodes import OWN
-from panolog.orchestrator.runs.money.account import view_money
+from panolog.orchestrator.runs.money.account import settled, view_money
 from panolog.orchestrator.runs.money.limits import Wanted, parse_deadline
-from panolog.orchestrator.runs.money.losses import settled
 from panolog.orchestrator.runs.money.prices import PriceList
 from panolog.orchestrator.runs.money.records import BudgetSet, NodeReserved, NodeReturned, WorkLost
 from panolog.orchestrator.runs.money.spending import Spending
