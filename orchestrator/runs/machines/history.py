@@ -171,15 +171,14 @@ def _after_success(nodes: Nodes, id: str) -> Nodes:
 
 def _quarantine(nodes: Nodes, record: NodeQuarantined) -> Nodes:
     """What has failed on a GPU does not count against its node any more."""
-    others = {id: replace(node, failures=_off(node, record.node)) for id, node in nodes.items()}
+    others = {
+        id: replace(node, failures=tuple(it for it in node.failures if it.card != record.node))
+        for id, node in nodes.items()
+    }
     here = nodes.get(record.node) or NodeState(record.node)
     count = here.quarantines + 1
     here = replace(here, host=record.host, until=record.until, reason=record.reason, quarantines=count)
     return {**others, here.id: here}
-
-
-def _off(node: NodeState, card: str) -> tuple[TaskFailure, ...]:
-    return tuple(failure for failure in node.failures if failure.card != card)
 
 
 def take_over(nodes: Nodes) -> Nodes:
