@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, Request, build_opener
 
 from panolog.orchestrator.watch.follower.notifications import Notification
-from panolog.orchestrator.watch.follower.shapes import Post, mail_of, post_of
+from panolog.orchestrator.watch.follower.shapes import mail_of, post_of
 from panolog.orchestrator.watch.follower.targets import Target
 
 _TIMEOUT_S = 10.0  # to connect, and for each answer
@@ -43,8 +43,7 @@ def send(target: Target, notification: Notification) -> Refusal | None:
     return _post(post_of(target, notification, time.time()))
 
 
-def _post(post: Post) -> Refusal | None:
-    request = Request(post.url, post.body, post.headers, method="POST")
+def _post(request: Request) -> Refusal | None:
     try:
         with build_opener(_NoRedirect).open(request, timeout=_TIMEOUT_S):
             return None

@@ -12,10 +12,10 @@ import hmac
 import html
 import json
 from contextlib import suppress
-from dataclasses import dataclass, field
 from email.message import EmailMessage
 from typing import Any
 from urllib.parse import urlsplit, urlunsplit
+from urllib.request import Request
 
 from panolog.orchestrator.watch.follower.notifications import Kind, Notification
 from panolog.orchestrator.watch.follower.targets import Target
@@ -31,16 +31,7 @@ _NTFY = {  # tag, which ntfy shows as an emoji, and priority
 }
 
 
-@dataclass(frozen=True)
-class Post:
-    """One request of HTTP, method POST."""
-
-    url: str = field(repr=False)
-    headers: dict[str, str] = field(repr=False)
-    body: bytes
-
-
-def post_of(target: Target, notification: Notification, now: float) -> Post:
+def post_of(target: Target, notification: Notification, now: float) -> Request:
     """The request for a webhook, Slack or ntfy. Args: now, seconds since the epoch."""
     url, headers, content = target.url, dict[str, str](), payload(notification)
     if target.kind == "slack":
@@ -57,7 +48,8 @@ def post_of(target: Target, notification: Notification, now: float) -> Post:
         headers = {"webhook-id": notification.id, "webhook-timestamp": str(int(now))}
         if target.secret:
             headers["webhook-signature"] = signature(target.secret, notification.id, int(now), body)
-    return Post(url, {"Content-Type": "application/json", "User-Agent": "panolog", **headers}, body)
+    headers = {"Content-Type": "application/json", "User-Agent": "panolog", **headers}
+    return Request(url, body, headers, method="POST")
 
 
 def payload(notification: Notification) -> dict[str, Any]:
