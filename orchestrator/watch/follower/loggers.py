@@ -11,14 +11,26 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.runs.folder import RunFolder, flat, read_json
+from panolog.orchestrator.runs.reading import query
 from panolog.orchestrator.watch.follower.board import Board, News
-from panolog.orchestrator.watch.follower.curves import points
 from panolog.orchestrator.watch.follower.ledger import Ledger
-from panolog.orchestrator.watch.follower.sinks.interface import Facts, Sink, Value
+from panolog.orchestrator.watch.follower.sinks.interface import Facts, Point, Sink, Value
 from panolog.scene.errors import RunFolderError
 
 _FIRST_S, _LONGEST_S = 2.0, 300.0  # pauses after errors, each twice as long as the one before
 _IDLE_S = 60.0  # between two looks without news
+_LOCK_S = 5.0  # to wait for the driver's lock
+# The settled part of a curve, as run.db has it in the end: each iteration once. After a failure a task
+# continues from its latest checkpoint, and iterations that follow it come again. A row counts only if no row
+# of an earlier iteration is newer; up to a checkpoint no newer rows will come.
+_ROWS = """
+WITH thin AS (
+    SELECT name, iteration, MAX(rowid) AS row FROM metrics
+    WHERE task = :task AND iteration <= :until GROUP BY name, iteration),
+kept AS (SELECT row, iteration, MAX(row) OVER (PARTITION BY name ORDER BY iteration) AS newest FROM thin)
+SELECT name, iteration, time, value FROM metrics
+WHERE rowid IN (SELECT row FROM kept WHERE row = newest AND iteration > :after) ORDER BY iteration, name
+"""
 
 
 class Logger(threading.Thread):
@@ -114,3 +126,12 @@ def settings_of(folder: RunFolder) -> dict[str, Value]:
         found[f"versions.{key}"] = str(value)
     found["scene"] = str(content.get("scene", {}).get("path", ""))
     return found
+
+
+def points(path: Path, task: str, after: int, until: int) -> list[Point]:
+    """The points of all curves of a task in (after, until], by iteration and name.
+
+    Args: path, of run.db; until, at most up to where they are settled. Raises InputError as `reading.query`.
+    """
+    values = {"task": task, "after": after, "until": until}
+    return [Point(*row) for row in query(path, _ROWS, values, timeout_s=_LOCK_S)]

@@ -7,9 +7,18 @@ from pathlib import Path
 from typing import ClassVar
 
 from panolog.orchestrator.runs.records import Outcome
-from panolog.orchestrator.watch.follower.curves import Point
 
 Value = str | int | float | bool
+
+
+@dataclass(frozen=True)
+class Point:
+    """One value of a curve."""
+
+    name: str  # of the curve: loss, psnr, …
+    iteration: int
+    time: float  # seconds since the epoch
+    value: float
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from mlflow.tracking import MlflowClient
 from typing_extensions import override
 
 from panolog.orchestrator.runs.records import Outcome
-from panolog.orchestrator.watch.follower.curves import Point
-from panolog.orchestrator.watch.follower.sinks.interface import Facts, Sink
+from panolog.orchestrator.watch.follower.sinks.interface import Facts, Point, Sink
 
 _TAG = "panolog.run"
 _BATCH, _PARAMS = 1000, 100  # of one request, as the REST API of MLflow limits them

@@ -15,8 +15,7 @@ from tensorboard.summary.writer.event_file_writer import EventFileWriter
 from typing_extensions import override
 
 from panolog.orchestrator.runs.records import Outcome
-from panolog.orchestrator.watch.follower.curves import Point
-from panolog.orchestrator.watch.follower.sinks.interface import Facts, Sink
+from panolog.orchestrator.watch.follower.sinks.interface import Facts, Point, Sink
 
 _OPEN = 64  # files at once
 _PATTERN = "events.out.tfevents.*"

@@ -15,8 +15,7 @@ from typing_extensions import override
 from wandb.errors import Error
 
 from panolog.orchestrator.runs.records import Outcome
-from panolog.orchestrator.watch.follower.curves import Point
-from panolog.orchestrator.watch.follower.sinks.interface import Facts, Sink
+from panolog.orchestrator.watch.follower.sinks.interface import Facts, Point, Sink
 
 _CODES = {Outcome.DONE: 0, Outcome.LIMITED: 0, Outcome.FAILED: 1, Outcome.INTERRUPTED: 130, None: 137}
 

@@ -20,9 +20,8 @@ from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Outcome
 from panolog.orchestrator.runs.state import ignore
 from panolog.orchestrator.watch.follower.board import Board
-from panolog.orchestrator.watch.follower.curves import Point
 from panolog.orchestrator.watch.follower.loggers import Logger
-from panolog.orchestrator.watch.follower.sinks.interface import Facts, Sink
+from panolog.orchestrator.watch.follower.sinks.interface import Facts, Point, Sink
 from panolog.orchestrator.watch.follower.watcher import Watcher
 from tests.deploy.files import ROOT
 from tests.orchestrator.fakes import SetClock
