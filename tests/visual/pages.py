@@ -10,8 +10,8 @@ from playwright.sync_api import Page, expect
 
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.queue import processes
 from panolog.orchestrator.runs.queue.entries import Command, Needs, Share, State
-from panolog.orchestrator.runs.queue.processes import Processes
 from panolog.orchestrator.runs.queue.runner import lock_of
 from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.watch.views.comparison.page import write_comparison
@@ -199,7 +199,7 @@ def queue_at_work(root: Path, runs: Path, clock: Clock) -> Iterator[Path]:
         queue.end(1, State.FAILED, 2, _FAILED)
         queue.claim(2)
         share = Share(("GPU-5a", "GPU-5b"), tuple(range(16)), 56 * 2**30)
-        queue.launched(2, Processes().identity(os.getpid()), share)
+        queue.launched(2, processes.identity(os.getpid()), share)
         queue.note(3, "waits for 4 GPUs: 2 of 4 free")
     clock.now = now
     with lock.hold(lock_of(folder)):

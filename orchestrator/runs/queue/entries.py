@@ -74,6 +74,11 @@ class Entry:
     share: Share | None = None  # what it has while it works; None: nothing, or it has not begun
 
     @property
+    def open(self) -> bool:
+        """Whether it waits or runs."""
+        return self.state in (State.WAITING, State.RUNNING)
+
+    @property
     def interrupted(self) -> bool:
         """Whether it has run before and is to be resumed."""
         return self.starts > 0

@@ -23,8 +23,8 @@ from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.control import state_of
 from panolog.orchestrator.runs.folder import RunFolder, command_line
 from panolog.orchestrator.runs.machines.children import bound_to_parent, signals_blocked
+from panolog.orchestrator.runs.queue import processes
 from panolog.orchestrator.runs.queue.entries import Entry, Share, State
-from panolog.orchestrator.runs.queue.processes import Processes
 from panolog.orchestrator.runs.queue.shares import Capacity, NeverFitsError, environment
 from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.runs.records import Outcome
@@ -47,7 +47,6 @@ class Limits:
     at_once: int = 1  # runs side by side
     forever: bool = False  # wait for new entries when none is left
     program: tuple[str, ...] = PROGRAM  # that takes the words of an entry
-    processes: Processes = field(default_factory=Processes)
     machine: Capacity = field(default_factory=Capacity.own)
 
 
@@ -128,7 +127,7 @@ class _Runner:
         for live in self.live.values():
             if live.child is not None:
                 live.child.send_signal(taken.si_signo)
-            elif live.entry.process is not None and self.limits.processes.alive(live.entry.process):
+            elif live.entry.process is not None and processes.alive(live.entry.process):
                 with suppress(ProcessLookupError):
                     os.kill(live.entry.process.pid, taken.si_signo)
 
@@ -197,7 +196,7 @@ class _Runner:
             return
         assert child.stdin is not None  # a pipe
         with suppress(ProcessLookupError, BrokenPipeError):  # it was killed at the gate
-            identity = self.limits.processes.identity(child.pid)
+            identity = processes.identity(child.pid)
             if share is not None and share.cores is not None:
                 os.sched_setaffinity(child.pid, share.cores)  # which all that it starts has too
             self._written(lambda: self.queue.launched(entry.id, identity, share))
@@ -226,7 +225,7 @@ class _Runner:
             self._judge(live.entry, code, of_runner=live.child is not None)
 
     def _alive(self, entry: Entry) -> bool:
-        return entry.process is not None and self.limits.processes.alive(entry.process)
+        return entry.process is not None and processes.alive(entry.process)
 
     def _judge(self, entry: Entry, code: int | None, *, of_runner: bool) -> None:
         """What follows from the end of a run. Args: code, None of one that was not a child."""

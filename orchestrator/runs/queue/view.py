@@ -1,15 +1,15 @@
 """A queue as commands and the dashboard show it, and what both can do with an entry."""
 
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.queue import processes
 from panolog.orchestrator.runs.queue.entries import Entry, State
-from panolog.orchestrator.runs.queue.processes import Processes
 from panolog.orchestrator.runs.queue.runner import lock_of, log_of, sole_runner
 from panolog.orchestrator.runs.queue.shares import describe
 from panolog.orchestrator.runs.queue.store import Queue
@@ -30,7 +30,7 @@ class QueueView:
 
     def reason(self, entry: Entry) -> str:
         """Why it has failed or was stopped; what it waits for, while a runner is at work."""
-        return entry.reason if self.runner or not _open(entry) else ""
+        return entry.reason if self.runner or not entry.open else ""
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -63,29 +63,28 @@ class QueueView:
         rows = [(str(entry.id), self.label(entry), str(entry.command.run)) for entry in self.entries]
         width = max((len(id) for id, _, _ in rows), default=0)
         for (id, label, run), entry in zip(rows, self.entries, strict=True):
-            more = self.reason(entry) or (describe(entry) if _open(entry) else "")
+            more = self.reason(entry) or (describe(entry) if entry.open else "")
             yield f"{id:>{width}}  {label:<11}  {run}" + (f"  ({more})" if more else "")
         if not rows:
             yield f"the queue {self.folder} is empty"
-        elif not self.runner and any(_open(entry) for entry in self.entries):
+        elif not self.runner and any(entry.open for entry in self.entries):
             yield "no runner is at work: `panolog queue run` starts one"
 
 
-def view_queue(queue: Queue, processes: Processes | None = None, *, removed: bool = False) -> QueueView:
+def view_queue(queue: Queue, *, removed: bool = False) -> QueueView:
     """A queue as it is now. Args: removed, show removed entries too."""
-    entries: Sequence[Entry] = queue.entries(removed=removed)
-    known = processes or Processes()
-    alive = frozenset(it.id for it in entries if it.state == State.RUNNING and _alive(it, known))
-    return QueueView(queue.folder, lock.held(lock_of(queue.folder)), tuple(entries), alive)
+    entries = tuple(queue.entries(removed=removed))
+    alive = frozenset(it.id for it in entries if it.state == State.RUNNING and _alive(it))
+    return QueueView(queue.folder, lock.held(lock_of(queue.folder)), entries, alive)
 
 
-def remove_entry(queue: Queue, id: int, processes: Processes | None = None) -> None:
+def remove_entry(queue: Queue, id: int) -> None:
     """Removes an entry, also one that a runner has left running, if nothing of it is alive any more.
 
     Raises QueueError if there is none of that number, or it is running.
     """
     entry = queue.entry(id)
-    dead = entry.state == State.RUNNING and not _alive(entry, processes or Processes())
+    dead = entry.state == State.RUNNING and not _alive(entry)
     if not dead or lock.held(lock_of(queue.folder)):
         queue.remove(id)
         return
@@ -93,10 +92,6 @@ def remove_entry(queue: Queue, id: int, processes: Processes | None = None) -> N
         queue.remove(id, dead=True)
 
 
-def _alive(entry: Entry, processes: Processes) -> bool:
+def _alive(entry: Entry) -> bool:
     known = entry.process is not None and processes.alive(entry.process)
     return known or lock.held(RunFolder(entry.command.run).lock)
-
-
-def _open(entry: Entry) -> bool:
-    return entry.state in (State.WAITING, State.RUNNING)

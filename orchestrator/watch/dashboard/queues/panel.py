@@ -72,7 +72,7 @@ class QueuePanel:
             state=entry.state,
             label=view.label(entry),
             reason=view.reason(entry),
-            share=describe(entry) if entry.state in (State.WAITING, State.RUNNING) else "",
+            share=describe(entry) if entry.open else "",
             time=entry.ended or entry.began or entry.added,
         )
 
@@ -81,6 +81,6 @@ def _shown(entries: Sequence[Entry]) -> list[Entry]:
     """Those that run, those that wait, and of the others the latest."""
     running = [entry for entry in entries if entry.state == State.RUNNING]
     waiting = [entry for entry in entries if entry.state == State.WAITING]
-    ended = [entry for entry in entries if entry.state not in (State.RUNNING, State.WAITING)]
+    ended = [entry for entry in entries if not entry.open]
     ended.sort(key=lambda entry: -(entry.ended or 0.0))
     return [*[*running, *waiting][:_OPEN], *ended[:_ENDED]]

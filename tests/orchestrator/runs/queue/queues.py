@@ -19,13 +19,14 @@ STAND_IN = Path(__file__).with_name("stand_in.py")
 RUNNER = """
 import signal, sys
 from pathlib import Path
-from panolog.orchestrator.runs.queue.processes import Processes
+from panolog.orchestrator.runs.queue import processes
 from panolog.orchestrator.runs.queue.runner import Limits, run_queue, sole_runner
 from panolog.orchestrator.runs.queue.store import opened
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 folder, boot, at_once, forever, *program = sys.argv[1:]
-limits = Limits(int(at_once), bool(int(forever)), tuple(program), Processes(Path(boot)))
+processes.BOOT = Path(boot)
+limits = Limits(int(at_once), bool(int(forever)), tuple(program))
 with opened(Path(folder)) as queue, sole_runner(Path(folder)):
     sys.exit(run_queue(queue, limits, lambda line: print(line, flush=True)))
 """

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.queue import processes
 from panolog.orchestrator.runs.queue.entries import State
-from panolog.orchestrator.runs.queue.processes import Processes
 from panolog.orchestrator.runs.queue.runner import log_of
 from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.runs.queue.view import remove_entry, view_queue
@@ -138,35 +138,39 @@ def test_a_runner_that_is_killed_at_the_gate_has_begun_nothing(tmp_path: Path) -
     assert [word for word, _, _ in queue.lines()] == ["begins", "done"]
 
 
-def test_what_ran_while_no_runner_was_there_is_removed_only_if_it_is_dead(tmp_path: Path) -> None:
+def test_what_ran_while_no_runner_was_there_is_removed_only_if_it_is_dead(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     queue = Scripted(tmp_path)
     queue.add("a", held=True)
     runner = queue.start()
     wait_until(lambda: len(queue.lines()) == 1, "the run")
-    known = Processes(tmp_path / "boot_id")
+    monkeypatch.setattr(processes, "BOOT", tmp_path / "boot_id")
     with closing(Queue(queue.folder)) as opened:
         with pytest.raises(QueueError, match="entry 1 is running; stop it first: `panolog stop "):
-            remove_entry(opened, 1, known)
+            remove_entry(opened, 1)
         queue.reboot(runner)
         wait_until(lambda: not lock.held(tmp_path / "a" / "lock"), "the end of its locks")
-        remove_entry(opened, 1, known)
+        remove_entry(opened, 1)
     assert queue.states() == [State.REMOVED]
 
 
-def test_another_process_of_the_same_number_is_not_taken_for_ours(tmp_path: Path) -> None:
+def test_another_process_of_the_same_number_is_not_taken_for_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     boot = tmp_path / "boot"
     boot.write_text("one\n")
-    known = Processes(boot)
-    me = known.identity(os.getpid())
-    assert known.alive(me)
+    monkeypatch.setattr(processes, "BOOT", boot)
+    me = processes.identity(os.getpid())
+    assert processes.alive(me)
     later = type(me)(me.boot, me.pid, me.started + 1)
-    assert not known.alive(later)
+    assert not processes.alive(later)
     boot.write_text("two\n")
-    assert not known.alive(me)
+    assert not processes.alive(me)
     child = subprocess.Popen([sys.executable, "-c", ""])
     os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)  # it has ended, and is not waited for
     with pytest.raises(ProcessLookupError):
-        known.identity(child.pid)
+        processes.identity(child.pid)
     child.wait()
 
 

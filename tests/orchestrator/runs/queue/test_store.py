@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from panolog.orchestrator.runs.queue import processes
 from panolog.orchestrator.runs.queue.entries import Command, Needs, Share, State
-from panolog.orchestrator.runs.queue.processes import Processes
 from panolog.orchestrator.runs.queue.store import DATABASE, Queue, default_folder, opened
 from panolog.orchestrator.runs.queue.view import view_queue
 from panolog.scene.errors import QueueError
@@ -99,7 +99,7 @@ def test_an_entry_is_claimed_once(queue: Queue, tmp_path: Path) -> None:
 
 def test_a_start_is_on_disk_with_its_process(queue: Queue, tmp_path: Path) -> None:
     queue.claim(1)
-    me = Processes().identity(1)
+    me = processes.identity(1)
     queue.launched(1, me)
     with opened(tmp_path / "queue", make=False) as other:
         (entry,) = other.running()
@@ -114,7 +114,7 @@ def test_kills_count_in_a_row_only_if_they_come_soon(tmp_path: Path) -> None:
         queue.claim(1)
         counts = []
         for seconds in (5.0, 5.0, 700.0, 5.0):
-            queue.launched(1, Processes().identity(1))
+            queue.launched(1, processes.identity(1))
             clock.now += seconds
             counts.append(queue.lose(1))
     assert counts == [1, 2, 1, 2]
@@ -132,7 +132,7 @@ def test_needs_and_shares_come_back(queue: Queue) -> None:
     queue.note(1, "waits for memory")
     assert queue.entry(1).reason == "waits for memory"
     assert view_queue(queue).reason(queue.entry(1)) == ""  # no runner is at work
-    queue.launched(1, Processes().identity(1), share)
+    queue.launched(1, processes.identity(1), share)
     assert (queue.entry(1).share, queue.entry(1).reason) == (share, "")
     queue.end(1, State.DONE, 0, "")
     queue.note(1, "too late")

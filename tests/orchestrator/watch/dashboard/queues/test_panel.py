@@ -13,8 +13,8 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.queue import processes
 from panolog.orchestrator.runs.queue.entries import Command, Needs, Share, State
-from panolog.orchestrator.runs.queue.processes import Processes
 from panolog.orchestrator.runs.queue.runner import lock_of
 from panolog.orchestrator.runs.queue.store import DATABASE, Queue
 from panolog.orchestrator.watch.dashboard.messages import QueueList
@@ -34,7 +34,7 @@ def queued(root: Path, names: Sequence[str]) -> Iterator[tuple[Served, Queue]]:
             queue.add(Command(run, ("/scene", "--output", str(run)), (), root, needs))
         queue.claim(1)
         share = Share(("GPU-a",), (0, 1), 3 * 2**30)
-        queue.launched(1, Processes().identity(os.getpid()), share)
+        queue.launched(1, processes.identity(os.getpid()), share)
         with lock.hold(lock_of(queue.folder)), serving(root / "runs", queue=queue.folder) as served:
             yield served, queue
 
