@@ -4,7 +4,6 @@ import os
 import socket
 import subprocess
 import sys
-from dataclasses import dataclass
 
 from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs.folder import command_line
@@ -20,37 +19,22 @@ RESUME = "resume"
 _LOG = "resume.log"
 _PROGRAM = "from panolog.orchestrator.cli.app import main; main()"
 _TAIL = 20_000_000  # bytes of it at most: enough for the longest driver's lines
+Driver = subprocess.Popen[bytes]  # one that this server has started; it continues when the server ends
 
 
-@dataclass
-class ResumedDriver:
-    """A driver that this server has started; it continues when the server ends."""
-
-    process: subprocess.Popen[bytes]
-
-    @property
-    def starting(self) -> bool:
-        """Whether the process has not ended. Also reaps it once it has."""
-        return self.process.poll() is None
-
-
-def available_actions(
-    entry: RunEntry, history: History, resumed: ResumedDriver | None, *, running: bool
-) -> Actions:
+def available_actions(entry: RunEntry, history: History, resumed: Driver | None, *, running: bool) -> Actions:
     """What can be done now, if nothing why not, and the last line of a driver that failed."""
     if running:
         why, available, failed = control.allowed(entry.folder), list(map(str, control.Action)), None
     else:
         why, available = _no_resume(entry, history, resumed), [RESUME]
-        failed = (
-            _last_line(entry) if resumed and not resumed.starting and resumed.process.returncode else None
-        )
+        failed = _last_line(entry) if resumed and resumed.poll() else None
     return Actions(allowed=why is None, why=why, available=() if why else tuple(available), failed=failed)
 
 
 def perform(
     entry: RunEntry, history: History, action: str, block: int | None, node: str | None
-) -> ResumedDriver | None:
+) -> Driver | None:
     """Does what a page requests. Raises InputError if that is not possible now, OSError if writing fails."""
     folder = entry.folder
     if action != RESUME:
@@ -69,7 +53,7 @@ def perform(
     return _resume(entry)
 
 
-def _no_resume(entry: RunEntry, history: History, resumed: ResumedDriver | None) -> str | None:
+def _no_resume(entry: RunEntry, history: History, resumed: Driver | None) -> str | None:
     """Why the run cannot be resumed from here; None if it can."""
     state, root = history.state, entry.folder.root
     host, command = state.driver.host if state.driver else None, command_line("resume", root)
@@ -77,7 +61,7 @@ def _no_resume(entry: RunEntry, history: History, resumed: ResumedDriver | None)
         return "the run is done"
     if state.outcome == "limited":
         return f"a limit has ended it: use `{command}` with a higher --max-cost or a later --deadline"
-    if resumed and resumed.starting:
+    if resumed and resumed.poll() is None:
         return "it is being resumed"
     if not os.access(root, os.W_OK | os.X_OK):
         return f"you may not write to {entry.name}"
@@ -88,7 +72,7 @@ def _no_resume(entry: RunEntry, history: History, resumed: ResumedDriver | None)
     return None
 
 
-def _resume(entry: RunEntry) -> ResumedDriver:
+def _resume(entry: RunEntry) -> Driver:
     """Starts `panolog resume` as a process of its own. Raises InputError if the scene is gone."""
     info, root = read_info(entry.folder), entry.folder.root
     # whatever the string is; the run may also have still to make it
@@ -98,12 +82,11 @@ def _resume(entry: RunEntry) -> ResumedDriver:
     log = os.open(root / _LOG, flags, 0o644)
     try:
         command = [sys.executable, "-c", _PROGRAM, "resume", str(root)]
-        process = subprocess.Popen(
+        return subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
         )
     finally:
         os.close(log)
-    return ResumedDriver(process)
 
 
 def _makes_its_scene(entry: RunEntry) -> bool:

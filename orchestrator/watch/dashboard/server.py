@@ -56,9 +56,9 @@ def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
     app.state.registry, app.state.pages, app.state.downloads = registry, pages, downloads
     app.include_router(router)
     app.include_router(model_router)
-    app.add_api_route("/", _index)
+    app.add_api_route("/", lambda: _page(RUNS))
     app.add_api_route("/runs/{id}", _run)
-    app.add_api_route("/compare", _compare)
+    app.add_api_route("/compare", lambda: _page(COMPARISON))
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     app.mount("/vendor", StaticFiles(directory=PLOTLY.parent), name="vendor")
     app.add_exception_handler(HTTPException, _error)
@@ -71,10 +71,6 @@ def _page(page: Page) -> HTMLResponse:
     return HTMLResponse(live_page(page), headers={"Cache-Control": "no-cache"})
 
 
-def _index() -> HTMLResponse:
-    return _page(RUNS)
-
-
 async def _run(request: Request, id: str) -> HTMLResponse:
     registry: RunRegistry = request.app.state.registry
     if found := await registry.run(id):
@@ -82,10 +78,6 @@ async def _run(request: Request, id: str) -> HTMLResponse:
         topic.start_refresh()  # the page requests the run as soon as its scripts are loaded
         registry.start(encoded_map, watch.entry.folder)  # and then this
     return _page(RUN)
-
-
-def _compare() -> HTMLResponse:
-    return _page(COMPARISON)
 
 
 def _error(_: Request, error: Exception) -> Response:

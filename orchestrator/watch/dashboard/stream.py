@@ -76,13 +76,8 @@ async def _turns(topic: Topic) -> AsyncIterator[None]:
         yield
         if not closed:
             await asyncio.sleep(_PAUSE_S)
-            await wait(changed, _PING_S)
-
-
-async def wait(changed: asyncio.Event, seconds: float) -> None:
-    """Waits for a change, at most so long."""
-    with suppress(asyncio.TimeoutError):
-        await asyncio.wait_for(changed.wait(), seconds)
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(changed.wait(), _PING_S)
 
 
 def _news(snapshot: Snapshot, sent: int | None, last: int) -> tuple[bytes | None, bytes | None]:

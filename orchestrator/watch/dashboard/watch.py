@@ -88,7 +88,7 @@ class Watch:
         self.snapshot = Snapshot(RunRow.unread(entry))
         self._recent: tuple[Stored, ...] = ()  # the latest records, oldest first
         self.history = History()
-        self.resumed: actions.ResumedDriver | None = None
+        self.resumed: actions.Driver | None = None
         self._lock = threading.Lock()
         self._used = 0.0  # time.monotonic() when its page was last requested
         self._row_stamp: tuple[Any, ...] | None = None  # what a row depends on, when the last one was made
@@ -114,7 +114,7 @@ class Watch:
     def act(self, action: str, block: int | None, node: str | None) -> None:
         """Does what a page requests. Raises as `actions.perform`."""
         with self._lock:
-            if self.resumed and self.resumed.starting and not self.running:
+            if self.resumed and self.resumed.poll() is None and not self.running:
                 raise InputError("it is being resumed")
             self.resumed = actions.perform(self.entry, self.history, action, block, node) or self.resumed
 
