@@ -44,6 +44,10 @@ class RunFolder:
     preflight = _At("preflight.json")  # what the run was expected to need
     scene = _At("scene")  # the scene of a run that was given panoramas or a video
     preparation = _At("prepare")  # how that scene is made: settings, progress, and what each step has come to
+    preparation_settings = _At("prepare/settings.json")  # of what that scene is made, and how
+    preparation_progress = _At("prepare/progress.json")  # what is done now
+    masks_picture = _At("prepare/masks.jpg")  # some panoramas with their masks
+    sfm_picture = _At("scene/sfm.png")  # the poses from above
     lock = _At("lock")  # held by the one driver
     supervisor = _At("supervisor")  # what a supervisor has locked while it waits before a resume
     presence = _At("driver")  # what the live driver says without its database
@@ -95,6 +99,10 @@ class RunFolder:
     def known_plan(self) -> Path:
         """The partition, or before there is one the outline: perhaps neither is there."""
         return self.plan if self.plan.exists() else self.outline
+
+    def step_result(self, step: str) -> Path:
+        """The result of a step of the preparation: there is one if the step is done."""
+        return self.preparation / f"{step}.json"
 
     def seam(self, below: int, above: int) -> Path:
         """The folder of the pictures of a face between two blocks."""

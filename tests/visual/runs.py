@@ -21,10 +21,6 @@ from panolog.orchestrator.runs.preparation.notes import (
     Counts,
     StepProgress,
     StepResult,
-    masks_picture,
-    progress_path,
-    result_path,
-    sfm_picture,
     write_note,
 )
 from panolog.orchestrator.runs.preparation.settings import Settings, Step, write_settings
@@ -331,18 +327,18 @@ def preparing(root: Path, clock: Clock) -> RunFolder:
         )
         counts = Counts(panoramas=142, registered=139, points=61_204, weak_links=0, contradictions=1)
         found = StepResult(step=Step.SFM, settings={}, seconds=1_410, lines=lines, counts=counts)
-        write_note(result_path(folder, Step.SFM), found)
+        write_note(folder.step_result(Step.SFM), found)
         masked = ("2.3% of the sphere: 10° around straight down, what is the same in all panoramas",)
         masks = StepResult(step=Step.MASKS, settings={}, seconds=312, lines=masked)
-        write_note(result_path(folder, Step.MASKS), masks)
+        write_note(folder.step_result(Step.MASKS), masks)
         places, names = town.cameras(_CAMERAS), [f"arcade_{30 * row:06d}.jpg" for row in range(_CAMERAS)]
         drift = np.random.default_rng(4).normal(0, [1.5, 1.5, 3], places.shape)
         write_sketch(folder, names, places, town.points(), places + drift)
-        town.write_path(sfm_picture(folder))
-        town.write_picture(masks_picture(folder), 3, 0.9)
+        town.write_path(folder.sfm_picture)
+        town.write_picture(folder.masks_picture, 3, 0.9)
         run.add(Preparing("estimating depth", PREPARE), after=1_412)
         write_note(
-            progress_path(folder),
+            folder.preparation_progress,
             StepProgress(step=Step.DEPTH, what="depth", done=58, total=139, time=run.until - 1),
         )
     return folder

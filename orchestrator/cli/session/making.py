@@ -105,7 +105,7 @@ class Preparation:
             lines=notes.shortened(self._lines),
             counts=self._counts,
         )
-        self.journal.until_done(lambda: notes.write_note(notes.result_path(self.folder, step), result))
+        self.journal.until_done(lambda: notes.write_note(self.folder.step_result(step), result))
         self._lines = outer
 
     def _find_poses(self) -> None:
@@ -117,7 +117,7 @@ class Preparation:
 
         scene, settings = self.folder.scene, self.settings
         report = scene / "sfm.json"
-        if scene.exists() and not (report.exists() and notes.sfm_picture(self.folder).exists()):
+        if scene.exists() and not (report.exists() and self.folder.sfm_picture.exists()):
             shutil.rmtree(scene)  # its driver was killed before the report: the workspace has all for both
         if not scene.exists():
             options = TypeAdapter(SfmSettings).validate_python(settings.sfm)
@@ -172,7 +172,7 @@ class Preparation:
                     self.folder.make(kept.parent)
                     write_bytes(kept, given.read_bytes())
             self._mask(pictures)
-            self.journal.until_done(lambda: write_mask_picture(notes.masks_picture(self.folder), pictures))
+            self.journal.until_done(lambda: write_mask_picture(self.folder.masks_picture, pictures))
         self._note(Step.SFM, LABELS[Step.SFM])
         return layers | {MASKS: [it if (it := one.layer(MASKS)).is_file() else None for one in pictures]}
 
@@ -257,5 +257,5 @@ class Preparation:
         now, count = time.time(), self._panoramas
         note = StepProgress(step=step, what=what, done=done, total=total, time=now, panoramas=count)
         with suppress(OSError):
-            notes.write_note(notes.progress_path(self.folder), note)
+            notes.write_note(self.folder.preparation_progress, note)
         self.journal.show_step(str(note))

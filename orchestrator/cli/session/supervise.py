@@ -21,7 +21,6 @@ from typing import Any
 from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs.folder import RunFolder, command_line
 from panolog.orchestrator.runs.machines.children import bound_to_parent, signals_blocked
-from panolog.orchestrator.runs.preparation.notes import result_path
 from panolog.orchestrator.runs.preparation.settings import Step
 from panolog.orchestrator.runs.records import Outcome
 from panolog.orchestrator.runs.state import RunState, Status
@@ -170,5 +169,5 @@ def _answers(host: str, port: int) -> bool:
 def progress_made(root: Path) -> Saved:
     """What a next driver of a run need not do again: if that grows, resuming it is worth it."""
     folder, state = RunFolder(root), control.state_of(root)
-    steps = frozenset(step for step in Step if result_path(folder, step).exists())
+    steps = frozenset(step for step in Step if folder.step_result(step).exists())
     return steps, {task.id: (task.status == Status.DONE, task.checkpoint) for task in state.tasks.values()}

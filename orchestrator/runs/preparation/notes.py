@@ -69,25 +69,6 @@ class StepResult(_Model):
     counts: Counts | None = None  # of the reconstruction
 
 
-def progress_path(folder: RunFolder) -> Path:
-    return folder.preparation / "progress.json"
-
-
-def result_path(folder: RunFolder, step: Step) -> Path:
-    """Where the result of a step is: there is one if the step is done."""
-    return folder.preparation / f"{step}.json"
-
-
-def masks_picture(folder: RunFolder) -> Path:
-    """Some panoramas with their masks, in one picture."""
-    return folder.preparation / "masks.jpg"
-
-
-def sfm_picture(folder: RunFolder) -> Path:
-    """The poses from above."""
-    return folder.scene / "sfm.png"
-
-
 def write_note(path: Path, note: StepProgress | StepResult) -> None:
     """Writes one of them. Raises OSError if that is impossible."""
     write_json(path, note.model_dump(mode="json"))
@@ -103,12 +84,12 @@ def shortened(lines: Sequence[str]) -> tuple[str, ...]:
 
 def read_progress(folder: RunFolder) -> StepProgress | None:
     """What is done now; None if that is not known."""
-    return _read(folder, progress_path(folder), StepProgress)
+    return _read(folder, folder.preparation_progress, StepProgress)
 
 
 def read_result(folder: RunFolder, step: Step) -> StepResult | None:
     """The result of a step; None if it is not done."""
-    found = _read(folder, result_path(folder, step), StepResult)
+    found = _read(folder, folder.step_result(step), StepResult)
     return found if found is not None and found.step is step else None
 
 

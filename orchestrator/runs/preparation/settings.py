@@ -1,7 +1,6 @@
 """RUN/prepare/settings.json: of what a run makes its scene, and how. Written before the first step begins."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -9,9 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.workers.tasks import StrEnum
 
-NADIR = (
-    10.0  # degrees around straight down: stitching and the end of a stick, which neighbours see from aside
-)
+NADIR = 10.0  # degrees around straight down: the end of a stick, and stitching; neighbours see it from aside
 MOST_BYTES = 1_000_000  # of a file in RUN/prepare
 
 
@@ -93,14 +90,10 @@ class Settings(Options):
         return {}
 
 
-def settings_path(folder: RunFolder) -> Path:
-    return folder.preparation / "settings.json"
-
-
 def write_settings(folder: RunFolder, settings: Settings) -> None:
     """Writes the settings. Raises OSError if that is impossible."""
     folder.make(folder.preparation)
-    write_json(settings_path(folder), settings.model_dump(mode="json"))
+    write_json(folder.preparation_settings, settings.model_dump(mode="json"))
 
 
 def read_settings(folder: RunFolder) -> Settings | None:
@@ -108,7 +101,7 @@ def read_settings(folder: RunFolder) -> Settings | None:
 
     Raises RunFolderError if they cannot be read or are of another format.
     """
-    path = settings_path(folder)
+    path = folder.preparation_settings
     if not path.exists():
         return None
     return folder.parsed(path, MOST_BYTES, Settings.model_validate_json, "start a new run")

@@ -9,7 +9,7 @@ from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import read_info
 from panolog.orchestrator.runs.preparation import forecast, notes
 from panolog.orchestrator.runs.preparation.notes import Counts, StepProgress, StepResult
-from panolog.orchestrator.runs.preparation.settings import Settings, Step, read_settings, settings_path
+from panolog.orchestrator.runs.preparation.settings import Settings, Step, read_settings
 from panolog.orchestrator.runs.state import RunState
 from panolog.orchestrator.watch.views.summary import Text, ViewModel
 from panolog.scene.errors import InputError
@@ -61,15 +61,15 @@ class PreparationView(ViewModel):
 
 def picture_paths(folder: RunFolder) -> dict[str, Path]:
     """Where the pictures of `_PICTURES` are, by name."""
-    return {"sfm": notes.sfm_picture(folder), "masks": notes.masks_picture(folder)}
+    return {"sfm": folder.sfm_picture, "masks": folder.masks_picture}
 
 
 def stamp_of(folder: RunFolder) -> tuple[object, ...]:
     """A value that changes whenever the view may; empty for a run that was given a scene."""
     if not folder.preparation.is_dir():
         return ()
-    files = [settings_path(folder), notes.progress_path(folder)]
-    files += [notes.result_path(folder, step) for step in Step]
+    files = [folder.preparation_settings, folder.preparation_progress]
+    files += [folder.step_result(step) for step in Step]
     return tuple(_state(path) for path in (*files, *picture_paths(folder).values()))
 
 

@@ -15,7 +15,7 @@ from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.orchestrator.runs.info import PENDING, make_info, read_info, write_info
 from panolog.orchestrator.runs.preparation import notes
 from panolog.orchestrator.runs.preparation.notes import Counts, StepProgress, StepResult
-from panolog.orchestrator.runs.preparation.settings import Settings, Step, settings_path, write_settings
+from panolog.orchestrator.runs.preparation.settings import Settings, Step, write_settings
 from panolog.orchestrator.runs.records import Outcome, Preparing, RunBegan, RunEnded
 from panolog.orchestrator.runs.state import replay
 from panolog.orchestrator.runs.store import read_milestones
@@ -41,16 +41,16 @@ def write_preparing(root: Path, lines: tuple[str, ...] = ("10 of 12 panoramas ha
     )
     write_settings(folder, settings)
     found = StepResult(step=Step.SFM, settings={}, seconds=60, lines=lines, counts=COUNTS)
-    notes.write_note(notes.result_path(folder, Step.SFM), found)
+    notes.write_note(folder.step_result(Step.SFM), found)
     note(folder, 3)
     folder.scene.mkdir()
-    cv2.imwrite(str(notes.sfm_picture(folder)), np.full((40, 60, 3), 255, np.uint8))
+    cv2.imwrite(str(folder.sfm_picture), np.full((40, 60, 3), 255, np.uint8))
     return folder
 
 
 def note(folder: RunFolder, done: int) -> None:
     progress = StepProgress(step=Step.DEPTH, what="depth", done=done, total=10)
-    notes.write_note(notes.progress_path(folder), progress)
+    notes.write_note(folder.preparation_progress, progress)
 
 
 @pytest.fixture
@@ -87,10 +87,10 @@ def test_its_pictures_are_sent(folder: RunFolder, served: Served) -> None:
     assert (answer.status_code, answer.headers["content-type"]) == (200, "image/png")
     assert served.client.get(f"{path}/preparation/masks").status_code == 404
     assert served.client.get(f"{path}/preparation/..%2Frun.json").status_code == 404
-    notes.masks_picture(folder).write_bytes(b"<svg onload=alert(1)>")
+    folder.masks_picture.write_bytes(b"<svg onload=alert(1)>")
     assert served.client.get(f"{path}/preparation/masks").status_code == 404
-    notes.sfm_picture(folder).unlink()
-    notes.sfm_picture(folder).symlink_to("/etc/hostname")
+    folder.sfm_picture.unlink()
+    folder.sfm_picture.symlink_to("/etc/hostname")
     assert served.client.get(f"{path}/preparation/sfm").status_code == 404
 
 
@@ -115,8 +115,8 @@ def test_files_made_to_do_harm_show_nothing(tmp_path: Path) -> None:
     spoils: dict[str, Callable[[Path], object]] = {"pipe": pipe, "link": link, "huge": huge}
     spoils["damaged"] = lambda path: path.write_bytes(b"{")
     for name, spoil in spoils.items():
-        spoil(settings_path(write_preparing(tmp_path / "runs" / name)))
-        spoil(notes.progress_path(write_preparing(tmp_path / "runs" / f"{name} progress")))
+        spoil(write_preparing(tmp_path / "runs" / name).preparation_settings)
+        spoil(write_preparing(tmp_path / "runs" / f"{name} progress").preparation_progress)
     with serving(tmp_path / "runs") as server:
         for run in server.get("/api/runs")["runs"]:
             page = server.get(f"/api/runs/{run['id']}")
@@ -132,13 +132,13 @@ def test_a_run_without_its_scene_can_be_resumed_only_if_it_makes_it(
     folder: RunFolder, served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     append(folder, RunEnded(Outcome.INTERRUPTED))
-    notes.sfm_picture(folder).unlink()
+    folder.sfm_picture.unlink()
     folder.scene.rmdir()
-    settings_path(folder).rename(folder.root / "away.json")
+    folder.preparation_settings.rename(folder.root / "away.json")
     monkeypatch.setattr("sys.executable", "/bin/true")
     path = f"/api/runs/{served.id('walk')}/actions"
     assert served.client.post(path, json={"action": "resume"}, headers=POST).status_code == 409
-    (folder.root / "away.json").rename(settings_path(folder))
+    (folder.root / "away.json").rename(folder.preparation_settings)
     append(folder, RunBegan(os.uname().nodename, 1, resumed=True), RunEnded(Outcome.INTERRUPTED))
     before = psutil.Process().children()
     assert served.client.post(path, json={"action": "resume"}, headers=POST).status_code == 202
@@ -179,7 +179,7 @@ def test_the_progress_of_a_run_grows_with_each_part_of_the_preparation(tmp_path:
 
     def show(step: Step, what: str, done: int = 0, total: int = 0) -> None:
         written = StepProgress(step=step, what=what, done=done, total=total)
-        notes.write_note(notes.progress_path(folder), written)
+        notes.write_note(folder.preparation_progress, written)
         view = view_preparation(folder, state, running=True)
         assert view is not None
         found.append(progress_of(state, 9.0, view.over))
@@ -191,7 +191,7 @@ def test_the_progress_of_a_run_grows_with_each_part_of_the_preparation(tmp_path:
     show(Step.MASKS, "static regions", 9, 9)
     show(Step.MASKS, "masks", 4, 9)
     done = StepResult(step=Step.MASKS, settings={}, seconds=1, lines=())
-    notes.write_note(notes.result_path(folder, Step.MASKS), done)
+    notes.write_note(folder.step_result(Step.MASKS), done)
     show(Step.SFM, "finding poses and points")
     for part in ("features", "look-alikes", "matches", "poses", "scene"):
         show(Step.SFM, part, 5, 9)

@@ -17,7 +17,6 @@ from panolog.orchestrator.runs.preparation.settings import (
     Step,
     as_arguments,
     read_settings,
-    settings_path,
 )
 from panolog.orchestrator.runs.state import ignore
 from panolog.prepare.check import scene_check
@@ -192,15 +191,15 @@ def test_sources_and_options_survive_the_way_through_a_command_line(
 def test_files_of_the_preparation_that_are_none_are_not_believed(content: bytes, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.preparation.mkdir()
-    settings_path(folder).write_bytes(content)
+    folder.preparation_settings.write_bytes(content)
     with pytest.raises(InputError, match=r"settings\.json"):
         read_settings(folder)
-    for path in (notes.progress_path(folder), notes.result_path(folder, Step.SFM)):
+    for path in (folder.preparation_progress, folder.step_result(Step.SFM)):
         path.write_bytes(content)
     assert notes.read_progress(folder) is None
     assert notes.read_result(folder, Step.SFM) is None
     of_another = notes.StepResult(step=Step.MASKS, settings={}, seconds=1, lines=())
-    notes.write_note(notes.result_path(folder, Step.SFM), of_another)
+    notes.write_note(folder.step_result(Step.SFM), of_another)
     assert notes.read_result(folder, Step.SFM) is None
 
 

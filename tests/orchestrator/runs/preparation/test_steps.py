@@ -51,7 +51,7 @@ def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> N
     assert settings.steps() == (Step.MASKS, Step.SFM, Step.CHECK)
     assert (settings.nadir, settings.static, settings.panoramas, settings.width) == (10, True, 9, 64)
     assert len(list((calm.scene / "masks").iterdir())) == 9
-    assert notes.masks_picture(calm).read_bytes().startswith(b"\xff\xd8\xff")
+    assert calm.masks_picture.read_bytes().startswith(b"\xff\xd8\xff")
     records = [stored.record for stored in read_records(calm.database)]
     steps = [str(it.task) for it in records if isinstance(it, Preparing)]
     assert steps == ["prepare"] * 3 + ["calibrate"] * 4

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.preparation.notes import StepResult, result_path, write_note
+from panolog.orchestrator.runs.preparation.notes import StepResult, write_note
 from panolog.orchestrator.runs.preparation.settings import Settings, Step, write_settings
 from panolog.orchestrator.runs.records import Outcome, Preparing, Record, RunEnded
 from panolog.orchestrator.watch.views.comparison.compare import compare
@@ -74,7 +74,7 @@ def test_a_run_that_makes_its_scene_has_the_name_of_what_it_makes_it_of(tmp_path
     made = Settings(source=source, others=more, video=True, panoramas=9, width=64, nadir=0, static=False)
     write_settings(folder, made)
     done = StepResult(step=Step.SFM, settings={}, seconds=1, lines=())
-    write_note(result_path(folder, Step.SFM), done)
+    write_note(folder.step_result(Step.SFM), done)
     with lock.hold(folder.lock):
         run, _ = compared(folder, write(tmp_path / "b")).runs
     assert run.scene == "walk.mp4 and 1 more" and run.progress > 0
