@@ -20,25 +20,25 @@ MEMORY_VARIABLE = "PANOLOG_MEMORY"  # GiB of this machine that a run may use
 SHARE_VARIABLE = "PANOLOG_SHARE"  # the part of this machine that a run pays
 
 
-def groups(controller: str, mount: Path = _MOUNT, own: Path = _OWN) -> Iterator[Path]:
+def groups(controller: str) -> Iterator[Path]:
     """The folders of this process's control groups that may limit it, the innermost first.
 
     Of version 2, and of a controller of version 1 ("memory", "cpu"). In a container the mount may be the
     container's own group, below which its path on the machine does not exist: folders may be missing.
     """
-    if not own.is_file():
+    if not _OWN.is_file():
         return
-    for line in own.read_text().splitlines():
+    for line in _OWN.read_text().splitlines():
         _, controllers, path = line.split(":", 2)
         if not controllers or controller in controllers.split(","):
-            base, inner = mount / (controller if controllers else ""), PurePosixPath(path.lstrip("/"))
+            base, inner = _MOUNT / (controller if controllers else ""), PurePosixPath(path.lstrip("/"))
             yield from (base / group for group in (inner, *inner.parents))
 
 
-def cores(mount: Path = _MOUNT, own: Path = _OWN) -> int:
+def cores() -> int:
     """CPU cores that this process may use: its affinity, and the quota of its control groups."""
     allowed = len(os.sched_getaffinity(0))
-    for group in groups("cpu", mount, own):
+    for group in groups("cpu"):
         if text := _read(group / "cpu.max"):  # "200000 100000" = two cores, "max 100000" = no limit
             limit, period = text.split()
         else:
@@ -48,12 +48,12 @@ def cores(mount: Path = _MOUNT, own: Path = _OWN) -> int:
     return max(1, allowed)
 
 
-def memory(mount: Path = _MOUNT, own: Path = _OWN) -> int:
+def memory() -> int:
     """Bytes of memory that are free: the machine's, and within the limits of control groups.
 
     At most this run's share. Raises ConfigError if PANOLOG_MEMORY is no number.
     """
-    return min([_free(mount, own), *_share()])
+    return min([_free(), *_share()])
 
 
 def memory_of_preparation() -> int:
@@ -61,20 +61,20 @@ def memory_of_preparation() -> int:
     return memory() * 3 // 4
 
 
-def memory_total(mount: Path = _MOUNT, own: Path = _OWN) -> int:
+def memory_total() -> int:
     """Bytes of memory that this process's machine has, or its control groups may use; else as `memory`."""
-    return min([_total(mount, own), *_share()])
+    return min([_total(), *_share()])
 
 
-def memory_usage(mount: Path = _MOUNT, own: Path = _OWN) -> tuple[int, int]:
+def memory_usage() -> tuple[int, int]:
     """Bytes of memory in use on this machine or in its control groups, by all runs, and all there are."""
-    total = _total(mount, own)
-    return max(0, total - _free(mount, own)), total
+    total = _total()
+    return max(0, total - _free()), total
 
 
-def _free(mount: Path, own: Path) -> int:
+def _free() -> int:
     free = [int(psutil.virtual_memory().available)]
-    for group, limit in _limits(mount, own):
+    for group, limit in _limits():
         stat = _counts(group / "memory.stat")
         used = _read(group / "memory.current") or _read(group / "memory.usage_in_bytes")
         dropped = stat.get("total_inactive_file", stat.get("inactive_file", 0))  # version 1 has both
@@ -82,8 +82,8 @@ def _free(mount: Path, own: Path) -> int:
     return max(0, min(free))
 
 
-def _total(mount: Path, own: Path) -> int:
-    return min([int(psutil.virtual_memory().total), *(limit for _, limit in _limits(mount, own))])
+def _total() -> int:
+    return min([int(psutil.virtual_memory().total), *(limit for _, limit in _limits())])
 
 
 def _share() -> Iterator[int]:
@@ -92,9 +92,9 @@ def _share() -> Iterator[int]:
         yield int(positive(MEMORY_VARIABLE, os.environ, 1.0, "a number of GiB, such as 12.5") * 2**30)
 
 
-def _limits(mount: Path, own: Path) -> Iterator[tuple[Path, int]]:
+def _limits() -> Iterator[tuple[Path, int]]:
     """Control groups with their limits in bytes, those without one left out."""
-    for group in groups("memory", mount, own):
+    for group in groups("memory"):
         limit = _read(group / "memory.max") or _read(group / "memory.limit_in_bytes")
         if limit.isdecimal():  # not "max", and not "" = no such file
             yield group, int(limit)
@@ -127,11 +127,11 @@ def memory_of(title: str) -> int:
     return held
 
 
-def oom_kills(mount: Path = _MOUNT, own: Path = _OWN, vmstat: Path = _VMSTAT) -> int:
+def oom_kills() -> int:
     """How many processes the kernel has killed for want of memory: in a control group, or on this machine."""
-    around, names = groups("memory", mount, own), ("memory.events", "memory.oom_control")
+    around, names = groups("memory"), ("memory.events", "memory.oom_control")
     files = [group / name for group in around for name in names]
-    for file in (*files, vmstat):  # root groups have none
+    for file in (*files, _VMSTAT):  # root groups have none
         if "oom_kill" in (counts := _counts(file)):
             return counts["oom_kill"]
     return 0
