@@ -1,7 +1,6 @@
 """What a run has cost, as people and programs read it, and what is lost when an attempt or a driver ends."""
 
 from collections import defaultdict
-from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
@@ -125,17 +124,15 @@ def _kinds(money: Spending) -> tuple[MachineKindView, ...]:
 
 
 def _kind(kind: str, price: float | None, machines: list[PaidMachine]) -> MachineKindView:
-    def total(name: Literal["used", "idle", "lost"]) -> UsedView:
-        return _used(sum((getattr(machine, name) for machine in machines), Used()), priced=price is not None)
-
+    own, priced = Spending({machine.reserved_as.node: machine for machine in machines}), price is not None
     return MachineKindView(
         kind=kind,
         price=price,
         count=len(machines),
         there=sum(machine.open for machine in machines),
-        used=total("used"),
-        idle=total("idle"),
-        lost=total("lost"),
+        used=_used(own.used, priced=priced),
+        idle=_used(own.idle, priced=priced),
+        lost=_used(own.lost, priced=priced),
     )
 
 
