@@ -25,6 +25,11 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
+def counted(number: int, what: str) -> str:
+    """So many of a thing: "1 block", "2,000 cameras"."""
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
 def seconds_of(text: str) -> float | None:
     """Seconds of a duration that people write, such as "8w", "1d 2h" or "1.5h"; None if it is none."""
     packed = "".join(text.split())

@@ -16,7 +16,7 @@ from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines import machine
 from panolog.orchestrator.runs.machines.gpus import gpus_to_share
 from panolog.orchestrator.runs.queue.entries import Entry, Needs, Share
-from panolog.orchestrator.runs.units import gib
+from panolog.orchestrator.runs.units import counted, gib
 
 _EVEN = 0.9  # of the memory is divided evenly; the rest is for the system, drivers and Ray
 
@@ -54,9 +54,9 @@ class Capacity:
             even = int(_EVEN * self.memory) // at_once
             memory = memory or min(self.memory, max(even, _foreseen(entry.command.run)))
         if gpus is not None and gpus > len(self.gpus):
-            raise NeverFitsError(f"needs {_count(gpus, 'GPU')}; this machine has {len(self.gpus)}")
+            raise NeverFitsError(f"needs {counted(gpus, 'GPU')}; this machine has {len(self.gpus)}")
         if cores is not None and cores > len(self.cores):
-            raise NeverFitsError(f"needs {_count(cores, 'core')}; this machine has {len(self.cores)}")
+            raise NeverFitsError(f"needs {counted(cores, 'core')}; this machine has {len(self.cores)}")
         if memory is not None and memory > self.memory:
             raise NeverFitsError(f"needs {gib(memory)} of memory; this machine has {gib(self.memory)}")
         return Needs(gpus, cores, memory)
@@ -69,9 +69,9 @@ class Capacity:
         together = -(-at_once // len(self.cores))  # runs on one core, if they are more than the cores
         cores = sorted((core for core in self.cores if use[core] < together), key=lambda core: use[core])
         if wanted.gpus and len(free) < wanted.gpus:
-            return f"waits for {_count(wanted.gpus, 'GPU')}: {len(free)} of {len(self.gpus)} free"
+            return f"waits for {counted(wanted.gpus, 'GPU')}: {len(free)} of {len(self.gpus)} free"
         if wanted.cores and len(cores) < wanted.cores:
-            return f"waits for {_count(wanted.cores, 'core')}: {len(cores)} of {len(self.cores)} free"
+            return f"waits for {counted(wanted.cores, 'core')}: {len(cores)} of {len(self.cores)} free"
         if wanted.memory and left < wanted.memory:
             return f"waits for {gib(wanted.memory)} of memory: {gib(max(0, left))} free"
         return Share(
@@ -104,13 +104,9 @@ def describe(entry: Entry) -> str:
 
 
 def _words(needs: Needs) -> str:
-    gpus = _count(needs.gpus, "GPU") if needs.gpus else ""
-    cores = _count(needs.cores, "core") if needs.cores else ""
+    gpus = counted(needs.gpus, "GPU") if needs.gpus else ""
+    cores = counted(needs.cores, "core") if needs.cores else ""
     return ", ".join(filter(None, (gpus, cores, gib(needs.memory) if needs.memory else "")))
-
-
-def _count(number: int, name: str) -> str:
-    return f"{number} {name}" + "s" * (number != 1)
 
 
 def _foreseen(run: Path) -> int:

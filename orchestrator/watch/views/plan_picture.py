@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from panolog.orchestrator.runs.units import counted
 from panolog.orchestrator.watch.views.palette import block_color
 from panolog.orchestrator.watch.views.plan_map import LABELS, RINGS, MapWindow, served, window_on
 from panolog.partition.plan import Plan
@@ -87,7 +88,7 @@ def _draw_texts(figure: Figure, axes: Axes, view: MapWindow) -> None:
     """Title, parameters and the legend, each in a place of its own."""
     plan, third = view.plan, "xyz"[view.axes[2]]
     config = plan.config
-    title = f"{_count(plan.grid.count, 'block')} ({plan.grid}), {_count(len(plan.rows), 'camera')}"
+    title = f"{counted(plan.grid.count, 'block')} ({plan.grid}), {counted(len(plan.rows), 'camera')}"
     figure.suptitle(title, x=0.01, ha="left", fontsize=15, color=_INK)
     text = f"seen along {third}   ·   {plan.assignment.overlap:.2f} blocks per camera"
     if view.layers > 1:
@@ -98,7 +99,7 @@ def _draw_texts(figure: Figure, axes: Axes, view: MapWindow) -> None:
     )
     if plan.grid.count <= _COUNTED:
         text += "\n" + "   ·   ".join(
-            f"{block}: {_count(len(plan.cameras(block)), 'camera')}, {_count(int(own), 'Gaussian')}"
+            f"{block}: {counted(len(plan.cameras(block)), 'camera')}, {counted(int(own), 'Gaussian')}"
             for block, own in enumerate(plan.gaussians)
         )
     axes.set_title(text, loc="left", fontsize=9, color=_GREY, linespacing=1.5)
@@ -109,7 +110,3 @@ def _draw_texts(figure: Figure, axes: Axes, view: MapWindow) -> None:
         Line2D([], [], ls="", marker=".", ms=3, color=_INK, label="points of the scene"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number:,} {what}{'' if number == 1 else 's'}"

@@ -43,7 +43,7 @@ from panolog.orchestrator.runs.records import (
     task_name,
 )
 from panolog.orchestrator.runs.state import OnChange, RunState, Status
-from panolog.orchestrator.runs.units import duration, gib
+from panolog.orchestrator.runs.units import counted, duration, gib
 from panolog.orchestrator.watch.views.preparation import view_preparation
 from panolog.orchestrator.watch.views.summary import (
     METRICS,
@@ -343,7 +343,7 @@ def _milestone(record: Record) -> str:
         case ModelSaved():
             return f"{task}: {record.gaussians:,} Gaussians after {duration(record.seconds)}"
         case PlanSaved():
-            return f"{task}: {len(record.blocks)} block{'s' * (len(record.blocks) != 1)}"
+            return f"{task}: {counted(len(record.blocks), 'block')}"
         case Merged():
             return f"{task}: {record.gaussians:,} Gaussians, {record.sky:,} of them sky"
         case EvaluationSaved():
