@@ -17,9 +17,11 @@ def identity(pid: int) -> Identity:
     return Identity(_boot(), pid, int(stat[_STARTED]))
 
 
-def alive(process: Identity) -> bool:
+def alive(process: Identity | None) -> bool:
     """Whether that process, and not another of its number, has not ended. Raises OSError as `identity`."""
-    stat = _stat(process.pid) if process.boot == _boot() else None
+    if process is None or process.boot != _boot():
+        return False
+    stat = _stat(process.pid)
     return stat is not None and int(stat[_STARTED]) == process.started
 
 

@@ -127,9 +127,9 @@ class _Runner:
         for live in self.live.values():
             if live.child is not None:
                 live.child.send_signal(taken.si_signo)
-            elif live.entry.process is not None and processes.alive(live.entry.process):
+            elif (process := live.entry.process) and processes.alive(process):
                 with suppress(ProcessLookupError):
-                    os.kill(live.entry.process.pid, taken.si_signo)
+                    os.kill(process.pid, taken.si_signo)
 
     def _start(self) -> None:
         """Starts what there is room for: first what is to be resumed, then what waits, each in order."""
@@ -218,14 +218,11 @@ class _Runner:
     def _end_ended(self) -> None:
         for id, live in list(self.live.items()):
             code = live.child.poll() if live.child is not None else None
-            ended = code is not None if live.child is not None else not self._alive(live.entry)
+            ended = code is not None if live.child is not None else not processes.alive(live.entry.process)
             if not ended or lock.held(RunFolder(live.entry.command.run).lock):
                 continue  # a supervisor that was killed leaves its driver time to save
             del self.live[id]
             self._judge(live.entry, code, of_runner=live.child is not None)
-
-    def _alive(self, entry: Entry) -> bool:
-        return entry.process is not None and processes.alive(entry.process)
 
     def _judge(self, entry: Entry, code: int | None, *, of_runner: bool) -> None:
         """What follows from the end of a run. Args: code, None of one that was not a child."""
@@ -273,9 +270,8 @@ class _Runner:
         path = log_of(self.queue.folder, entry.id)
         with suppress(OSError), path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _TAIL))
-            lines = file.read(_TAIL).decode(errors="replace").split("\n")
-            if line := next((line.strip() for line in reversed(lines) if line.strip()), ""):
-                return line.removeprefix("panolog: ")
+            if text := file.read(_TAIL).decode(errors="replace").strip():
+                return text.rpartition("\n")[2].strip().removeprefix("panolog: ")
         return f"see {path}"
 
     def _written(self, work: Callable[[], _Answer]) -> _Answer:

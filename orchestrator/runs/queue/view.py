@@ -93,5 +93,4 @@ def remove_entry(queue: Queue, id: int) -> None:
 
 
 def _alive(entry: Entry) -> bool:
-    known = entry.process is not None and processes.alive(entry.process)
-    return known or lock.held(RunFolder(entry.command.run).lock)
+    return processes.alive(entry.process) or lock.held(RunFolder(entry.command.run).lock)
