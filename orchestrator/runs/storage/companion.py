@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
-from panolog.orchestrator.runs.machines.children import ENDS, Companion, start_companion
+from panolog.orchestrator.runs.machines.children import ENDS, start_companion
 from panolog.orchestrator.runs.storage.plan import MIRROR_PLAN, MirrorPlan
 from panolog.scene.errors import RunError, StoreError
 
@@ -48,7 +48,7 @@ class _Keeper:
         self._plan, self._say = plan, say
         self._left = ""
         self._ended = threading.Event()
-        self._process = _started(plan)
+        self._start(plan)
         self._begin()
         self._thread = threading.Thread(target=self._keep, name="mirror", daemon=True)
         # A thread has the mask of the one that starts it: requests to stop go to the main thread, also in a
@@ -62,9 +62,7 @@ class _Keeper:
     def finish(self) -> str:
         """Ends the mirror when all is out. Returns what is not; Ctrl-C ends the wait."""
         self._ended.set()
-        with suppress(OSError):
-            assert self._process.stdin is not None
-            self._process.stdin.close()
+        self._end_input()
         try:
             while self._thread.is_alive():
                 self._thread.join(1.0)
@@ -75,6 +73,16 @@ class _Keeper:
             return self._left or f"not all of the run is in {self._plan.url}: interrupted"
         hint = f"`panolog resume {self._plan.url}` on this machine copies the rest"
         return f"{self._left}; {hint}" if self._left else ""
+
+    def _start(self, plan: MirrorPlan) -> None:
+        line = MIRROR_PLAN.dump_json(plan).decode()
+        self._process = start_companion("panolog.orchestrator.runs.storage", line)
+
+    def _end_input(self) -> None:
+        """Lets the mirror end when all is out."""
+        with suppress(OSError):
+            assert self._process.stdin is not None
+            self._process.stdin.close()
 
     def _begin(self) -> None:
         """Waits until the mirror is at work. Raises StoreError with its line if it cannot be."""
@@ -106,11 +114,9 @@ class _Keeper:
             pause, tries = min(2 * pause, _LONGEST_S), tries + 1
             if last and tries > _TRIES:
                 return
-            self._process = _started(self._plan, again=True)
+            self._start(replace(self._plan, again=True, force=False))  # in place of one that was killed
             if last:
-                with suppress(OSError):
-                    assert self._process.stdin is not None
-                    self._process.stdin.close()
+                self._end_input()
             try:
                 self._begin()
                 self._left = ""
@@ -126,10 +132,3 @@ class _Keeper:
         for line in self._process.stdout:
             with suppress(ValueError):
                 yield json.loads(line)
-
-
-def _started(plan: MirrorPlan, *, again: bool = False) -> Companion:
-    """The process of a mirror. Args: again, in place of one that was killed."""
-    if again:
-        plan = replace(plan, again=True, force=False)
-    return start_companion("panolog.orchestrator.runs.storage", MIRROR_PLAN.dump_json(plan).decode())

@@ -31,9 +31,7 @@ class MirrorPlan:
     force: bool = False  # take it from another driver
     again: bool = False  # the mirror of a driver that is at work was killed: this one takes its place
     period: float = _PERIOD_S  # seconds between two rounds
-    patience: float = (
-        60 * _PATIENCE_MIN
-    )  # seconds without progress after the end of the run, before it gives up
+    patience: float = 60 * _PATIENCE_MIN  # seconds without progress after the run, before it gives up
 
 
 MIRROR_PLAN = TypeAdapter(MirrorPlan)  # from and to the line of JSON that the mirror gets
