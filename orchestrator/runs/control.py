@@ -163,9 +163,8 @@ def begin(folder: RunFolder) -> list[Noticed]:
     folder.control.mkdir(exist_ok=True)
     notices = []
     while requests := take(folder):
-        for item in requests:
-            late = _notice(f"{item}: was requested of an earlier driver, so nothing is done")
-            notices.append(item if isinstance(item, Noticed) else late)
+        late = "was requested of an earlier driver, so nothing is done"
+        notices += [it if isinstance(it, Noticed) else _notice(f"{it}: {late}") for it in requests]
     return notices
 
 
