@@ -103,5 +103,4 @@ def _last_line(entry: RunEntry) -> str:
         text = entry.folder.read(entry.folder.root / _LOG, _TAIL).decode(errors="replace")
     except InputError:
         return f"see {_LOG}"
-    lines = text.split("\n")
-    return next((line.strip() for line in reversed(lines) if line.strip()), f"see {_LOG}")
+    return text.strip().rpartition("\n")[2].strip() or f"see {_LOG}"

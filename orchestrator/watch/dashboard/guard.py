@@ -74,16 +74,15 @@ def is_local(host: str) -> bool:
         return host == "localhost"
 
 
-def token_for(host: str, file: Path | None = None) -> str | None:
+def token_for(host: str) -> str | None:
     """The token that clients must send: None on a loopback address, else the user's, made if needed.
 
-    It is kept in a file, by default `token_file`, so that open pages work again after a restart; remove the
-    file for a new one.
+    It is kept in `token_file`, so that open pages work again after a restart; remove the file for a new one.
     Raises InputError if the file holds no token, OSError if it can be neither read nor written.
     """
     if is_local(host):
         return None
-    file = file or token_file()
+    file = token_file()
     file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     try:
         handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -191,9 +190,8 @@ def listen(host: str, port: int) -> socket.socket:
     # With the protocol: only then does asyncio know that it is TCP and turn Nagle's algorithm off.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    listener.setsockopt(
-        socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _SEND_TIMEOUT_MS
-    )  # connections inherit it
+    # Connections inherit it.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _SEND_TIMEOUT_MS)
     try:
         listener.bind((host, port))
     except (OSError, OverflowError) as error:

@@ -137,13 +137,11 @@ class Watch:
         folder = self.entry.folder
         try:
             require_plain(self.entry)
-            status = folder.info.stat()
             return (
                 running := lock.held(folder.lock),
                 presence.waiting(folder.presence),
                 _clock(running=running),
-                status.st_mtime_ns,
-                status.st_size,
+                version_of(folder.info),
                 stamp_of(folder),
                 _database_stamp(folder.database),
             )
@@ -190,8 +188,8 @@ class Watch:
         if page_stamp == self._page_stamp:
             return
         view = self._view(read_json(folder), waiting, store, running=running)
-        own = {"id": entry.id, "name": entry.name, "path": str(folder.root)}
-        page = RunPage(**dict(view), **own, actions=available, result=result)
+        shown: dict[str, Any] = dict(view) | {"id": entry.id, "name": entry.name, "path": str(folder.root)}
+        page = RunPage(**shown, actions=available, result=result)
         self._publish(page, tasks, fresh=not self._page_stamp or self._page_stamp[:2] != page_stamp[:2])
         self._page_stamp = page_stamp
 

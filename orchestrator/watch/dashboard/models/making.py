@@ -142,11 +142,8 @@ def _work(requests: IO[bytes], answers: IO[bytes], idle: float, nice: int) -> No
     import torch  # noqa: PLC0415
 
     torch.set_num_threads(1)
-    for needed in (
-        "watch.views.site.build",
-        "watch.dashboard.models.pages",
-    ):  # no part of a request
-        import_module(f"panolog.orchestrator.{needed}")
+    for needed in ("views.site.build", "dashboard.models.pages"):  # no part of a request
+        import_module(f"panolog.orchestrator.watch.{needed}")
     os.nice(nice)
     while select.select([requests], [], [], idle)[0] and (line := requests.readline()):
         module, *arguments = json.loads(line)

@@ -156,15 +156,18 @@ def test_the_token_opens_the_door_and_without_it_nothing_is_answered(tmp_path: P
         assert served.act(id, "stop").status_code == 403
 
 
-def test_a_token_is_needed_beyond_this_machine_and_stays_the_same(tmp_path: Path) -> None:
-    file = tmp_path / "state" / "token"
+def test_a_token_is_needed_beyond_this_machine_and_stays_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    file = guard.token_file()
     for host in ("127.0.0.1", "127.1.2.3", "::1", "localhost"):
-        assert guard.token_for(host, file) is None
+        assert guard.token_for(host) is None
     assert not file.exists()
-    token = guard.token_for("0.0.0.0", file)
+    token = guard.token_for("0.0.0.0")
     assert token is not None and len(token) >= 43
     assert file.stat().st_mode & 0o777 == 0o600
-    assert {guard.token_for(host, file) for host in ("::", "192.168.1.1", "myhost")} == {token}
+    assert {guard.token_for(host) for host in ("::", "192.168.1.1", "myhost")} == {token}
 
 
 def test_without_a_home_only_the_token_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
