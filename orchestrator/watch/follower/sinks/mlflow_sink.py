@@ -40,7 +40,7 @@ class MlflowSink(Sink):
 
     @override
     def open(self, facts: Facts, known: str) -> str:
-        """As the interface. A run that was made before a kill is found by its tag."""
+        """Takes up the run; one that was made before a kill is found by its tag."""
         self._run = known or self._find(facts)
         self._client.update_run(self._run, status="RUNNING")
         if not known:
@@ -60,7 +60,6 @@ class MlflowSink(Sink):
 
     @override
     def present(self, task: str, after: int, until: int, names: Sequence[str]) -> set[tuple[str, int]]:
-        """As the interface."""
         return {
             (name, metric.step)
             for name in names
@@ -70,7 +69,6 @@ class MlflowSink(Sink):
 
     @override
     def log(self, task: str, points: Sequence[Point]) -> None:
-        """As the interface."""
         metrics = [
             Metric(f"{task}/{it.name}", it.value, round(1000 * it.time), it.iteration) for it in points
         ]
@@ -79,7 +77,6 @@ class MlflowSink(Sink):
 
     @override
     def finish(self, outcome: Outcome | None, metrics: Mapping[str, float], report: Path | None) -> None:
-        """As the interface."""
         for name, value in metrics.items():
             self._client.log_metric(self._run, f"final/{name}", value, step=0)
         if report is not None:

@@ -30,7 +30,6 @@ class TensorBoardSink(Sink):
 
     @override
     def open(self, facts: Facts, known: str) -> str:
-        """As the interface."""
         if not known:
             settings = {name: str(value) for name, value in facts.settings.items()}
             self._write("", [Event(summary=hparams_pb(settings, trial_id=facts.id))])
@@ -38,7 +37,6 @@ class TensorBoardSink(Sink):
 
     @override
     def present(self, task: str, after: int, until: int, names: Sequence[str]) -> set[tuple[str, int]]:
-        """As the interface."""
         wanted, found = set(names), set()
         for event in events(self._folder / task):
             for value in event.summary.value:
@@ -48,7 +46,6 @@ class TensorBoardSink(Sink):
 
     @override
     def log(self, task: str, points: Sequence[Point]) -> None:
-        """As the interface."""
         self._write(
             task,
             [
@@ -63,7 +60,7 @@ class TensorBoardSink(Sink):
 
     @override
     def finish(self, outcome: Outcome | None, metrics: Mapping[str, float], report: Path | None) -> None:
-        """As the interface; the report stays in the run folder."""
+        """Adds the metrics; the report stays in the run folder."""
         values = [Summary.Value(tag=f"final/{name}", simple_value=value) for name, value in metrics.items()]
         if values:
             self._write("", [Event(summary=Summary(value=values))])

@@ -32,7 +32,6 @@ class WandbSink(Sink):
 
     @override
     def open(self, facts: Facts, known: str) -> str:
-        """As the interface."""
         self._folder.mkdir(parents=True, exist_ok=True)
         quiet = wandb.Settings(silent=True, console="off", disable_git=True, x_disable_meta=True)
         self._run = wandb.init(
@@ -53,12 +52,12 @@ class WandbSink(Sink):
 
     @override
     def present(self, task: str, after: int, until: int, names: Sequence[str]) -> set[tuple[str, int]]:
-        """As the interface: the client can read nothing back."""
+        """Nothing: the client can read nothing back."""
         return set()
 
     @override
     def log(self, task: str, points: Sequence[Point]) -> None:
-        """As the interface; the client sends it a little later."""
+        """Adds points, which the client sends a little later."""
         axis = f"{task}/iteration"
         if task not in self._known:
             self._live.define_metric(axis, hidden=True)
@@ -69,7 +68,6 @@ class WandbSink(Sink):
 
     @override
     def finish(self, outcome: Outcome | None, metrics: Mapping[str, float], report: Path | None) -> None:
-        """As the interface."""
         self._live.summary.update({f"final/{name}": value for name, value in metrics.items()})
         if report is not None:
             artifact = wandb.Artifact(f"report-{self._live.id}", type="report")
