@@ -4,7 +4,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
 from pydantic.fields import FieldInfo
@@ -127,7 +126,7 @@ def view_run(
     *,
     running: bool,
     root: Path | None = None,
-    usages: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+    usages: Mapping[str, Mapping[str, Any]] | None = None,
     waiting: str = "",
     preparation: PreparationView | None = None,
     store: str = "",
@@ -149,7 +148,7 @@ def view_run(
         eta=summary.eta,
         paused=summary.paused,
         stages=tuple(_with_share(stage, preparation) for stage in stages),
-        nodes=_nodes(history, usages, summary, running=running),
+        nodes=_nodes(history, usages or {}, summary, running=running),
         preparation=preparation,
         store=store,
         info=info,

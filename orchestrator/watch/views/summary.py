@@ -47,11 +47,7 @@ _TASKS = STAGES | {
     Stage.REPAIR: "repair of seam",
 }
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws_psnr": "WS-PSNR", "ws_ssim": "WS-SSIM"}
-LABELS = {
-    "interrupted": "stopped",
-    "stopped": "driver lost",
-    "limited": "ended early",
-}  # by which people read them
+LABELS = {"interrupted": "stopped", "stopped": "driver lost", "limited": "ended early"}  # for people
 _PROGRESS = ("iteration", "iterations", "rate", "loss", "psnr", "gaussians", "memory", "host_peak")
 Text = Annotated[str, SkipValidation]  # of users and file systems: also what UTF-8 cannot represent
 
@@ -178,7 +174,8 @@ def summarize(
     Args: running, whether a driver works on it; now, epoch seconds; root, the run folder in commands;
     prepared, as `progress_of`.
     """
-    status, stage = status_of(state, running=running), stage_of(state)
+    stage = stage_of(state)
+    status = "running" if running else state.outcome or "stopped"  # the latter of a driver that was killed
     reason = reason_of(state, running=running)
     end = state.ended or (None if running else state.latest) or (time.time() if now is None else now)
     progress = progress_of(state, end, prepared)
@@ -266,11 +263,6 @@ def _task_view(task: TaskState, now: float) -> TaskView:
         reasons=task.reasons,
         **{name: getattr(task.progress, name, None) for name in _PROGRESS},
     )
-
-
-def status_of(state: RunState, *, running: bool) -> str:
-    """ "running", "done", "failed", "interrupted", or "stopped" if the driver was killed."""
-    return "running" if running else state.outcome or "stopped"
 
 
 def reason_of(state: RunState, *, running: bool) -> str | None:

@@ -85,9 +85,8 @@ def write_snapshot(
         imports=Markup(json.dumps({"imports": imports})),
         snapshot=Markup(snapshot.replace("<", r"\u003c")),  # no text ends the element that it is in
         plotly=Markup(PLOTLY.read_text(encoding="utf-8")),
-        made=time.strftime(
-            "%Y-%m-%d %H:%M UTC", time.gmtime(time.time())
-        ),  # readers may be in another time zone
+        # Readers may be in another time zone.
+        made=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(time.time())),
     )
     write_bytes(path, text.encode())
 

@@ -35,7 +35,6 @@ from panolog.orchestrator.watch.views.site.source import Model, open_model
 from panolog.orchestrator.watch.views.site.viewpoints import Viewpoint, Viewpoints, read_viewpoints
 from panolog.scene.errors import InputError
 from panolog.scene.files import Locate, here, write_bytes
-from panolog.scene.gaussians import Gaussians
 from panolog.scene.stores.outline import local_folder
 from panolog.scene.write import StageProgress, no_progress
 from panolog.workers.tasks import TaskId
@@ -171,18 +170,14 @@ def _reduced(
         if source.count <= STREAMED_FROM and not wanted.streams:
             write_sog(folder / MODEL, source)
             return MODEL
-        sky = None if model.sky is None or not wanted.sky else _sky_source(model.sky, place.upside_down)
+        seen = model.sky if wanted.sky else None
+        sky = None if seen is None else InMemory(Splats.of(seen).turned(place.upside_down))
         side = SIDE / (place.unit or 1.0)
         write_streamed(folder / STREAMED, source, sky, side=side, levels=wanted.levels)
         _write_indices(folder)
         return f"{STREAMED}/{INDEX}"
 
     return replace(page, shown=model.total - model.missing - left), write
-
-
-def _sky_source(sky: Gaussians, frame: Frame) -> InMemory:
-    """The sky as Gaussians of an exported frame."""
-    return InMemory(Splats.of(sky).turned(frame))
 
 
 def _write_indices(folder: Path) -> None:

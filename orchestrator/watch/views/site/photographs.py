@@ -12,6 +12,7 @@ import scipy
 from numpy.typing import NDArray
 from PIL import Image
 
+from panolog.orchestrator.runs.folder import is_below
 from panolog.scene.colmap_files import read_image_records
 from panolog.scene.errors import InputError
 from panolog.scene.files import file_of
@@ -61,19 +62,19 @@ def require_size(size: int, name: str) -> None:
         raise InputError(f"{name} has more than {_BYTES:,} bytes")
 
 
-def photograph(scene: Path, name: str, width: int = WIDE, patience: float = PATIENCE_S) -> bytes:
+def photograph(scene: Path, name: str, patience: float = PATIENCE_S) -> bytes:
     """A small copy of a panorama of a scene. Args: patience, seconds for which its store may fail.
 
     Raises InputError if there is no such scene, or no image of that name really below it; StoreLostError.
     """
     check_names(scene, [name])
     path = file_of(image_folder(scene), name).resolve()
-    if not (path.is_file() and path.is_relative_to(scene.resolve())):
+    if not is_below(path, scene):
         raise InputError(f"{name} is missing in {image_folder(scene)}, or a link that leads out of the scene")
     require_size(path.stat().st_size, name)
     data = whole(path, patience)  # of a scene in an object store
     with path.open("rb") if data is None else BytesIO(data) as file:
-        return small_copy(file, name, width)
+        return small_copy(file, name, WIDE)
 
 
 def panorama_rotations(scene: Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
