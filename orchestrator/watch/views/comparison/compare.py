@@ -165,11 +165,9 @@ def _settings(runs: Sequence[ReadRun | UnreadRun]) -> Iterator[DifferentSetting]
     """The settings that are not the same in all runs that could be read."""
     read = [run.view for run in runs if isinstance(run, ReadRun)]
     keys = {setting.key: setting.unit_or_doc for view in read for setting in view.config}
-    values = [{setting.key: setting.value for setting in view.config} for view in read]
-    given_by = [dict(flat(part_of(view.info, "config"))) for view in read]
+    values = [dict(flat(part_of(view.info, "config"))) for view in read]
     for key, doc in keys.items():
-        known = [key in given for given in given_by]
-        found = [table.get(key) for table in values]
+        known, found = [key in table for table in values], [table.get(key) for table in values]
         if len(set(known)) > 1 or any(value != found[0] for value in found):
             given = iter(zip(found, known, strict=True))
             cells = [next(given) if isinstance(run, ReadRun) else (None, False) for run in runs]
