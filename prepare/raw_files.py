@@ -75,7 +75,7 @@ def stitch_source(
     """
     if not source.exists():
         raise SceneError(f"{source}: there is no such file or folder")
-    if source.is_dir() and source.resolve() in (output.resolve(), *output.resolve().parents):
+    if source.is_dir() and output.resolve().is_relative_to(source.resolve()):
         raise SceneError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
     notes = list[str]()
     if source.is_file() and source.suffix.lower() not in {INSP, *SUFFIXES}:
