@@ -239,6 +239,12 @@ def read_json(folder: RunFolder) -> dict[str, Any]:
     return content
 
 
+def part_of(content: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """An object in a JSON object, such as the settings in run.json; {} if what is there is none."""
+    found = content.get(key)
+    return found if isinstance(found, dict) else {}
+
+
 def read_head(folder: RunFolder) -> tuple[str, int]:
     """The scene's path and the training width of a run. Raises InputError if the folder is no run."""
     return head_of(folder, read_json(folder))

@@ -10,9 +10,10 @@ import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from panolog.orchestrator.runs import lock
-from panolog.orchestrator.runs.folder import RunFolder, read_json
+from panolog.orchestrator.runs.folder import RunFolder, part_of, read_json
 from panolog.orchestrator.runs.info import read_history
 from panolog.orchestrator.runs.records import Outcome
 from panolog.orchestrator.runs.state import RunState, Status, TaskState, replay
@@ -105,11 +106,9 @@ def models_of_parts(folder: RunFolder, state: RunState) -> list[Removal]:
     return found
 
 
-def _kept(info: dict[str, object]) -> int:
+def _kept(info: dict[str, Any]) -> int:
     """How many checkpoints of a task the settings of a run keep; older runs have no such setting."""
-    config = info.get("config")
-    retention = config.get("retention") if isinstance(config, dict) else None
-    kept = retention.get("checkpoints") if isinstance(retention, dict) else None
+    kept = part_of(part_of(info, "config"), "retention").get("checkpoints")
     return kept if isinstance(kept, int) and kept >= 1 else 1
 
 

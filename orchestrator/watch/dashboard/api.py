@@ -64,7 +64,7 @@ from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import Response, StreamingResponse
 from pydantic import Field
 
-from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.folder import RunFolder, part_of
 from panolog.orchestrator.watch.dashboard import pictures, stream
 from panolog.orchestrator.watch.dashboard.dependencies import (
     Body,
@@ -95,7 +95,6 @@ from panolog.orchestrator.watch.views.exposures import exposure_curve
 from panolog.orchestrator.watch.views.pages.encoding import encode
 from panolog.orchestrator.watch.views.pages.findings import read_findings
 from panolog.orchestrator.watch.views.plan_page import (
-    BlockCameras,
     CameraView,
     cameras_of,
     map_of,
@@ -103,7 +102,6 @@ from panolog.orchestrator.watch.views.plan_page import (
     scores_of,
     view_camera,
 )
-from panolog.orchestrator.watch.views.run_view import part_of
 from panolog.scene.errors import InputError
 from panolog.scene.stores.outline import local_folder, made_here
 from panolog.scene.stores.url import is_url
@@ -164,7 +162,7 @@ async def get_panorama(request: Request, run: Run, row: int) -> Response:
 @router.get("/api/runs/{id}/block/{number}")
 async def get_block(request: Request, run: Run, number: int) -> Response:
     """The cameras of a block of its plan."""
-    return await respond_json(request, _block, run, number, status=404)
+    return await respond_json(request, lambda: cameras_of(plan_of(run.entry.folder), number), status=404)
 
 
 def encoded_map(folder: RunFolder) -> bytes:
@@ -182,10 +180,6 @@ def encoded_map(folder: RunFolder) -> bytes:
 @lru_cache(maxsize=4)  # of about a megabyte each
 def _encoded(folder: RunFolder, _: tuple[tuple[int, int], ...]) -> bytes:
     return encode(map_of(folder))
-
-
-def _block(run: Watch, number: int) -> BlockCameras | None:
-    return cameras_of(plan_of(run.entry.folder), number)
 
 
 def _camera_view(run: Watch, row: int) -> CameraView | None:

@@ -5,13 +5,14 @@ from typing import Any
 
 from pydantic import ConfigDict
 
+from panolog.orchestrator.runs.folder import part_of
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.views.comparison.measured import whole
 from panolog.orchestrator.watch.views.comparison.schema import Comparison, CurvesOfRuns
 from panolog.orchestrator.watch.views.exposures import ExposureCurve
 from panolog.orchestrator.watch.views.pages.findings import Findings
 from panolog.orchestrator.watch.views.plan_page import BlockCameras, CameraView
-from panolog.orchestrator.watch.views.run_view import LiveView, RunView, part_of, scene_name
+from panolog.orchestrator.watch.views.run_view import LiveView, RunView, scene_name
 from panolog.orchestrator.watch.views.summary import STAGES, SummaryHead, TaskView, Text, ViewModel
 
 

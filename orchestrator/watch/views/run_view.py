@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 
 from panolog.orchestrator.runs.config import known_settings
-from panolog.orchestrator.runs.folder import flat
+from panolog.orchestrator.runs.folder import flat, part_of
 from panolog.orchestrator.runs.machines.gpus import GpuUsage
 from panolog.orchestrator.runs.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.watch.views.history import History, Span
@@ -105,12 +105,6 @@ class RunView(LiveView):
     summary: Summary
     began: float | None
     config: tuple[SettingView, ...]
-
-
-def part_of(info: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """An object in run.json, such as its settings; {} if what run.json holds there is none."""
-    found = info.get(key)
-    return found if isinstance(found, dict) else {}
 
 
 def scene_name(run: RunView) -> str:

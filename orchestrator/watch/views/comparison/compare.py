@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
-from panolog.orchestrator.runs.folder import flat
+from panolog.orchestrator.runs.folder import flat, part_of
 from panolog.orchestrator.runs.state import Status
 from panolog.orchestrator.watch.views.comparison.fairness import warnings
 from panolog.orchestrator.watch.views.comparison.measured import Measured, finite, whole
@@ -22,7 +22,7 @@ from panolog.orchestrator.watch.views.comparison.schema import (
     Trained,
 )
 from panolog.orchestrator.watch.views.palette import block_color
-from panolog.orchestrator.watch.views.run_view import RunView, part_of, scene_name
+from panolog.orchestrator.watch.views.run_view import RunView, scene_name
 from panolog.orchestrator.watch.views.summary import STAGES, TaskView
 from panolog.scene.files import natural_key
 from panolog.workers.tasks import Stage, TaskId

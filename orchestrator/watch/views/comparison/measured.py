@@ -4,9 +4,10 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
-from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.folder import RunFolder, part_of
 from panolog.orchestrator.runs.units import means
 from panolog.orchestrator.watch.views.comparison.schema import METRICS, MeasuredView
 from panolog.workers.seams.schema import Seam, parse_seams
@@ -42,15 +43,13 @@ def read_measured(folder: RunFolder) -> Measured | None:
     if not path.exists():
         return None
     content = folder.parsed(path, _MOST, _object, MEASURED_ANEW)
-    given, left_out = content.get("views"), content.get("left_out")
-    items = list(given.items())[:_VIEWS] if isinstance(given, dict) else []
-    views = {name: _values(values) for name, values in items}
+    views = {name: _values(values) for name, values in islice(part_of(content, "views").items(), _VIEWS)}
     head = MeasuredView(
         width=whole(content.get("width")),
         crop_bottom=_number(content.get("crop_bottom")),
         detail=_number(content.get("detail")),
         panoramas=len(views),
-        left_out=len(left_out) if isinstance(left_out, dict) else 0,
+        left_out=len(part_of(content, "left_out")),
         gaussians=whole(content.get("gaussians")),
     )
     mean = means(views.values()) if views else _values(content.get("mean"))
