@@ -30,8 +30,7 @@ from panolog.orchestrator.runs import info as run_info
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import RunInfo
-from panolog.orchestrator.runs.money.limits import prices_of
-from panolog.orchestrator.runs.money.prices import PriceList
+from panolog.orchestrator.runs.money.prices import PriceList, prices_of
 from panolog.orchestrator.runs.records import Noticed, Part, PreflightSaved, Preparing
 from panolog.orchestrator.runs.state import ignore
 from panolog.partition.plan import Plan
@@ -103,7 +102,7 @@ class Driving:
             self.scene,
             info.config,
             folder.root,
-            prices_of(journal.state),
+            prices_of(journal.state.money.budget),
             local=self.local,
             warn=self._warn,
             say=journal.explain,

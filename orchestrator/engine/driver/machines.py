@@ -15,7 +15,7 @@ from panolog.orchestrator.engine.scheduling.scaling import IDLE_S, Growth, Work
 from panolog.orchestrator.runs.clock import Clock
 from panolog.orchestrator.runs.machines.history import leave_of
 from panolog.orchestrator.runs.machines.nodes import Node
-from panolog.orchestrator.runs.money.prices import of_record, price_by
+from panolog.orchestrator.runs.money.prices import price_by, prices_of
 from panolog.orchestrator.runs.records import NodeLeaving, Noticed
 from panolog.workers.tasks import TaskId
 
@@ -88,7 +88,7 @@ class Machines:
     def _grow(self, growth: Growth, work: Work, running: Sequence[Running], nodes: Sequence[Node]) -> Coming:
         """Requests what a stage should have besides, and returns what is coming."""
         budget = self._journal.state.money.budget
-        price, settings = price_by(of_record(budget.prices) if budget else None), self._config.scaling
+        price, settings = price_by(prices_of(budget)), self._config.scaling
         found = self._expected.decide(growth, work, running, nodes, settings, price, cuda=self._cuda)
         if found.more:
             names, stage = _named(growth, found.more, "more of"), work.demands[0].task.stage

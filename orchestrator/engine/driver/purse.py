@@ -131,7 +131,7 @@ def require_enough(
     Args: estimate, as `after_training`; now, seconds since the epoch; used, what scene and preflight have
     cost, in currency units.
     """
-    rate = sum(prices.reserved(node, prices.of_record(budget.prices)).price or 0.0 for node in nodes) / 3600
+    rate = sum(prices.reserved(node, prices.prices_of(budget)).price or 0.0 for node in nodes) / 3600
     needed = _UNSURE * after_training(estimate) + _TURN_S
     what = f"merge, evaluation and delivery alone need about {duration(needed)}"
     if budget.max_cost is not None and used + rate * needed >= budget.max_cost:
@@ -147,7 +147,7 @@ def reserve_own(journal: Journal) -> None:
     """Records that the driver's machine costs from now on, before there is a pool, unless it does already."""
     own, budget = journal.state.money.machines.get(OWN), journal.state.money.budget
     if own is None or not own.open:
-        journal.record([prices.reserved(own_node(), prices.of_record(budget.prices) if budget else None)])
+        journal.record([prices.reserved(own_node(), prices.prices_of(budget))])
 
 
 class Purse:
@@ -161,8 +161,7 @@ class Purse:
         own = journal.state.money.machines.get(OWN)
         self._own = own is not None and own.open  # the driver's machine is counted since before the pool
         self._stranded: float | None = None  # Clock.monotonic(): no machine since then, after a limit
-        budget = journal.state.money.budget
-        self._prices = prices.of_record(budget.prices) if budget else None
+        self._prices = prices.prices_of(journal.state.money.budget)
 
     def see(self, nodes: tuple[Node, ...]) -> None:
         """Records which machines have come and gone, and of which another share is the run's."""

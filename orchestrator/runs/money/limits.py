@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 
-from panolog.orchestrator.runs.money.prices import PriceList, of_record
+from panolog.orchestrator.runs.money.prices import PriceList
 from panolog.orchestrator.runs.money.records import BudgetSet
 from panolog.orchestrator.runs.state import RunState
 from panolog.orchestrator.runs.units import DURATION, seconds_of
@@ -63,11 +63,6 @@ class Wanted:
             return None
         _check(after, state)
         return after
-
-
-def prices_of(state: RunState) -> PriceList | None:
-    """The prices of a run; None if it has none. Raises ConfigError if they are of another format."""
-    return of_record(state.money.budget.prices) if state.money.budget else None
 
 
 def _check(budget: BudgetSet, state: RunState) -> None:

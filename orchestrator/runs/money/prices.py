@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from panolog.orchestrator.runs.machines.nodes import Node
-from panolog.orchestrator.runs.money.records import NodeReserved
+from panolog.orchestrator.runs.money.records import BudgetSet, NodeReserved
 from panolog.orchestrator.runs.units import gib
 from panolog.scene.errors import ConfigError, in_one_line, wrong_value
 
@@ -150,9 +150,9 @@ def parse_json(text: str) -> PriceList:
     return _checked(tree, "--prices", "")
 
 
-def of_record(prices: Mapping[str, Any]) -> PriceList | None:
-    """The list of a `BudgetSet`. Raises ConfigError if it is of another format."""
-    return _checked(dict(prices), "the run's prices", "") if prices else None
+def prices_of(budget: BudgetSet | None) -> PriceList | None:
+    """The prices of a run; None if it has none. Raises ConfigError if they are of another format."""
+    return _checked(budget.prices, "the run's prices", "") if budget and budget.prices else None
 
 
 def _checked(tree: Mapping[str, Any], where: str, text: str) -> PriceList:

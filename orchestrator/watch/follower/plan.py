@@ -18,11 +18,7 @@ END = "end"  # what a run's command writes to its follower when it ends; one tha
 LAST_S = 30.0  # for which the last news are delivered, and tried again
 STALLED = "PANOLOG_NOTIFY_STALLED"  # minutes without a record after which a run counts as stalled
 _STALLED_MIN = 30.0
-_PACKAGES = {
-    "mlflow": ("mlflow", "mlflow-skinny"),
-    "tensorboard": ("tensorboard",) * 2,
-    "wandb": ("wandb",) * 2,
-}
+_PACKAGES = {"mlflow": "mlflow-skinny", "tensorboard": "tensorboard", "wandb": "wandb"}  # by their modules
 
 
 @dataclass(frozen=True)
@@ -123,8 +119,8 @@ def _require_no_user(uri: str) -> None:
 
 def _sink(text: str, environment: Mapping[str, str]) -> SinkChoice:
     choice = _choice(text)
-    module, package = _PACKAGES[choice.kind]
-    if find_spec(module) is None:
+    if find_spec(choice.kind) is None:
+        package = _PACKAGES[choice.kind]
         raise ConfigError(
             f"--log {choice.kind}: the package {package} is missing; install it: pip install {package}"
         )
