@@ -8,6 +8,7 @@ from panolog.orchestrator.runs.clock import CLOCK, Clock
 from panolog.orchestrator.runs.records import Outcome
 from panolog.orchestrator.watch.follower.notifications import Notification
 
+_FIRST_S, _LONGEST_S = 2.0, 300.0  # pauses between tries, each twice as long as the one before
 _LAST_S = 5.0  # the longest pause between tries once the run has ended
 ALL = 2**62  # an iteration beyond every one: all curves of the task are settled
 
@@ -52,11 +53,12 @@ class Board:
             self._changed.wait_for(lambda: self._news is not known, seconds)
             return self._news
 
-    def pause(self, seconds: float) -> bool:
-        """Waits between two tries: until the run has ended, or for so many seconds; then for a short time.
+    def pause(self, tries: int, least: float = 0.0) -> bool:
+        """Waits between two tries: until the run has ended, or longer each time; then for a short time.
 
-        Returns whether there is time for another try.
+        Args: tries, that came before this pause's; least, seconds. Returns whether there is time for another.
         """
+        seconds = max(least, min(_FIRST_S * 2**tries, _LONGEST_S))
         if self._news.ended:
             self._clock.sleep(max(0.0, min(seconds, _LAST_S, self.left)))
             return self.left > 0

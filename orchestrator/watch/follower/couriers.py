@@ -16,7 +16,6 @@ from panolog.orchestrator.watch.follower.sending import Refusal, send
 from panolog.orchestrator.watch.follower.targets import Target
 
 _TRIES = 60  # of one notification by one follower: hours, if the run lasts
-_FIRST_S, _LONGEST_S = 2.0, 300.0  # pauses between tries, each twice as long as the one before
 _MOST = 100  # notifications of one run to one target, besides its end
 _ENDS = (Kind.DONE, Kind.FAILED)
 Send = Callable[[Target, Notification], Refusal | None]
@@ -71,7 +70,7 @@ class Courier(threading.Thread):
             problem = f"{refusal.reason}; not delivered: {notification.kind}"
             if refusal.final:
                 break
-            if not self._board.pause(max(refusal.after, min(_FIRST_S * 2**tried, _LONGEST_S))):
+            if not self._board.pause(tried, refusal.after):
                 self.problem = problem
                 return False
         self.problem = problem

@@ -17,7 +17,6 @@ from panolog.orchestrator.watch.follower.ledger import Ledger
 from panolog.orchestrator.watch.follower.sinks.interface import Facts, Point, Sink, Value
 from panolog.scene.errors import RunFolderError
 
-_FIRST_S, _LONGEST_S = 2.0, 300.0  # pauses after errors, each twice as long as the one before
 _IDLE_S = 60.0  # between two looks without news
 _LOCK_S = 5.0  # to wait for the driver's lock
 # The settled part of a curve, as run.db has it in the end: each iteration once. After a failure a task
@@ -64,7 +63,7 @@ class Logger(threading.Thread):
                 news = self._board.wait(_IDLE_S, news)
             except errors as error:
                 self.problem = f"not all was passed on: {type(error).__name__}"
-                self._board.pause(min(_FIRST_S * 2**failures, _LONGEST_S))
+                self._board.pause(failures)
                 news, failures = self._board.news, failures + 1
 
     def _begin(self, sink: Sink, news: News) -> None:
@@ -91,7 +90,7 @@ class Logger(threading.Thread):
     def _add(self, task: str, after: int, until: int, *, check: bool) -> None:
         """One piece. Args: check, reads back what the sink has of it."""
         assert self._sink is not None  # `_begin` comes first
-        wanted = points(self._folder.database, task, after, until)
+        wanted = _points(self._folder.database, task, after, until)
         if wanted:
             self._unsure = [task, after, until]
             self._ledger.keep(piece=self._unsure)
@@ -128,7 +127,7 @@ def settings_of(folder: RunFolder) -> dict[str, Value]:
     return found
 
 
-def points(path: Path, task: str, after: int, until: int) -> list[Point]:
+def _points(path: Path, task: str, after: int, until: int) -> list[Point]:
     """The points of all curves of a task in (after, until], by iteration and name.
 
     Args: path, of run.db; until, at most up to where they are settled. Raises InputError as `reading.query`.
