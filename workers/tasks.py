@@ -51,6 +51,7 @@ class Stage(StrEnum):
         return self in (Stage.SCORE, Stage.MEASURE)
 
 
+AFTER_TRAINING = (Stage.MERGE, Stage.MEASURE, Stage.EVAL, Stage.DELIVER)  # also one that a limit has ended
 _NUMBERED = (Stage.DISTRICT, Stage.SCORE, Stage.BLOCK, Stage.UNION, Stage.ROUND, Stage.REPAIR, Stage.MEASURE)
 _ORDER = {stage: position for position, stage in enumerate(Stage)}
 _NAME = re.compile(r"([a-z]+)(?:/(\d{3,9}))?")

@@ -30,10 +30,9 @@ from panolog.orchestrator.runs.records import Noticed, Record, TaskFailed
 from panolog.orchestrator.runs.state import RunState, Status
 from panolog.orchestrator.runs.units import duration
 from panolog.scene.errors import ConfigError, RunError
-from panolog.workers.tasks import EVAL, MERGE, Stage
+from panolog.workers.tasks import AFTER_TRAINING, EVAL, MERGE
 
-_AFTER = (Stage.MERGE, Stage.MEASURE, Stage.EVAL, Stage.DELIVER)  # the stages after the training
-_UNSURE = 1.2  # times what is estimated of these: estimates of them were up to a fifth too low
+_UNSURE = 1.2  # times what is estimated of what follows the training: that was up to a fifth too low
 _TURN_S = 2.0  # in which tasks take note of a stop, and the driver of their end
 _NEAR = 0.8  # of a limit, from which on people are warned
 
@@ -54,7 +53,7 @@ def after_training(estimate: Mapping[str, float | None] | None) -> float:
 
     Args: estimate, `PreflightSaved.seconds`.
     """
-    return sum((estimate or {}).get(stage) or 0.0 for stage in _AFTER)
+    return sum((estimate or {}).get(stage) or 0.0 for stage in AFTER_TRAINING)
 
 
 def verdict(

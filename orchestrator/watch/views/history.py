@@ -15,10 +15,7 @@ from panolog.orchestrator.runs.records import (
     task_name,
 )
 from panolog.orchestrator.runs.state import RunState, apply, replay
-from panolog.workers.tasks import Stage, TaskId
-
-# What follows the training, also one that a limit has ended.
-_FOLLOWING = (Stage.MERGE, Stage.MEASURE, Stage.EVAL, Stage.DELIVER)
+from panolog.workers.tasks import AFTER_TRAINING, Stage, TaskId
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,7 @@ class History:
             self.limited = stored.time
         elif isinstance(record, BudgetSet) and self.limited is not None:  # all that followed is made anew
             self.limited = None
-            for stage in _FOLLOWING:
+            for stage in AFTER_TRAINING:
                 self.spans.pop(stage, None)
 
     def _note_preparing(self, stage: Stage, time: float) -> None:
@@ -89,7 +86,7 @@ class History:
     def cut(self, stage: Stage) -> float | None:
         """When a limit has ended a stage early; None of one that it has not, or that follows."""
         span = self.spans.get(stage)
-        return None if span is None or stage in _FOLLOWING else self.limited
+        return None if span is None or stage in AFTER_TRAINING else self.limited
 
 
 def without_older_progress(records: Sequence[Stored]) -> list[Stored]:
