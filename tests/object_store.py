@@ -10,7 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Literal
@@ -40,6 +40,7 @@ class ObjectStore:
     keys: list[tuple[str, str]] = field(default_factory=list)  # (method, path) in order
     down: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock)
+    writing: threading.Lock = field(default_factory=threading.Lock)  # moto looks first, and then writes
 
     @property
     def environment(self) -> dict[str, str]:
@@ -159,8 +160,10 @@ class _Handler(BaseHTTPRequestHandler):
             self._reset()
             return
         headers = {name: self.headers[name] for name in self.headers if name.lower() not in _HOP}
+        conditional = self.command != "GET" and ("If-None-Match" in self.headers or "If-Match" in self.headers)
         try:
-            status, given, data = _call(self.store.server, self.command, self.path, body, headers)
+            with self.store.writing if conditional else nullcontext():
+                status, given, data = _call(self.store.server, self.command, self.path, body, headers)
         except OSError:  # the test has ended
             return
         if fault == "lost answer":
