@@ -160,7 +160,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._reset()
             return
         headers = {name: self.headers[name] for name in self.headers if name.lower() not in _HOP}
-        conditional = self.command != "GET" and ("If-None-Match" in self.headers or "If-Match" in self.headers)
+        conditional = any(name in self.headers for name in ("If-None-Match", "If-Match"))
         try:
             with self.store.writing if conditional else nullcontext():
                 status, given, data = _call(self.store.server, self.command, self.path, body, headers)
