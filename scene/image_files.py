@@ -6,6 +6,7 @@ import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from io import BytesIO
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -17,14 +18,13 @@ from panolog.scene.errors import ImageError, SceneError
 from panolog.scene.pictures.headers import ImageInfo, read_header, without_orientation
 from panolog.scene.pictures.jpeg import is_cut
 from panolog.scene.pictures.kinds import describe_picture, kind_of
-from panolog.scene.pictures.profiles import jpeg_segments, to_srgb
+from panolog.scene.pictures.profiles import JPEG, JPEG_SCAN, PNG, chunks, jpeg_segments, to_srgb
 from panolog.scene.stores.outline import whole
 
 _TAIL = 65_536  # bytes searched for the end of a JPEG before the whole file is: cameras append little
 _HEAD = 262_144  # bytes in which the pixels of a PNG must begin, if not all of it is there
-_PNG = b"\x89PNG\r\n\x1a\n"
 _IEND = b"\0\0\0\0IEND\xaeB`\x82"
-_JPEG, _JPEG_END, _JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", 0xDA
+_JPEG_END = b"\xff\xd9"
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame, all codings
 _REDUCED = {
     1: cv2.IMREAD_COLOR,
@@ -54,9 +54,9 @@ def read_info(path: Path) -> ImageInfo:
         raise SceneError(f"{path}: there is no such image")
     with path.open("rb") as file:
         magic = file.read(8)
-        if magic == _PNG:
+        if magic == PNG:
             return _png(path, file)
-        if magic.startswith(_JPEG):
+        if magic.startswith(JPEG):
             return _jpeg(path, file)
         if info := read_header(file):
             return info
@@ -83,11 +83,11 @@ def shows_ends(path: Path) -> bool:
     with path.open("rb") as file:
         magic = file.read(8)
         try:
-            if magic == _PNG:
+            if magic == PNG:
                 pixels_begin = b"IDAT" in file.read(_HEAD)
                 file.seek(8)
                 return pixels_begin and bool(_png(path, file))
-            return magic.startswith(_JPEG) and bool(_jpeg(path, file))
+            return magic.startswith(JPEG) and bool(_jpeg(path, file))
         except ImageError:
             return False
 
@@ -102,12 +102,12 @@ def _read(path: Path) -> bytes:
 
 def _decoded(path: Path, data: bytes, flags: int) -> NDArray[Any]:
     """`decode` of what was read from `path`."""
-    if data.startswith(_JPEG):
+    if data.startswith(JPEG):
         _jpeg(path, BytesIO(data))  # OpenCV fills the missing part of a truncated one with grey
     if data.startswith(_TIFF):
         data = without_orientation(data)
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _chunks_fit(data) else None
-    if pixels is not None and data.startswith(_JPEG) and is_cut(data, pixels, flags):
+    if pixels is not None and data.startswith(JPEG) and is_cut(data, pixels, flags):
         raise _truncated(path)
     if pixels is None:
         tiff = data.startswith(_TIFF) and flags != cv2.IMREAD_UNCHANGED  # one of 32 bits has no colours
@@ -151,7 +151,7 @@ def decode_with_alpha(
     """
     data = _read(path)
     reduction = 1
-    if quick and width is not None and data.startswith(_JPEG):
+    if quick and width is not None and data.startswith(JPEG):
         given = _jpeg(path, BytesIO(data)).width
         reduction = next(it for it in (8, 4, 2, 1) if given >= 2 * it * width or it == 1)
     pixels = _decoded(path, data, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -213,7 +213,7 @@ def resize_used(used: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bo
 
 def _opacity(path: Path, data: bytes) -> NDArray[np.uint8] | None:
     """The alpha channel (H, W) of what was read from `path`, 255 opaque; None if all of it is opaque."""
-    if data.startswith((_JPEG, _NO_ALPHA)) or (data.startswith(_PNG) and not _png_alpha(BytesIO(data))):
+    if data.startswith((JPEG, _NO_ALPHA)) or (data.startswith(PNG) and not _png_alpha(BytesIO(data))):
         return None
     header = read_header(BytesIO(data))
     if header is not None and not header.alpha:
@@ -315,15 +315,12 @@ def layer_record(path: Path) -> tuple[str, str] | None:
 
 def _chunks_fit(data: bytes) -> bool:
     """Whether a PNG has all its chunks, each as long as it says: OpenCV allocates that much, then checks."""
-    if not data.startswith(_PNG):
+    if not data.startswith(PNG):
         return True
-    at = 8
-    while at + 12 <= len(data):
-        length, kind = struct.unpack(">I4s", data[at : at + 8])
-        at += 12 + length  # both, and a checksum
-        if kind == b"IEND":
-            return bool(at <= len(data))
-    return False
+    file = BytesIO(data)
+    file.seek(8)
+    ends = (file.tell() + size + 4 for kind, size in chunks(file, png=True) if kind == b"IEND")  # a checksum
+    return next(ends, len(data) + 1) <= len(data)
 
 
 def _truncated(path: Path) -> ImageError:
@@ -347,28 +344,18 @@ def _png_alpha(file: BinaryIO) -> bool:
     if color in (b"\4", b"\6"):
         return True
     file.seek(33)
-    for _ in range(_PNG_CHUNKS):
-        head = file.read(8)
-        if len(head) < 8 or head[4:] == b"IDAT":
-            return False
-        if head[4:] == b"tRNS":
-            return True
-        file.seek(int.from_bytes(head[:4], "big") + 4, os.SEEK_CUR)
-    return False
+    kinds = (kind for kind, _ in islice(chunks(file, png=True), _PNG_CHUNKS))
+    return b"tRNS" in takewhile(lambda kind: kind != b"IDAT", kinds)
 
 
 def _jpeg(path: Path, file: BinaryIO) -> ImageInfo:
     info = None
-    for marker, length in jpeg_segments(file):
-        if marker in _JPEG_SIZES:
-            header = file.read(6)
-            if len(header) == 6:
-                bits, height, width, channels = struct.unpack(">BHHB", header)
-                info = ImageInfo(width, height, bits, channels)
-            file.seek(-len(header), os.SEEK_CUR)
-        if marker == _JPEG_SCAN and info is not None and _has_end(file):
+    for marker, _ in jpeg_segments(file):
+        if marker in _JPEG_SIZES and len(header := file.read(6)) == 6:
+            bits, height, width, channels = struct.unpack(">BHHB", header)
+            info = ImageInfo(width, height, bits, channels)
+        elif marker == JPEG_SCAN and info is not None and _has_end(file):
             return info
-        file.seek(length, os.SEEK_CUR)
     raise _truncated(path)
 
 

@@ -5,14 +5,14 @@ import struct
 import zlib
 from collections.abc import Iterator
 
-from panolog.scene.pictures.profiles import jpeg_segments
+from panolog.scene.pictures.profiles import JPEG, PNG, chunks, is_webp, jpeg_segments
 
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _APP1 = 0xE1
 EXIF_HEAD, XMP_HEAD = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"  # of segments of a JPEG
 _PNG_HEADER = 33  # bytes of a PNG before its second chunk: the signature and IHDR
 _PNG_XMP = b"XML:com.adobe.xmp\0"
+_PARTS = (b"eXIf", b"iTXt", b"EXIF", b"XMP ")  # chunks of a PNG and of a WebP
 _BLOCK = 2**20  # bytes of a PNG's EXIF or XMP; a JPEG's have 65,533 at most
 _READ = 2**22  # bytes that are read in all: the entries of EXIF may all point at the same large block
 
@@ -52,48 +52,31 @@ def read_blocks(file: Bounded) -> tuple[Bounded | None, bytes | None]:
 
 def _parts(file: Bounded, magic: bytes) -> Iterator[bytes]:
     """The EXIF and XMP of a file that begins with `magic`, with the heads that a JPEG gives them."""
-    if magic[:8] == _PNG:
-        file.seek(8)
-        return _png_parts(file)
-    if magic[:4] == b"RIFF" and magic[8:] == b"WEBP":
-        return _webp_parts(file)
-    return _jpeg_parts(file) if magic[:2] == _JPEG else iter(())
-
-
-def _webp_parts(file: Bounded) -> Iterator[bytes]:
-    """Those of a WebP, behind its pixels; the file is at its first chunk."""
-    while len(head := file.read(8)) == 8:
-        kind, length = struct.unpack("<4sI", head)
-        after = file.tell() + length + length % 2
-        if kind == b"EXIF" and length <= _BLOCK:
-            yield EXIF_HEAD + file.read(length).removeprefix(EXIF_HEAD)
-        elif kind == b"XMP " and length <= _BLOCK:
-            yield XMP_HEAD + file.read(length)
-        file.seek(after)
+    if magic[:2] == JPEG:
+        return _jpeg_parts(file)
+    png = magic[:8] == PNG
+    file.seek(8 if png else 12)
+    return _chunk_parts(file, png) if png or is_webp(magic) else iter(())
 
 
 def _jpeg_parts(file: Bounded) -> Iterator[bytes]:
     """The contents of the APP1 segments with EXIF or XMP before the first scan."""
     for marker, length in jpeg_segments(file):
-        after = file.tell() + length
         head = file.read(min(length, len(XMP_HEAD))) if marker == _APP1 else b""
         if head.startswith((EXIF_HEAD, XMP_HEAD)):
             yield head + file.read(length - len(head))
-        file.seek(after)
 
 
-def _png_parts(file: Bounded) -> Iterator[bytes]:
-    """The EXIF and XMP of a PNG, before or after the pixels, with the heads that a JPEG gives them."""
-    while len(head := file.read(8)) == 8:
-        length, kind = struct.unpack(">I4s", head)
-        after = file.tell() + length + 4  # and a checksum
-        if kind == b"eXIf" and length <= _BLOCK:
-            yield EXIF_HEAD + file.read(length).removeprefix(EXIF_HEAD)
-        elif kind == b"iTXt" and length <= _BLOCK:
-            data = file.read(length)
-            if data.startswith(_PNG_XMP):
-                yield XMP_HEAD + _text(data[len(_PNG_XMP) :])
-        file.seek(after)
+def _chunk_parts(file: Bounded, png: bool) -> Iterator[bytes]:
+    """The EXIF and XMP of a PNG or WebP, before or after the pixels; the file is at its first chunk."""
+    for kind, length in chunks(file, png=png):
+        data = file.read(length) if kind in _PARTS and length <= _BLOCK else b""
+        if data and kind in (b"eXIf", b"EXIF"):
+            yield EXIF_HEAD + data.removeprefix(EXIF_HEAD)
+        elif data and kind == b"XMP ":
+            yield XMP_HEAD + data
+        elif data.startswith(_PNG_XMP):
+            yield XMP_HEAD + _text(data[len(_PNG_XMP) :])
 
 
 def _text(data: bytes) -> bytes:
@@ -130,7 +113,7 @@ def with_chunks(png: bytes, *chunks: tuple[bytes, bytes]) -> bytes:
 
 def with_metadata(image: bytes, exif: bytes | None, xmp: bytes | None) -> bytes:
     """A PNG or JPEG, as OpenCV writes it, with EXIF (a TIFF stream) and an XMP packet, if there are any."""
-    if image.startswith(_PNG):
+    if image.startswith(PNG):
         chunks = [] if exif is None else [(b"eXIf", exif)]
         chunks += [] if xmp is None else [(b"iTXt", _PNG_XMP + b"\0\0\0\0" + xmp)]
         return with_chunks(image, *chunks)

@@ -5,7 +5,6 @@ Layout: ITU T.81.
 """
 
 import re
-from collections.abc import Iterator
 from io import BytesIO
 from typing import Any
 
@@ -13,12 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.pictures.profiles import jpeg_segments
+from panolog.scene.pictures.profiles import JPEG_SCAN, jpeg_segments
 
 _BLOCK = 2  # pixels of a row that a JPEG loses at once, at least, reduced eight times
 _GREY, _MORE = 128, b"\x55\x2a" * 32  # what missing pixels are; bytes that any code decodes
 _MARKER = re.compile(rb"\xff+([\x01-\xcf\xd8-\xfe])")  # in a scan, FF 00 and restarts are none
-_PROGRESSIVE, _SCAN, _END = 0xC2, 0xDA, 0xD9
+_PROGRESSIVE, _END = 0xC2, 0xD9
 _UNSENT = 15  # bits of a coefficient that no scan has
 
 
@@ -27,7 +26,7 @@ def is_cut(data: bytes, pixels: NDArray[Any], flags: int) -> bool:
 
     Args: data, the file; pixels (H, W) or (H, W, 3), as `cv2.imdecode` has made them with `flags`.
     """
-    progressive = any(marker == _PROGRESSIVE for marker, _ in _segments(data))
+    progressive = any(marker == _PROGRESSIVE for marker, _ in jpeg_segments(BytesIO(data)))
     if not progressive and (pixels[-1, -_BLOCK:] != _GREY).any():
         return False
     whole, end = _scans(data)
@@ -37,13 +36,6 @@ def is_cut(data: bytes, pixels: NDArray[Any], flags: int) -> bool:
     longer = np.frombuffer(data[:end] + _MORE + data[end:], np.uint8)
     again = cv2.imdecode(longer, flags)
     return again is None or not np.array_equal(again, pixels)
-
-
-def _segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(marker, content) of all segments up to the first scan."""
-    file = BytesIO(data)
-    for marker, length in jpeg_segments(file):
-        yield marker, file.read(length)
 
 
 def _scans(data: bytes) -> tuple[bool, int]:
@@ -60,7 +52,7 @@ def _scans(data: bytes) -> tuple[bool, int]:
         content = data[start + 2 : at]
         if marker == _PROGRESSIVE:
             unsent = {id: np.full(64, _UNSENT) for id in content[6::3]}
-        elif marker == _SCAN and unsent and len(content) > 3:
+        elif marker == JPEG_SCAN and unsent and len(content) > 3:
             first, last, bits = content[-3:]
             for id in content[1:-3:2]:
                 if id in unsent:

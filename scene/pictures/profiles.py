@@ -17,8 +17,8 @@ from PIL import Image, ImageCms
 
 from panolog.scene.pictures.headers import DAMAGE
 
-_JPEG, _JPEG_SCAN, _APP2, _JPEG_HEAD = b"\xff\xd8", 0xDA, 0xE2, b"ICC_PROFILE\0"
-_PNG, _TIFF = b"\x89PNG\r\n\x1a\n", (b"II*\0", b"MM\0*")
+PNG, JPEG, JPEG_SCAN = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", 0xDA
+_APP2, _JPEG_HEAD, _TIFF = 0xE2, b"ICC_PROFILE\0", (b"II*\0", b"MM\0*")
 _TIFF_TAG = 34675  # InterColorProfile
 _LARGEST = 2**24  # bytes of a profile; those with tables have some megabytes
 _MODES = {"RGB": "RGB", "GRAY": "L"}  # of Pillow, by the colours of a profile
@@ -56,17 +56,18 @@ def in_srgb(picture: Image.Image) -> Image.Image:
 
 def embedded_profile(data: bytes) -> bytes | None:
     """The ICC profile in a JPEG, PNG, WebP or TIFF; None if there is none, or it is damaged."""
+    file = BytesIO(data)
     try:
-        if data.startswith(_JPEG):
-            return _of_jpeg(BytesIO(data))
-        if data.startswith(_PNG):
-            return _of_png(data)
-        if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-            found = (data[at : at + size] for kind, at, size in _chunks(data, 12) if kind == b"ICCP")
-            return next(found, None)
+        if data.startswith(JPEG):
+            return _of_jpeg(file)
+        if data.startswith(PNG):
+            return _of_png(file)
+        if is_webp(data):
+            file.seek(12)
+            return next((file.read(size) for kind, size in chunks(file, png=False) if kind == b"ICCP"), None)
         if data.startswith(_TIFF):
             tags = Image.Exif()
-            tags.load_from_fp(BytesIO(data))
+            tags.load_from_fp(file)
             tag = tags.get(_TIFF_TAG)
             return tag if isinstance(tag, bytes) else None
     except _DAMAGE:
@@ -74,8 +75,13 @@ def embedded_profile(data: bytes) -> bytes | None:
     return None
 
 
+def is_webp(head: bytes) -> bool:
+    """Whether a file that begins so is a WebP, whose chunks begin at its byte 12."""
+    return head[:4] == b"RIFF" and head[8:12] == b"WEBP"
+
+
 def jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
-    """(marker, bytes after its length field) of a JPEG up to its scan; the file is then at those bytes."""
+    """(marker, bytes after its length field) of a JPEG up to its scan; the file is at them each time."""
     file.seek(2)
     while True:
         head = file.read(4)
@@ -83,44 +89,43 @@ def jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
             head = head[1:] + file.read(1)
         if len(head) < 4 or head[0] != 0xFF:
             return
-        yield head[1], max(0, int.from_bytes(head[2:], "big") - 2)
-        if head[1] == _JPEG_SCAN:
+        length = max(0, int.from_bytes(head[2:], "big") - 2)
+        after = file.tell() + length
+        yield head[1], length
+        if head[1] == JPEG_SCAN:
             return
+        file.seek(after)
+
+
+def chunks(file: BinaryIO, *, png: bool) -> Iterator[tuple[bytes, int]]:
+    """(kind, bytes) of the chunks of a PNG or WebP from where the file is; it is at each one's content."""
+    while len(head := file.read(8)) == 8:
+        kind, size = struct.unpack(">I4s", head)[::-1] if png else struct.unpack("<4sI", head)
+        after = file.tell() + size + (4 if png else size % 2)  # a checksum, or a byte that makes it even
+        yield kind, size
+        file.seek(after)
 
 
 def _of_jpeg(file: BinaryIO) -> bytes | None:
     """The profile in APP2 segments, each with its number, from 1 on, and how many there are."""
     parts = dict[int, bytes]()
     for marker, length in jpeg_segments(file):
-        after = file.tell() + length
         if marker == _APP2 and file.read(len(_JPEG_HEAD)) == _JPEG_HEAD:
             number, _ = file.read(2)
-            parts[number] = file.read(after - file.tell())
-        file.seek(after)
+            parts[number] = file.read(length - len(_JPEG_HEAD) - 2)
     return b"".join(parts[number] for number in sorted(parts)) or None
 
 
-def _of_png(data: bytes) -> bytes | None:
+def _of_png(file: BinaryIO) -> bytes | None:
     """The profile in the chunk iCCP: a name, a zero, the compression, 0, and the compressed profile."""
-    for kind, at, size in _chunks(data, 8):
+    file.seek(8)
+    for kind, size in chunks(file, png=True):
         if kind == b"iCCP":
-            packed = data[at : at + size].split(b"\0", 1)[1][1:]
+            packed = file.read(size).split(b"\0", 1)[1][1:]
             return zlib.decompressobj().decompress(packed, _LARGEST)
         if kind == b"IDAT":
             break
     return None
-
-
-def _chunks(data: bytes, at: int) -> Iterator[tuple[bytes, int, int]]:
-    """(kind, where its content begins, bytes) of the chunks of a PNG or a WebP from `at` on."""
-    png = data.startswith(_PNG)
-    while at + 8 <= len(data):
-        if png:
-            size, kind = struct.unpack_from(">I4s", data, at)
-        else:
-            kind, size = struct.unpack_from("<4sI", data, at)
-        yield kind, at + 8, size
-        at += 8 + size + (4 if png else size % 2)  # a checksum, or a byte that makes the size even
 
 
 @lru_cache(maxsize=16)
