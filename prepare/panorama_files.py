@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -24,7 +24,6 @@ from panolog.scene.write import Progress
 _THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama
 _ADDED = ("@eaDir", "__MACOSX")  # folders of Synology's thumbnails and of macOS's archives
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")  # the likeliest first
-LayerFiles = dict[str, list[Path | None]]  # by the name of the layer, for each panorama
 In = TypeVar("In")
 Out = TypeVar("Out")
 
@@ -37,6 +36,7 @@ class PanoramaFile:
     name: str  # relative to the image folder
     path: Path
     source: str = ""  # the label of what it was taken from, where there are several
+    layers: Mapping[str, Path] = field(default_factory=dict, hash=False)  # those that it has, by folder
 
     def layer(self, folder: str) -> Path:
         """The file of a layer: SCENE/FOLDER/STEM.png."""

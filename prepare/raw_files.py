@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from panolog.prepare.panorama_files import SUFFIXES, pictures_below
-from panolog.prepare.stitching.lenses import Pair, Up, pairs_as_json, read_pairs
+from panolog.prepare.stitching.lenses import Pair, pairs_as_json, read_pairs
 from panolog.prepare.stitching.pictures import (
     INSP,
     LENSES,
@@ -17,19 +17,11 @@ from panolog.prepare.stitching.pictures import (
     shows_circles,
     stitch_pictures,
 )
-from panolog.prepare.video.frames import extract_frames
+from panolog.prepare.video.frames import FrameChoice, extract_frames
 from panolog.prepare.video.lenses import video_lenses
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.write import StageProgress
-
-
-@dataclass(frozen=True)
-class FrameChoice:
-    """Which frames of a video are stitched."""
-
-    parallax: float  # degrees between two of them
-    most: int | None
 
 
 @dataclass(frozen=True)
@@ -65,14 +57,14 @@ def stitch_source(
     output: Path,
     *,
     width: int | None,
-    up: Up | None,
-    frames: FrameChoice,
+    choice: FrameChoice,
     progress: StageProgress,
 ) -> StitchReport:
     """Stitches the pictures of two circles in a folder, one picture, or a video.
 
     Arguments and errors as of `stitch_pictures` and `extract_frames`.
     """
+    up = choice.up
     if not source.exists():
         raise SceneError(f"{source}: there is no such file or folder")
     if source.is_dir() and output.resolve().is_relative_to(source.resolve()):
@@ -88,8 +80,8 @@ def stitch_source(
         made = extract_frames(
             source,
             output,
-            parallax=frames.parallax,
-            most=frames.most,
+            parallax=choice.parallax,
+            most=choice.frames,
             up=up,
             progress=partial(progress, "frames"),
             note=notes.append,

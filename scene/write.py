@@ -3,7 +3,7 @@
 import secrets
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -98,6 +98,7 @@ class PosedImage:
     translation: NDArray[np.float64]  # (3,)
     sightings: Sightings = UNSEEN  # which points it sees, and where as fractions of width and height
     quaternion: NDArray[np.float64] | None = None  # (4,) w x y z, kept bit by bit; None: of the rotation
+    layers: Mapping[str, Path] = field(default_factory=dict)  # the files of those that it has, by folder
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +110,6 @@ class NewScene:
     points: NDArray[np.float64]  # (P, 3) world units
     colors: NDArray[np.uint8] | None  # (C, 3) RGB of the first C points; others' are from the panoramas
     split: Mapping[str, Sequence[str]] | None = None  # stems by "train.txt" and "test.txt"; None: every 8th
-    layers: Mapping[str, Sequence[Path | None]] | None = None  # by folder, for each image its file
     offset: Offset | None = None
 
 
@@ -194,10 +194,8 @@ def _copy_files(folder: Path, new: NewScene, link: bool, progress: Progress) -> 
     """The panoramas and their layers."""
     for done, image in enumerate(new.images, start=1):
         _copy(image.file, folder / "images" / image.name, link)
-        for layer, files in (new.layers or {}).items():
-            file = files[done - 1]
-            if file is not None:
-                _copy(file, folder / layer / f"{stem_of(image.name)}.png", link)
+        for layer, file in image.layers.items():
+            _copy(file, folder / layer / f"{stem_of(image.name)}.png", link)
         progress(done, len(new.images))
 
 

@@ -112,12 +112,13 @@ def stitch(
     as_json: JsonOption = False,
 ) -> None:
     """Make panoramas of pictures or a video that show two fisheye circles."""
-    from panolog.prepare.raw_files import FrameChoice, stitch_source
+    from panolog.prepare.raw_files import stitch_source
+    from panolog.prepare.video.frames import FrameChoice
     from panolog.prepare.video.selection import PARALLAX
 
-    chosen = FrameChoice(PARALLAX if parallax is None else parallax, frames)
+    choice = FrameChoice(PARALLAX if parallax is None else parallax, frames, up)
     with progress_bar("looking for the lenses", resumable=True) as show:
-        report = stitch_source(source, output, width=width, up=up, frames=chosen, progress=show)
+        report = stitch_source(source, output, width=width, choice=choice, progress=show)
     print_result(report.as_json(), report.lines(), as_json=as_json)
 
 

@@ -105,9 +105,11 @@ def import_scene(
     scene, offset = _centred(scene)
     masks, left_out = find_masks(source, images, scene.masks)
     split, lost = _split(scene, source)
-    new = NewScene(
-        scene.images, size, scene.points, scene.colors, split=split, layers={MASKS: masks}, offset=offset
-    )
+    masked = [
+        image if mask is None else replace(image, layers={MASKS: mask})
+        for image, mask in zip(scene.images, masks, strict=True)
+    ]
+    new = NewScene(masked, size, scene.points, scene.colors, split=split, offset=offset)
     write_scene(output, new, link=link, progress=partial(progress, "import"))
     observations = sum(len(image.sightings[0]) for image in scene.images)
     notes = [*scene.notes, *left_out, *lost]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.panorama_files import LayerFiles, PanoramaFile, pictures_below
+from panolog.prepare.panorama_files import PanoramaFile, pictures_below
 from panolog.prepare.sfm.features import MEMORY
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
@@ -25,9 +25,7 @@ from panolog.prepare.sfm.trajectory import (
 )
 from panolog.prepare.sources.find import Sources, find_sources
 from panolog.prepare.sources.gather import Gathered, gather
-from panolog.prepare.stitching.lenses import Up
-from panolog.prepare.video.frames import frame_times
-from panolog.prepare.video.selection import PARALLAX
+from panolog.prepare.video.frames import FrameChoice, frame_times
 from panolog.prepare.world.exif import read_exif
 from panolog.prepare.world.georeference import Georeference, check_metres, georeference, scale_from_distance
 from panolog.scene.errors import ConfigError, SceneError
@@ -35,11 +33,11 @@ from panolog.scene.files import natural_key, some_of, stem_of
 from panolog.scene.write import NewScene, Offset, PosedImage, StageProgress, require_new, write_scene
 
 _APART = 0.1  # of the spread of a trajectory: poses that differ more are wrong, or belong to another
-WithMasks = Callable[[Sequence[PanoramaFile], LayerFiles], LayerFiles]
+WithMasks = Callable[[Sequence[PanoramaFile]], Sequence[PanoramaFile]]
 
 
 @dataclass(frozen=True)
-class SfmSettings:
+class SfmSettings(FrameChoice):
     """The options of `panolog scene sfm`."""
 
     pairing: Pairing = "auto"
@@ -48,9 +46,6 @@ class SfmSettings:
     parts: bool = False  # write each other part as a scene next to that of the largest
     gps: bool = True  # take metres and north from EXIF
     distance: tuple[str, str, float] | None = None  # names of two panoramas, and metres between them
-    parallax: float = PARALLAX  # degrees between two frames of a video
-    frames: int | None = None  # of each video at most
-    up: Up | None = None  # of pictures or a video that are to be stitched: where up is in the first circle
     link: bool = False  # instead of copying
     trajectory: Path | None = None  # where the camera was, as TUM or CSV
 
@@ -65,15 +60,15 @@ def make_scene(
     output: Path,
     settings: SfmSettings,
     progress: StageProgress,
-    with_masks: WithMasks = lambda _, layers: layers,
+    with_masks: WithMasks = lambda panoramas: panoramas,
     memory: int = MEMORY,
     show: Callable[[Sketch], None] | None = None,
 ) -> SfmReport:
     """Makes a scene of `source` in the new folder `output`, with its report.
 
-    Args: source, a folder or a video, or several; with_masks, gets the panoramas and their layers, and
-        returns the layers with masks that it has made; those of an interrupted job must stay as they are;
-        memory, bytes that may be used; show, called with what is known of the place as poses are found.
+    Args: source, a folder or a video, or several; with_masks, gets the panoramas and returns them with masks
+        that it has made; those of an interrupted job must stay as they are; memory, bytes that may be used;
+        show, called with what is known of the place as poses are found.
 
     Raises SceneError if the source is wrong or its panoramas share too little: there is no `output` then, and
     what was done is kept for the next call. RunError if a process is killed, OSError if a file fails.
@@ -88,16 +83,14 @@ def make_scene(
     if known is not None:
         check_times(known, [it.is_video for it in sources.all])
     gathered = gather(sources, folder, settings, progress)
-    panoramas = gathered.panoramas
-    settings = replace(settings, distance=_between(settings.distance, panoramas))
-    layers = with_masks(panoramas, gathered.layers)
+    settings = replace(settings, distance=_between(settings.distance, gathered.panoramas))
+    panoramas = with_masks(gathered.panoramas)
     places = None if known is None else _places(known, sources, folder, panoramas)
     sketcher = None if show is None else Sketcher(panoramas, show, gps=settings.gps)
     if sketcher is not None:
         sketcher.begin()
     found = reconstruct(
         panoramas,
-        layers,
         folder,
         pairing=settings.pairing,
         mapper=settings.mapper,
@@ -239,19 +232,12 @@ def new_scene(
     model = found.model
     kept = [it.quaternion for it in known]
     poses = zip_longest(model.rows, model.rotations, model.translations, model.sightings, kept)
-    images = [PosedImage(found.panoramas[row].name, found.panoramas[row].path, *pose) for row, *pose in poses]
-    order = sorted(range(len(images)), key=lambda place: natural_key(images[place].name))
-    return NewScene(
-        [images[place] for place in order],
-        found.size,
-        model.points,
-        colors,
-        split=split,
-        layers={
-            layer: [files[model.rows[place]] for place in order] for layer, files in found.layers.items()
-        },
-        offset=offset,
-    )
+    images = list[PosedImage]()
+    for row, *pose in poses:
+        panorama = found.panoramas[row]
+        images.append(PosedImage(panorama.name, panorama.path, *pose, layers=panorama.layers))
+    images.sort(key=lambda image: natural_key(image.name))
+    return NewScene(images, found.size, model.points, colors, split=split, offset=offset)
 
 
 def check_place(output: Path, sources: Iterable[Path]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.panorama_files import LayerFiles, PanoramaFile
+from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.consistency.solve import Solver
 from panolog.prepare.sfm.features import MEMORY, find_features
@@ -34,7 +34,6 @@ class Reconstruction:
     """Poses and points of panoramas, or of a part of them, and how they came about."""
 
     panoramas: tuple[PanoramaFile, ...]  # all, in order
-    layers: LayerFiles
     size: tuple[int, int]  # width and height of each
     model: SparseModel
     links: list[Link]  # between parts of it, the weakest first; their rows are those of `from_colmap`
@@ -53,7 +52,6 @@ def max_error(width: int) -> float:
 
 def reconstruct(
     panoramas: Sequence[PanoramaFile],
-    layers: LayerFiles,
     folder: Path,
     *,
     pairing: Pairing,
@@ -73,7 +71,7 @@ def reconstruct(
     """
     with silence_colmap():
         work = Workspace(folder, tuple(panoramas), sketcher=sketcher)
-        size, features = featured(work, layers, progress, memory)
+        size, features = featured(work, progress, memory)
         allowed = max_error(size[0])
         pairs = choose_pairs(work, pairing, progress, [] if places is None else near_pairs(places, _NEAREST))
         match_pairs(work, pairs, allowed, progress)
@@ -89,7 +87,6 @@ def reconstruct(
     return [
         Reconstruction(
             panoramas=tuple(panoramas),
-            layers=layers,
             size=size,
             model=model,
             links=part.links,
@@ -104,17 +101,15 @@ def reconstruct(
     ]
 
 
-def featured(
-    work: Workspace, layers: LayerFiles, progress: StageProgress, memory: int
-) -> tuple[tuple[int, int], int]:
+def featured(work: Workspace, progress: StageProgress, memory: int) -> tuple[tuple[int, int], int]:
     """The width and height of the panoramas of a workspace, and how many features it then has of them.
 
     Raises SceneError as `reconstruct` does.
     """
-    size, count = check_images([panorama.path for panorama in work.panoramas]), len(work.panoramas)
+    size = check_images([panorama.path for panorama in work.panoramas])
     masks = [
-        [path for layer in (MASKS, SKY_MASKS) if (path := layers.get(layer, [None] * count)[row])]
-        for row in range(count)
+        [panorama.layers[layer] for layer in (MASKS, SKY_MASKS) if layer in panorama.layers]
+        for panorama in work.panoramas
     ]
     states = [[(str(path), *file_state(path)) for path in paths] for paths in masks]
     work.open([_VERSION, max_error(size[0]), states])

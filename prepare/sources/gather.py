@@ -9,12 +9,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 from panolog.prepare.file_kinds import converted_here
 from panolog.prepare.panorama_files import (
     SUFFIXES,
-    LayerFiles,
     PanoramaFile,
     look_into,
     masks_among,
@@ -25,7 +23,7 @@ from panolog.prepare.sources.find import Source, Sources
 from panolog.prepare.sources.sizes import to_one_size
 from panolog.prepare.stitching.lenses import Up
 from panolog.prepare.stitching.pictures import INSP, raw_pictures, stitch_pictures
-from panolog.prepare.video.frames import extract_frames
+from panolog.prepare.video.frames import FrameChoice, extract_frames
 from panolog.prepare.world.cropped import complete_panoramas
 from panolog.prepare.world.exif import read_exif
 from panolog.scene.errors import SceneError
@@ -37,51 +35,26 @@ _LAYERS = (MASKS, SKY_MASKS, DEPTHS)
 Note = Callable[[str], None]
 
 
-class Choice(Protocol):
-    """What is chosen of videos, and how raw files are stitched."""
-
-    @property
-    def parallax(self) -> float:
-        """Degrees between two frames of a video."""
-
-    @property
-    def frames(self) -> int | None:
-        """How many of each video at most."""
-
-    @property
-    def up(self) -> Up | None:
-        """Where up is in the first circle of what is to be stitched."""
-
-
 @dataclass(frozen=True)
 class Gathered:
     """The panoramas of a scene."""
 
     panoramas: tuple[PanoramaFile, ...]  # of one size, in the order of capture
-    layers: LayerFiles
     left_out: tuple[str, ...]  # what of the sources was not read, one line for each kind
     notes: tuple[str, ...]  # what videos and raw files lack, and what was scaled
-
-
-@dataclass(frozen=True)
-class Row:
-    """A panorama with its layers."""
-
-    panorama: PanoramaFile
-    layers: dict[str, Path | None]
 
 
 def gather(
     sources: Sources,
     work: Path,
-    choice: Choice,
+    choice: FrameChoice,
     progress: StageProgress,
-    known: tuple[Sequence[PanoramaFile], LayerFiles] = ((), {}),
+    known: Sequence[PanoramaFile] = (),
 ) -> Gathered:
     """The panoramas of all sources.
 
-    Args: work, the workspace; known, panoramas of a scene that these are added to, with their layers. They
-        come first, and what is a copy of one is left out.
+    Args: work, the workspace; known, panoramas of a scene that these are added to. They come first, and what
+        is a copy of one is left out.
 
     Raises InputError if a source is wrong, or there is nothing else than copies of one panorama; OSError if a
     file cannot be read or written.
@@ -89,31 +62,30 @@ def gather(
     notes, left_out = list[str](), list(sources.left_out)
     videos = [it for it in sources.all if it.is_video]
     folders = [it for it in sources.all if not it.is_video]
-    rows = dict[Source, list[Row]]()
+    found = dict[Source, list[PanoramaFile]]()
     for turn, source in enumerate(videos):
         show = part_of(partial(progress, "frames"), turn, len(videos))
-        rows[source] = _frames(source, _place(work, source), choice, show, notes.append)
+        found[source] = _frames(source, _place(work, source), choice, show, notes.append)
     for turn, source in enumerate(folders):
         show = part_of(partial(progress, "stitching"), turn, len(folders))
         folder, others = _stitched(source.path, _place(work, source), choice.up, show, notes.append)
-        alone = len(sources.all) == 1 and not known[0]
-        rows[source] = _photographs(source, folder, MIN_CAMERAS if alone else 1)
+        alone = len(sources.all) == 1 and not known
+        own = panoramas_in_folder(folder, MIN_CAMERAS if alone else 1)
+        found[source] = [_labelled(source, panorama) for panorama in own]
         left_out += others
     if folders:
-        taken = [row for source in folders for row in rows[source]]
-        least = 1 if videos or known[0] else MIN_CAMERAS
+        taken = [panorama for source in folders for panorama in found[source]]
+        least = 1 if videos or known else MIN_CAMERAS
         show = partial(progress, "metadata")
-        whole, copies = _completed(taken, known[0], least, work / "whole", show)
+        whole, copies = _completed(taken, known, least, work / "whole", show)
         left_out[:0] = copies
-        rows |= {source: [it for it in whole if it.panorama.source == source.label] for source in folders}
+        found |= {source: [it for it in whole if it.source == source.label] for source in folders}
     if len(sources.all) > 1:
-        rows |= {source: _in_order(rows[source]) for source in folders}
-    found = rows_of(*known) + [row for source in sources.all for row in rows[source]]
-    panoramas = [row.panorama for row in found]
+        found |= {source: _in_order(found[source]) for source in folders}
+    panoramas = [*known, *(panorama for source in sources.all for panorama in found[source])]
     check_names(work, [panorama.name for panorama in panoramas])
     sized = to_one_size(panoramas, work / "sized", partial(progress, "sizes"), notes.append)
-    layers = {layer: [row.layers.get(layer) for row in found] for layer in _LAYERS}
-    return Gathered(sized, layers, tuple(left_out), tuple(notes))
+    return Gathered(sized, tuple(left_out), tuple(notes))
 
 
 def _place(work: Path, source: Source) -> Path:
@@ -127,7 +99,9 @@ def _labelled(source: Source, panorama: PanoramaFile) -> PanoramaFile:
     return replace(panorama, name=name, source=source.label)
 
 
-def _frames(source: Source, place: Path, choice: Choice, progress: Progress, note: Note) -> list[Row]:
+def _frames(
+    source: Source, place: Path, choice: FrameChoice, progress: Progress, note: Note
+) -> list[PanoramaFile]:
     """The chosen frames of a video."""
     folder = place / "frames"
     files = extract_frames(
@@ -141,7 +115,7 @@ def _frames(source: Source, place: Path, choice: Choice, progress: Progress, not
     )
     masks = find_layer(folder, MASKS, [file.name for file in files])
     return [
-        Row(_labelled(source, PanoramaFile(folder, file.name, file)), {MASKS: mask})
+        _labelled(source, PanoramaFile(folder, file.name, file, layers={} if mask is None else {MASKS: mask}))
         for file, mask in zip(files, masks, strict=True)
     ]
 
@@ -164,45 +138,32 @@ def _stitched(
     return place / "stitched", [*lines, *look_into(given, {INSP}).left_out]
 
 
-def _photographs(source: Source, folder: Path, least: int) -> list[Row]:
-    """The panoramas of a source that is a folder. Args: folder, where they are."""
-    panoramas, layers = panoramas_in_folder(folder, least)
-    return rows_of([_labelled(source, panorama) for panorama in panoramas], layers)
-
-
-def rows_of(panoramas: Sequence[PanoramaFile], layers: LayerFiles) -> list[Row]:
-    """Panoramas, each with its layers."""
-    return [
-        Row(panorama, {layer: files[row] for layer, files in layers.items()})
-        for row, panorama in enumerate(panoramas)
-    ]
-
-
 def _completed(
-    rows: Sequence[Row], known: Sequence[PanoramaFile], least: int, folder: Path, progress: Progress
-) -> tuple[list[Row], list[str]]:
+    panoramas: Sequence[PanoramaFile],
+    known: Sequence[PanoramaFile],
+    least: int,
+    folder: Path,
+    progress: Progress,
+) -> tuple[tuple[PanoramaFile, ...], list[str]]:
     """Photographs without copies, also of those that are known, whole where they are cropped.
 
     And a line for each copy.
     """
-    kept, lines = without_copies(rows, least, known)
-    panoramas = [row.panorama for row in kept]
-    whole = as_png(panoramas, folder.with_name("converted"), part_of(progress, 0, 2))
-    whole = complete_panoramas(whole, folder, part_of(progress, 1, 2))
-    return [replace(row, panorama=panorama) for row, panorama in zip(kept, whole, strict=True)], lines
+    kept, lines = without_copies(panoramas, least, known)
+    whole = as_png(kept, folder.with_name("converted"), part_of(progress, 0, 2))
+    return complete_panoramas(whole, folder, part_of(progress, 1, 2)), lines
 
 
-def _in_order(rows: Sequence[Row]) -> list[Row]:
+def _in_order(panoramas: Sequence[PanoramaFile]) -> list[PanoramaFile]:
     """Photographs in the order in which they were taken, if all say when; else of their names."""
-    times = [read_exif(row.panorama.path).time for row in rows]
+    times = [read_exif(panorama.path).time for panorama in panoramas]
     known = [(time, place) for place, time in enumerate(times) if time is not None]
-    return [rows[place] for _, place in sorted(known)] if len(known) == len(rows) else list(rows)
+    all_known = len(known) == len(panoramas)
+    return [panoramas[place] for _, place in sorted(known)] if all_known else list(panoramas)
 
 
-def panoramas_in_folder(
-    source: Path, least: int = MIN_CAMERAS
-) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
-    """The panoramas in a folder, or in its folder images or imgs, and the layers next to or among them.
+def panoramas_in_folder(source: Path, least: int = MIN_CAMERAS) -> list[PanoramaFile]:
+    """The panoramas in a folder, or in its folder images or imgs, with the layers next to or among them.
 
     A picture NAME_mask.png next to NAME.jpg is its mask.
 
@@ -224,20 +185,24 @@ def panoramas_in_folder(
     root = source if is_root else source.parent
     layers = {layer: find_layer(root, layer, names) for layer in _LAYERS}
     layers[MASKS] = [mask or among.get(file) for mask, file in zip(layers[MASKS], files, strict=True)]
-    return tuple(PanoramaFile(root, name, file) for name, file in zip(names, files, strict=True)), layers
+    found = list[PanoramaFile]()
+    for row, (name, file) in enumerate(zip(names, files, strict=True)):
+        own = {layer: path for layer, paths in layers.items() if (path := paths[row]) is not None}
+        found.append(PanoramaFile(root, name, file, layers=own))
+    return found
 
 
 def without_copies(
-    rows: Sequence[Row], least: int = MIN_CAMERAS, known: Sequence[PanoramaFile] = ()
-) -> tuple[list[Row], list[str]]:
+    panoramas: Sequence[PanoramaFile], least: int = MIN_CAMERAS, known: Sequence[PanoramaFile] = ()
+) -> tuple[list[PanoramaFile], list[str]]:
     """The panoramas whose files differ, and a line for each other one: it shows nothing more.
 
     Args: known, others that they are not to be copies of.
     Raises: SceneError, fewer than `least` differ.
     """
-    every = [*known, *(row.panorama for row in rows)]
+    every = [*known, *panoramas]
     sizes = Counter(panorama.path.stat().st_size for panorama in every)
-    first, kept, lines = dict[bytes, str](), list[Row](), list[str]()
+    first, kept, lines = dict[bytes, str](), list[PanoramaFile](), list[str]()
     for place, panorama in enumerate(every, start=-len(known)):
         if sizes[panorama.path.stat().st_size] > 1:
             digest = hashlib.sha256(panorama.path.read_bytes()).digest()
@@ -246,10 +211,10 @@ def without_copies(
                 continue
             first.setdefault(digest, panorama.name)
         if place >= 0:
-            kept.append(rows[place])
+            kept.append(panorama)
     if len(kept) < least:
         raise SceneError(
-            f"{rows[0].panorama.root}: {len(kept)} panoramas differ, the others are copies; at least {least} "
+            f"{panoramas[0].root}: {len(kept)} panoramas differ, the others are copies; at least {least} "
             "are needed"
         )
     return kept, lines

@@ -1,7 +1,7 @@
 """Extracts the frames of a 360° video for a reconstruction: sharp ones, an even baseline apart."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from functools import cache, partial
 from pathlib import Path
@@ -29,6 +29,15 @@ _QUALITY = 95
 _WIDEST = 45.0  # degrees of parallax from which no features match
 
 Sensors = Callable[[], tuple[Telemetry | None, list[str]]]  # `read_telemetry` of a video
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """Which frames of a video become panoramas, and how what shows two fisheye circles is stitched."""
+
+    parallax: float = PARALLAX  # degrees between two of them
+    frames: int | None = None  # of each video at most
+    up: Up | None = None  # where up is in the first circle
 
 
 def extract_frames(

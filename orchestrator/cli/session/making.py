@@ -156,25 +156,24 @@ class Preparation:
         if found := [f"{what}: {number:,}" for what, number in doubts.items() if number]:
             yield f"{', '.join(found)}; {self.folder.scene / 'sfm.json'} names them"
 
-    def _with_masks(
-        self, panoramas: Sequence[PanoramaFile], layers: dict[str, list[Path | None]]
-    ) -> dict[str, list[Path | None]]:
-        """The layers with masks, which are made in RUN/prepare from those that are given."""
+    def _with_masks(self, panoramas: Sequence[PanoramaFile]) -> Sequence[PanoramaFile]:
+        """The panoramas with masks, which are made in RUN/prepare from those that are given."""
         if Step.MASKS not in self.settings.steps():
-            return layers
+            return panoramas
         folder = self.folder.preparation
         pictures = [replace(panorama, root=folder) for panorama in panoramas]
         with self._step(Step.MASKS):
             shutil.rmtree(folder / GIVEN, ignore_errors=True)  # the source may have fewer than it had
-            for picture, given in zip(pictures, layers.get(MASKS, []), strict=False):
-                if given is not None:
+            for picture in pictures:
+                if (given := picture.layers.get(MASKS)) is not None:
                     kept = picture.layer(GIVEN)
                     self.folder.make(kept.parent)
                     write_bytes(kept, given.read_bytes())
             self._mask(pictures)
             self.journal.until_done(lambda: write_mask_picture(self.folder.masks_picture, pictures))
         self._note(Step.SFM, LABELS[Step.SFM])
-        return layers | {MASKS: [it if (it := one.layer(MASKS)).is_file() else None for one in pictures]}
+        made = [{MASKS: it} if (it := picture.layer(MASKS)).is_file() else {} for picture in pictures]
+        return [replace(one, layers={**one.layers, **own}) for one, own in zip(panoramas, made, strict=True)]
 
     def _mask(self, pictures: Sequence[PanoramaFile]) -> None:
         """Masks the panoramas of each source by what is the same in it: cameras have their own operators."""

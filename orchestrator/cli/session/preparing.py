@@ -176,8 +176,8 @@ def _look_at(given: Sequence[Path]) -> tuple[bool, int, int, bool]:
             count, masked = count + raw[0], False
             sizes.append((source.path, raw[1], raw[1] // 2))
         else:
-            panoramas, layers = panoramas_in_folder(source.path, MIN_CAMERAS if len(sources) == 1 else 1)
-            count, masked = count + len(panoramas), masked and all(layers[MASKS])
+            panoramas = panoramas_in_folder(source.path, MIN_CAMERAS if len(sources) == 1 else 1)
+            count, masked = count + len(panoramas), masked and all(MASKS in it.layers for it in panoramas)
             sizes += _sizes(panoramas)
     return any(it.is_video for it in sources), count, common_width(sizes), masked
 

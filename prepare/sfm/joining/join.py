@@ -8,8 +8,7 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
-from panolog.prepare.networks.masks import GIVEN
-from panolog.prepare.panorama_files import LayerFiles, PanoramaFile
+from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.consistency.agreement import Posed, motion_between
 from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.consistency.evidence import read_evidence
@@ -60,10 +59,8 @@ def join_scene(
     known, folder = read_known(into), workspace_folder(output.resolve())
     taken = {known.scene.root.name, *(Path(it.name).parts[0] for it in known.images)}
     sources = find_sources(source, taken)
-    gathered = gather(sources, folder, settings, progress, (known.panoramas, known.layers))
-    kept = [*known.given, *[None] * (len(gathered.panoramas) - len(known.given))]
-    layers = {**gathered.layers, GIVEN: kept}
-    found = _join(known, gathered.panoramas, layers, folder, settings, progress, memory)
+    gathered = gather(sources, folder, settings, progress, known.panoramas)
+    found = _join(known, gathered.panoramas, folder, settings, progress, memory)
     notes, scene = gathered.notes, Into(into, len(known.images))
     report = SfmReport(found, _world(known), notes, gathered.left_out, 1, sources.all, scene)
     made = any(panorama.path.is_relative_to(folder) for panorama in found.panoramas)
@@ -92,7 +89,6 @@ def _check_settings(settings: SfmSettings) -> None:
 def _join(
     known: KnownScene,
     panoramas: Sequence[PanoramaFile],
-    layers: LayerFiles,
     folder: Path,
     settings: SfmSettings,
     progress: StageProgress,
@@ -104,7 +100,7 @@ def _join(
     """
     work, count = Workspace(folder, tuple(panoramas)), len(known.images)
     with silence_colmap():
-        size, features = featured(work, layers, progress, memory)
+        size, features = featured(work, progress, memory)
         pairs = _pairs(work, known, settings.pairing, progress)
         match_pairs(work, pairs, max_error(size[0]), progress)
         model = _points(work, known, size)
@@ -127,7 +123,6 @@ def _join(
     whole = with_new(known, sparse, size, max_error(size[0]))
     return Reconstruction(
         panoramas=tuple(panoramas),
-        layers=layers,
         size=size,
         model=whole,
         links=links_of(whole, size[0]),

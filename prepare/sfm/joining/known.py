@@ -1,7 +1,7 @@
 """The scene that panoramas are added to, and what its points become with them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from panolog.prepare.networks.masks import GIVEN
-from panolog.prepare.panorama_files import LayerFiles, PanoramaFile
+from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.scene.colmap import read_colmap
 from panolog.scene.model import NO_OFFSET, Scene
@@ -26,9 +26,7 @@ class KnownScene:
 
     scene: Scene
     images: tuple[PosedImage, ...]  # with what they have observed
-    panoramas: tuple[PanoramaFile, ...]
-    layers: LayerFiles
-    given: tuple[Path | None, ...]  # masks of a user that were combined with others
+    panoramas: tuple[PanoramaFile, ...]  # with the masks of a user that were combined with others, too
     offset: Offset | None
     split: Mapping[str, list[str]] | None  # as train.txt and test.txt have it
 
@@ -51,14 +49,10 @@ def read_known(folder: Path) -> KnownScene:
                 image.quaternion,
             )
         )
-        panoramas.append(PanoramaFile(scene.root, panorama.name, panorama.image, scene.root.name))
-    layers: LayerFiles = {
-        MASKS: [panorama.mask for panorama in scene.panoramas],
-        SKY_MASKS: [panorama.sky_mask for panorama in scene.panoramas],
-        DEPTHS: [panorama.depth for panorama in scene.panoramas],
-    }
-    combined = (panorama.layer(GIVEN) for panorama in panoramas)
-    given = tuple(path if path.is_file() else None for path in combined)
+        file = PanoramaFile(scene.root, panorama.name, panorama.image, scene.root.name)
+        given = it if (it := file.layer(GIVEN)).is_file() else None
+        layers = {MASKS: panorama.mask, SKY_MASKS: panorama.sky_mask, DEPTHS: panorama.depth, GIVEN: given}
+        panoramas.append(replace(file, layers={name: path for name, path in layers.items() if path}))
     offset = read_offset(scene.root)
     if scene.offset != NO_OFFSET:  # the model is far from its origin: what is read of it is not
         there = np.add(scene.offset, NO_OFFSET if offset is None else offset.offset)
@@ -67,7 +61,7 @@ def read_known(folder: Path) -> KnownScene:
     if any((scene.root / name).is_file() for name in ("train.txt", "test.txt")):
         parts = {"train.txt": scene.train, "test.txt": scene.test}
         split = {name: [scene.panoramas[row].stem for row in rows] for name, rows in parts.items()}
-    return KnownScene(scene, tuple(images), tuple(panoramas), layers, given, offset, split)
+    return KnownScene(scene, tuple(images), tuple(panoramas), offset, split)
 
 
 def with_new(known: KnownScene, found: SparseModel, size: tuple[int, int], most: float) -> SparseModel:

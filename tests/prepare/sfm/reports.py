@@ -30,7 +30,6 @@ def faulty() -> SfmReport:
     model = in_a_row((0, 1, 2, 4))
     found = Reconstruction(
         panoramas=tuple(PanoramaFile(Path(), f"{name}.jpg", Path(f"{name}.jpg")) for name in "abcde"),
-        layers={},
         size=(1024, 512),
         model=model,
         links=[

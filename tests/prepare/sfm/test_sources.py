@@ -8,7 +8,7 @@ import pytest
 
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
 from panolog.prepare.sources.find import find_sources
-from panolog.prepare.sources.gather import gather, panoramas_in_folder, rows_of, without_copies
+from panolog.prepare.sources.gather import gather, panoramas_in_folder, without_copies
 from panolog.scene.errors import InputError
 from panolog.scene.write import no_progress
 
@@ -53,9 +53,9 @@ def test_copies_are_left_out_by_content_and_named(tmp_path: Path) -> None:
     for name in ("0", "2"):
         cv2.imwrite(str(tmp_path / "masks" / f"{name}.png"), np.full((64, 128), 255, np.uint8))
     (tmp_path / "images" / "3.png").write_bytes((tmp_path / "images" / "1.png").read_bytes())
-    rows, lines = without_copies(rows_of(*panoramas_in_folder(tmp_path)))
-    assert [row.panorama.name for row in rows] == ["0.png", "1.png", "2.png"]
-    assert [row.layers["masks"] is not None for row in rows] == [True, False, True]
+    panoramas, lines = without_copies(panoramas_in_folder(tmp_path))
+    assert [panorama.name for panorama in panoramas] == ["0.png", "1.png", "2.png"]
+    assert ["masks" in panorama.layers for panorama in panoramas] == [True, False, True]
     assert lines == ["3.png: is a copy of 1.png, left out"]
 
 
@@ -80,10 +80,10 @@ def test_pictures_of_nothing_are_refused(tmp_path: Path) -> None:
 def test_where_pictures_and_masks_are(pictures: str, given: str, tmp_path: Path) -> None:
     _pictures(tmp_path / pictures)
     _pictures(tmp_path / "place" / "masks")
-    panoramas, layers = panoramas_in_folder(tmp_path / given)
+    panoramas = panoramas_in_folder(tmp_path / given)
     assert [panorama.name for panorama in panoramas] == ["0.png", "1.png", "2.png"]
-    assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(3)]
-    assert layers["depths"] == [None] * 3
+    masks = [tmp_path / "place" / "masks" / f"{number}.png" for number in range(3)]
+    assert [panorama.layers for panorama in panoramas] == [{"masks": mask} for mask in masks]
 
 
 def test_pictures_next_to_their_folder_are_named(tmp_path: Path) -> None:
@@ -100,11 +100,11 @@ def test_pictures_next_to_their_folder_are_named(tmp_path: Path) -> None:
 def test_a_mask_next_to_its_panorama_is_no_panorama(tmp_path: Path) -> None:
     """It was reconstructed as one more picture, and the operator was trained."""
     _pictures(tmp_path / "images")
-    mask = np.full((64, 128), 255, np.uint8)
-    cv2.imwrite(str(tmp_path / "images" / "1_mask.png"), mask)
-    panoramas, layers = panoramas_in_folder(tmp_path / "images")
+    cv2.imwrite(str(tmp_path / "images" / "1_mask.png"), np.full((64, 128), 255, np.uint8))
+    panoramas = panoramas_in_folder(tmp_path / "images")
     assert [panorama.name for panorama in panoramas] == ["0.png", "1.png", "2.png"]
-    assert layers["masks"] == [None, tmp_path / "images" / "1_mask.png", None]
+    mask = tmp_path / "images" / "1_mask.png"
+    assert [panorama.layers for panorama in panoramas] == [{}, {"masks": mask}, {}]
 
 
 def test_what_is_left_out_is_in_the_refusal(tmp_path: Path) -> None:

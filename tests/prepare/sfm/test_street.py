@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.panorama_files import LayerFiles
+from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm import sketch
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene, workspace_folder
 from panolog.prepare.sfm.report import SfmReport
@@ -98,8 +99,7 @@ def test_nothing_is_seen_under_a_mask(street: Made) -> None:
 def test_features_of_other_masks_are_not_used(street: Made, tmp_path: Path) -> None:
     other = tmp_path / "mask.png"
     cv2.imwrite(str(other), np.zeros((WIDTH // 2, WIDTH), np.uint8))
-    both: list[tuple[LayerFiles, int]] = [({}, COUNT), ({"masks": [other] * COUNT}, 0)]
-    for layers, wanted in both:
+    for layers, wanted in (({}, COUNT), ({"masks": other}, 0)):
         output = tmp_path / f"scene {wanted}"
         shutil.copytree(street.featured, workspace_folder(output), symlinks=True)
         assert _interrupted(street.source, output, "features", layers=layers) == wanted
@@ -168,7 +168,7 @@ def test_a_cropped_video_with_gps_and_gravity_becomes_a_scene_with_masks_in_metr
 
 
 def _interrupted(
-    source: Path, output: Path, stage: str, least: int = 0, layers: LayerFiles | None = None
+    source: Path, output: Path, stage: str, least: int = 0, layers: dict[str, Path] | None = None
 ) -> int:
     """Interrupts a job in a stage, when `least` of its steps are done; returns how many were."""
     steps = []
@@ -178,6 +178,9 @@ def _interrupted(
             steps.append(done)
             raise KeyboardInterrupt
 
+    def with_masks(panoramas: Sequence[PanoramaFile]) -> list[PanoramaFile]:
+        return [replace(it, layers={**it.layers, **(layers or {})}) for it in panoramas]
+
     with pytest.raises(KeyboardInterrupt):
-        make_scene(source, output, SfmSettings(), interrupt, lambda _, found: {**found, **(layers or {})})
+        make_scene(source, output, SfmSettings(), interrupt, with_masks)
     return steps[0]

@@ -111,7 +111,7 @@ def test_a_folder_of_them_is_one_of_panoramas(tmp_path: Path, monkeypatch: pytes
     for name in ("a.avif", "b.avif", "c.heic"):
         (tmp_path / name).touch()
     monkeypatch.setattr(file_kinds, "installed", lambda module: True)
-    panoramas, _ = panoramas_in_folder(tmp_path)
+    panoramas = panoramas_in_folder(tmp_path)
     assert [it.name for it in panoramas] == ["a.avif", "b.avif", "c.heic"]
     monkeypatch.setattr(file_kinds, "installed", lambda module: False)
     with pytest.raises(

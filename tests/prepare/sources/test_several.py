@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from panolog.prepare.panorama_files import LayerFiles, PanoramaFile
+from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.pipeline import SfmSettings, make_scene, workspace_folder
 from panolog.prepare.sfm.reconstruct import Reconstruction
 from panolog.prepare.sources.find import find_sources
@@ -47,8 +47,7 @@ def test_each_source_is_chosen_by_itself_and_follows_in_time(street: Street, tmp
     assert {(info.width, info.height) for info in (read_info(it.path) for it in found.panoramas)} == {
         (PHOTOGRAPH, PHOTOGRAPH // 2)
     }
-    masks = [name for name, mask in zip(names, found.layers["masks"], strict=True) if mask]
-    assert masks == ["stills/8.jpg"]
+    assert [it.name for it in found.panoramas if "masks" in it.layers] == ["stills/8.jpg"]
     assert [line for line in found.left_out if "copy" in line] == list(found.left_out)
     assert any(" of another size than 640 x 320: scaled to it" in note for note in found.notes)
     order = list(dict.fromkeys(what for what, _ in steps))
@@ -84,11 +83,11 @@ def test_what_was_stopped_ends_the_same(street: Street, tmp_path: Path) -> None:
     assert {it: it.stat().st_mtime_ns for it in before} == before  # nothing is made again
 
 
-def _in_a_row(panoramas: tuple[PanoramaFile, ...], layers: LayerFiles, *_: Any, **__: Any) -> Any:
+def _in_a_row(panoramas: tuple[PanoramaFile, ...], *_: Any, **__: Any) -> Any:
     """A reconstruction of all panoramas, a metre from one to the next, in place of a search for poses."""
     model = in_a_row(tuple(range(len(panoramas))))
     size = (PHOTOGRAPH, PHOTOGRAPH // 2)
-    return [Reconstruction(panoramas, layers, size, model, [], [], {}, frozenset(), [], 100, 9)]
+    return [Reconstruction(panoramas, size, model, [], [], {}, frozenset(), [], 100, 9)]
 
 
 @pytest.mark.parametrize(

@@ -69,9 +69,8 @@ class FakeSfm:
         }
         self.calls.append(settings)
         work = workspace_folder(output.resolve())
-        layers = with_masks(*panoramas_in_folder(source))
-        found = [(mask.name, mask.stat().st_mtime_ns) for mask in layers.get("masks", []) if mask]
-        self.masks.append(found)
+        masks = [it.layers["masks"] for it in with_masks(panoramas_in_folder(source)) if "masks" in it.layers]
+        self.masks.append([(mask.name, mask.stat().st_mtime_ns) for mask in masks])
         for part in ("features", "poses"):
             progress(part, 0, 10)
             show(sketches[part])
@@ -82,7 +81,7 @@ class FakeSfm:
                 self.done.append(part)
             progress(part, 10, 10)
         copytree(self.town, output)
-        for mask in filter(None, layers.get("masks", [])):
+        for mask in masks:
             (output / "masks").mkdir(exist_ok=True)
             copy(mask, output / "masks")
         self.at("report")

@@ -50,7 +50,7 @@ def gathering(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[Path]]:
     ) -> None:
         calls.append(source)
         found = gather(find_sources(source), workspace_folder(output.resolve()), settings, progress)
-        with_masks(found.panoramas, found.layers)
+        with_masks(found.panoramas)
         raise MaskedError
 
     monkeypatch.setattr(pipeline, "make_scene", make_scene)

@@ -38,14 +38,14 @@ class Place:
 def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
     folder = tmp_path_factory.mktemp("jobs") / "place"
     (folder / "day 2").mkdir(parents=True)
-    shots, images = walk([STEP] * COUNT), []
+    shots, images, mask = walk([STEP] * COUNT), [], folder / "mask.png"
+    cv2.imwrite(str(mask), np.full((32, 64), 255, np.uint8))
     for row, shot in enumerate(shots):
         file = folder / f"{row}.png"
         cv2.imwrite(str(file), render(shot, WIDTH))
         turn = Rotation.from_euler("YXZ", shot.turn, degrees=True).as_matrix().T @ WORLD[0].T
-        images.append(PosedImage(f"day_2/{row}.png", file, turn, -turn @ _there(shot)))
-    mask = folder / "mask.png"
-    cv2.imwrite(str(mask), np.full((32, 64), 255, np.uint8))
+        layers = {"masks": mask} if row == 1 else {}
+        images.append(PosedImage(f"day_2/{row}.png", file, turn, -turn @ _there(shot), layers=layers))
     points = np.random.default_rng(1).normal(0, 3, (6, 3))
     new = NewScene(
         images,
@@ -53,7 +53,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
         points,
         np.arange(18, dtype=np.uint8).reshape(6, 3),
         split={"train.txt": ["day_2/1", "day_2/2", "day_2/3"], "test.txt": ["day_2/0"]},
-        layers={"masks": [None, mask, None, None]},
         offset=Offset(offset=(5.0, 6.0, 7.0)),
     )
     write_scene(folder / "scene", new, link=False)
