@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -30,6 +29,7 @@ class Table:
     """Where the rows of the first element are and what each one holds."""
 
     path: Path
+    layout: str  # ascii, binary_little_endian or binary_big_endian
     count: int  # rows
     dtype: np.dtype[Any]  # one row
     offset: int  # bytes before the first row
@@ -48,18 +48,8 @@ class Table:
         return records
 
 
-@dataclass(frozen=True)
-class Header:
-    """What precedes the rows."""
-
-    layout: str  # ascii, binary_little_endian or binary_big_endian
-    count: int  # rows of the first element, `vertex`
-    properties: tuple[tuple[str, str], ...]  # name and numpy kind
-    comments: tuple[str, ...]
-
-
-def read_header(path: Path, file: BinaryIO) -> Header:
-    """Reads the header of a PLY; `file` is then at the first row.
+def read_header(path: Path, file: BinaryIO) -> Table:
+    """The table by the header of a PLY, whose rows may be text or missing; `file` is then at the first row.
 
     Raises PlyError: no PLY, another first element than `vertex`, or a list property.
     """
@@ -77,12 +67,9 @@ def read_header(path: Path, file: BinaryIO) -> Header:
     names = [name for _, _, name in properties]
     if len(set(names)) != len(names) or not names:
         raise PlyError(f"{path}: the vertex properties of the PLY are missing or named twice")
-    return Header(
-        layout,
-        int(words[elements[0]][-1]),
-        tuple((name, _TYPES[kind]) for _, kind, name in properties),
-        tuple(line.partition(" ")[2] for line in lines if line.startswith("comment ")),
-    )
+    dtype = np.dtype([(name, _ORDER.get(layout, "=") + _TYPES[kind]) for _, kind, name in properties])
+    comments = tuple(line.partition(" ")[2] for line in lines if line.startswith("comment "))
+    return Table(path, layout, int(words[elements[0]][-1]), dtype, file.tell(), comments)
 
 
 def read_table(path: Path) -> Table:
@@ -93,17 +80,15 @@ def read_table(path: Path) -> Table:
     if not path.is_file():
         raise PlyError(f"{path}: there is no such file")
     with path.open("rb") as file:
-        header = read_header(path, file)
-        offset = file.tell()
-    if header.layout not in _ORDER:
-        raise PlyError(f"{path}: PLY format {header.layout} cannot be read; save it as binary PLY")
-    dtype = np.dtype([(name, _ORDER[header.layout] + kind) for name, kind in header.properties])
-    missing = offset + header.count * dtype.itemsize - path.stat().st_size
+        table = read_header(path, file)
+    if table.layout not in _ORDER:
+        raise PlyError(f"{path}: PLY format {table.layout} cannot be read; save it as binary PLY")
+    missing = table.offset + table.count * table.dtype.itemsize - path.stat().st_size
     if missing > 0:
         raise PlyError(
-            f"{path}: truncated, {missing} bytes of its {header.count} rows are missing; copy it again"
+            f"{path}: truncated, {missing} bytes of its {table.count} rows are missing; copy it again"
         )
-    return Table(path, header.count, dtype, offset, header.comments)
+    return table
 
 
 def read_vertices(table: Table) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
@@ -111,7 +96,7 @@ def read_vertices(table: Table) -> tuple[NDArray[np.float64], NDArray[np.uint8] 
 
     Raises PlyError: no position, or colours that are not 8 bit.
     """
-    position, color = point_columns(table.path, table.dtype.names or ())
+    position, color = point_columns(table)
     if any(table.dtype[name] != np.uint8 for name in color):
         raise PlyError(f"{table.path}: the colours of the point cloud are not 8 bit; save them as uchar")
     rows = table.rows(0, table.count)
@@ -119,13 +104,14 @@ def read_vertices(table: Table) -> tuple[NDArray[np.float64], NDArray[np.uint8] 
     return points, np.stack([rows[name] for name in color], axis=1) if color else None
 
 
-def point_columns(path: Path, names: Sequence[str]) -> tuple[list[str], list[str]]:
+def point_columns(table: Table) -> tuple[list[str], list[str]]:
     """The names of a point cloud's columns: x y z, and red green blue or diffuse_red and so on, or none.
 
     Raises PlyError: x, y or z is missing.
     """
+    names = table.dtype.names or ()
     if missing := [name for name in "xyz" if name not in names]:
-        raise PlyError(f"{path}: the point cloud has no column {missing[0]}")
+        raise PlyError(f"{table.path}: the point cloud has no column {missing[0]}")
     for prefix in ("", "diffuse_"):
         color = [prefix + name for name in ("red", "green", "blue")]
         if set(color) <= set(names):
