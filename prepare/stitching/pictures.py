@@ -17,7 +17,7 @@ from panolog.prepare.stitching.lenses import APPROXIMATE, Pair, Up, pairs_as_jso
 from panolog.prepare.stitching.light import fall_off
 from panolog.prepare.stitching.stitch import Stitcher
 from panolog.prepare.world.exif import camera_of, essential_exif
-from panolog.prepare.world.image_blocks import EXIF_HEAD, with_segments
+from panolog.prepare.world.image_blocks import with_metadata
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, natural_key, write_bytes
 from panolog.scene.image_files import decode, decode_colors, read_info
@@ -172,8 +172,7 @@ def _stitch(file: Path, target: Path, stitcher: Stitcher, changed: int, note: Ca
         )
     whole = stitcher.panorama(halves(picture))
     jpeg = bytes(cv2.imencode(".jpg", whole, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
-    if (block := essential_exif(file)) is not None:
-        jpeg = with_segments(jpeg, EXIF_HEAD + block)
+    jpeg = with_metadata(jpeg, essential_exif(file), None)
     target.parent.mkdir(parents=True, exist_ok=True)
     with atomic(target) as temporary:
         temporary.write_bytes(jpeg)

@@ -25,7 +25,7 @@ from defusedxml.ElementTree import fromstring
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from panolog.prepare.world.image_blocks import Bounded, read_blocks
+from panolog.prepare.world.image_blocks import EXIF_HEAD, Bounded, read_blocks
 from panolog.scene.errors import SceneError
 from panolog.scene.pictures.headers import DAMAGE
 
@@ -168,7 +168,7 @@ def essential_exif(path: Path) -> bytes | None:
                 reduced[ExifTags.IFD.GPSInfo] = place
             if ExifTags.Base.DateTime in tags:
                 reduced[ExifTags.Base.DateTime] = tags[ExifTags.Base.DateTime]
-            return reduced.tobytes().removeprefix(b"Exif\0\0") if len(reduced) else None
+            return reduced.tobytes().removeprefix(EXIF_HEAD) if len(reduced) else None
         except DAMAGE:
             return None
 

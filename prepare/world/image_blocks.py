@@ -91,17 +91,6 @@ def _text(data: bytes) -> bytes:
         return b""
 
 
-def with_segments(jpeg: bytes, *contents: bytes) -> bytes:
-    """A JPEG with these contents, which begin as EXIF or XMP does, each as an APP1 segment.
-
-    Args: jpeg, as OpenCV writes it, with a JFIF segment at its beginning, which has to stay the first.
-    """
-    behind = 4 + int.from_bytes(jpeg[4:6], "big")
-    marker = bytes((0xFF, _APP1))
-    segments = b"".join(marker + (len(it) + 2).to_bytes(2, "big") + it for it in contents)
-    return jpeg[:behind] + segments + jpeg[behind:]
-
-
 def with_chunks(png: bytes, *chunks: tuple[bytes, bytes]) -> bytes:
     """A PNG with these chunks, each a kind of four characters and its data, before the others but IHDR."""
     packed = b"".join(
@@ -117,6 +106,8 @@ def with_metadata(image: bytes, exif: bytes | None, xmp: bytes | None) -> bytes:
         chunks = [] if exif is None else [(b"eXIf", exif)]
         chunks += [] if xmp is None else [(b"iTXt", _PNG_XMP + b"\0\0\0\0" + xmp)]
         return with_chunks(image, *chunks)
+    behind = 4 + int.from_bytes(image[4:6], "big")  # a JFIF segment, which has to stay the first
     segments = [] if exif is None else [EXIF_HEAD + exif]
     segments += [] if xmp is None else [XMP_HEAD + xmp]
-    return with_segments(image, *segments)
+    marked = (bytes((0xFF, _APP1)) + (len(it) + 2).to_bytes(2, "big") + it for it in segments)
+    return image[:behind] + b"".join(marked) + image[behind:]
