@@ -20,9 +20,10 @@ _LENSES = f"a video of two lenses; {STITCH}"
 _VIDEO = "a video; give it by itself, or next to the folder: `panolog run FOLDER VIDEO -o RUN`"
 _STITCHED = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 HEIC, AVIF = (".heic", ".heif", ".hif"), (".avif",)  # pictures that become PNG: `sources/convert.py`
+INSP = ".insp"  # a JPEG that Insta360 names so where it is not stitched
 VIDEOS = frozenset({*_STITCHED, ".insv", ".osv"})  # that a folder may hold
 _KINDS = {
-    ".insp": f"a photograph of two fisheye lenses (Insta360); {STITCH}",
+    INSP: f"a photograph of two fisheye lenses (Insta360); {STITCH}",
     ".insv": _LENSES,
     ".360": _LENSES,
     ".osv": _LENSES,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.file_kinds import VIDEOS, converted_here, describe_left_out
+from panolog.prepare.file_kinds import INSP, VIDEOS, converted_here, describe_left_out
 from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
@@ -91,7 +91,7 @@ def look_into(folder: Path, used: Collection[str] = ()) -> FolderContent:
                 files.append(path)
             elif path.suffix.lower() in SUFFIXES:
                 hidden.append(path.relative_to(folder).as_posix())
-    kinds = {*SUFFIXES, *converted_here().intersection(used)}
+    kinds = {*SUFFIXES, *{*converted_here(), INSP}.intersection(used)}
     images = [path for path in files if path.suffix.lower() in kinds and path.is_file()]
     videos = [path for path in files if path.suffix.lower() in VIDEOS and path.is_file()]
     left_out = describe_left_out(sorted(it for it in files if it.suffix.lower() not in used), folder)

@@ -5,13 +5,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from panolog.prepare.file_kinds import INSP
 from panolog.prepare.panorama_files import SUFFIXES, pictures_below
 from panolog.prepare.stitching.lenses import Pair, pairs_as_json, read_pairs
 from panolog.prepare.stitching.pictures import (
-    INSP,
     LENSES,
     check_folder,
-    common_width,
     find_pairs,
     raw_pictures,
     shows_circles,
@@ -73,7 +72,9 @@ def stitch_source(
     if source.is_file() and source.suffix.lower() not in {INSP, *SUFFIXES}:
         if width is not None:
             raise ConfigError("--width is of pictures; frames of a video are as wide as the lenses resolve")
-        pair = _lenses_of(source)
+        if (lenses := video_lenses(source)) is None:
+            raise _no_circles(source)
+        pair = lenses.pair
         check_folder(output)
         output.mkdir(parents=True, exist_ok=True)
         write_bytes(output / LENSES, pairs_as_json([pair if up is None else replace(pair, up=up)]))
@@ -106,15 +107,7 @@ def look_at_raw(source: Path) -> tuple[int, int] | None:
     """
     inner = pictures_below(source)
     files = raw_pictures(inner) if inner.is_dir() else []
-    return (len(files), common_width(find_pairs(files).values())) if files else None
-
-
-def _lenses_of(video: Path) -> Pair:
-    """The lenses of a video. Raises SceneError if it shows no circles."""
-    found = video_lenses(video)
-    if found is None:
-        raise _no_circles(video)
-    return found.pair
+    return (len(files), min(pair.width for pair in find_pairs(files).values())) if files else None
 
 
 def _no_circles(source: Path) -> SceneError:

@@ -15,9 +15,8 @@ from typing import Any
 
 import av
 
-from panolog.prepare.file_kinds import VIDEOS, converted_here
+from panolog.prepare.file_kinds import INSP, VIDEOS, converted_here
 from panolog.prepare.panorama_files import look_into, pictures_below
-from panolog.prepare.stitching.pictures import INSP
 from panolog.prepare.video.lenses import first_lens
 from panolog.prepare.video.streams import begun, open_container
 from panolog.prepare.world.exif import read_exif
@@ -79,11 +78,7 @@ def find_sources(given: Sequence[Path], taken: Collection[str] = ()) -> Sources:
 
 def _pictures(folder: Path) -> list[Path]:
     """The pictures of a folder, also those of two lenses, in the natural order of their names."""
-    inner = pictures_below(folder)
-    raw = [it for it in inner.rglob("*") if it.suffix.lower() == INSP and not it.name.startswith(".")]
-    return sorted(
-        {*look_into(inner, converted_here()).images, *raw}, key=lambda it: natural_key(it.as_posix())
-    )
+    return look_into(pictures_below(folder), {*converted_here(), INSP}).images
 
 
 def _without_companions(sources: Sequence[Source]) -> tuple[list[Source], list[str]]:

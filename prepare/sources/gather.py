@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from panolog.prepare.file_kinds import converted_here
+from panolog.prepare.file_kinds import INSP, converted_here
 from panolog.prepare.panorama_files import (
     SUFFIXES,
     PanoramaFile,
@@ -22,7 +22,7 @@ from panolog.prepare.sources.convert import as_png
 from panolog.prepare.sources.find import Source, Sources
 from panolog.prepare.sources.sizes import to_one_size
 from panolog.prepare.stitching.lenses import Up
-from panolog.prepare.stitching.pictures import INSP, raw_pictures, stitch_pictures
+from panolog.prepare.stitching.pictures import raw_pictures, stitch_pictures
 from panolog.prepare.video.frames import FrameChoice, extract_frames
 from panolog.prepare.world.cropped import complete_panoramas
 from panolog.prepare.world.exif import read_exif

@@ -2,13 +2,14 @@
 
 import os
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from panolog.prepare.file_kinds import INSP
 from panolog.prepare.panorama_files import look_into, masks_among
 from panolog.prepare.provenance import MAX_BYTES
 from panolog.prepare.stitching.calibrate import AGREED, Lenses, OverlapError, calibrate, disagreement
@@ -19,13 +20,12 @@ from panolog.prepare.stitching.stitch import Stitcher
 from panolog.prepare.world.exif import camera_of, essential_exif
 from panolog.prepare.world.image_blocks import with_metadata
 from panolog.scene.errors import SceneError
-from panolog.scene.files import atomic, natural_key, write_bytes
+from panolog.scene.files import atomic, write_bytes
 from panolog.scene.image_files import decode, decode_colors, read_info
 from panolog.scene.pictures.kinds import STITCH_THERE, describe_picture
 from panolog.scene.write import Progress, no_progress
 
 LENSES = "lenses.json"
-INSP = ".insp"  # a JPEG that Insta360 names so where it is not stitched
 _SAMPLED = 8  # pictures in which the lenses are looked for
 _SIDE = 2048  # pixels of a lens's picture in which that is done, at most
 _QUALITY = 95
@@ -37,11 +37,10 @@ def raw_pictures(folder: Path) -> list[Path]:
 
     Raises SceneError if a picture is damaged.
     """
-    images = look_into(folder).images
-    masks = set(masks_among(images).values())
-    named = [it for it in folder.rglob("*") if it.suffix.lower() == INSP and not it.name.startswith(".")]
-    found = sorted({*images, *named} - masks, key=lambda it: natural_key(it.relative_to(folder).as_posix()))
-    first = next((it for it in found if it in images), None)
+    images = look_into(folder, {INSP}).images
+    masks = masks_among(images).values()
+    found = [it for it in images if it not in masks]
+    first = next((it for it in found if it.suffix.lower() != INSP), None)
     if first is not None and not shows_circles(first):
         return []
     return [it for it in found if it.suffix.lower() == INSP or shows_circles(it)]
@@ -85,11 +84,6 @@ def find_pairs(files: Sequence[Path], known: Sequence[Pair] = (), up: Up | None 
         pair = pair if up is None else replace(pair, up=up)
         found.update(dict.fromkeys(pictures, pair))
     return found
-
-
-def common_width(pairs: Iterable[Pair]) -> int:
-    """Pixels of the panoramas of several cameras, which all have the same size."""
-    return min(pair.width for pair in pairs)
 
 
 def lenses_in(source: Path, size: tuple[int, int], pictures: Sequence[Lenses]) -> Pair:
@@ -142,7 +136,7 @@ def stitch_pictures(
         output.mkdir(parents=True, exist_ok=True)
         write_bytes(output / LENSES, pairs_as_json(distinct))
     note(APPROXIMATE)
-    width = width or common_width(distinct)
+    width = width or min(pair.width for pair in distinct)
     stitchers = {pair: Stitcher(pair, width) for pair in distinct}
     for done, (file, target) in enumerate(targets.items(), 1):
         stitcher = stitchers[pairs[file]]
