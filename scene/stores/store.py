@@ -7,7 +7,6 @@ growing pauses, after the provider's own library has done the same for up to 90 
 
 import asyncio
 import errno
-import importlib
 import logging
 import os
 import random
@@ -17,10 +16,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-from panolog.scene.errors import StoreError, StoreLostError
+from panolog.scene.errors import StoreError, StoreLostError, first_line
 from panolog.scene.files import write_bytes
 from panolog.scene.stores.url import PROTOCOLS, StoreUrl, parse_url
 
@@ -45,7 +45,7 @@ class _Errors:
     def loaded(self) -> "_Errors":
         """The classes, with those that all file systems share."""
         absent, final, passing = (
-            tuple(map(_loaded, names)) for names in (self.absent, self.final, self.passing)
+            tuple(map(resolve_name, names)) for names in (self.absent, self.final, self.passing)
         )
         return _Errors(
             (FileNotFoundError, *absent),
@@ -288,12 +288,6 @@ def _opened(url: StoreUrl) -> tuple[_Errors, Any]:
     return errors, files
 
 
-def _loaded(named: str) -> type[Exception]:
-    module, _, name = named.partition(":")
-    found: type[Exception] = getattr(importlib.import_module(module), name)
-    return found
-
-
 def _no_access(where: str, error: Exception) -> StoreError:
     return StoreError(
         f"{where}: no access ({_reason(error)}); set the provider's credentials, by its"
@@ -342,7 +336,7 @@ def _reason(error: BaseException) -> str:
     """An error in few words. Texts of the providers' libraries may quote requests, which are left out."""
     if (address := _address(error)) is not None:
         return f"{address} cannot be reached; check the address of the store (its endpoint) and the network"
-    text = (str(error).strip().splitlines() or [""])[0]
+    text = first_line(str(error))
     if text and "://" not in text and len(text) <= 120:
         return text
     status = _status(error)
