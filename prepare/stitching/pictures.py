@@ -21,7 +21,7 @@ from panolog.prepare.world.exif import camera_of, essential_exif
 from panolog.prepare.world.image_blocks import with_metadata
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, write_bytes
-from panolog.scene.image_files import decode, decode_colors, read_info
+from panolog.scene.image_files import decode, decode_colors, read_info, resize
 from panolog.scene.pictures.kinds import STITCH_THERE, describe_picture
 from panolog.scene.write import Progress, no_progress
 
@@ -178,10 +178,7 @@ def reduced(picture: Picture) -> Lenses:
     one, other = halves(picture)
     factor = min(1.0, _SIDE / max(one.shape[:2]))
     size = round(one.shape[1] * factor), round(one.shape[0] * factor)
-    if factor == 1:
-        return one, other
-    small = [np.asarray(cv2.resize(it, size, interpolation=cv2.INTER_AREA), np.uint8) for it in (one, other)]
-    return small[0], small[1]
+    return resize(one, size), resize(other, size)
 
 
 def _spread(count: int) -> list[int]:

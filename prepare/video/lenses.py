@@ -53,10 +53,6 @@ class VideoLenses:
     pair: Pair
     second: Second | None  # None: in the same frames
 
-    def layout(self) -> "StitchedLayout":
-        """The layout that stitches its frames."""
-        return _layout(self.pair)
-
 
 @dataclass(frozen=True)
 class StitchedLayout:
@@ -92,8 +88,11 @@ class StitchedLayout:
 
 
 @lru_cache(maxsize=2)
-def _layout(pair: Pair) -> StitchedLayout:
-    """Kept, as what a stitcher has computed is used again when the video is opened again."""
+def stitched_layout(pair: Pair) -> StitchedLayout:
+    """The layout that stitches frames of two lenses.
+
+    Kept, as what a stitcher has computed is used again when the video is opened again.
+    """
     return StitchedLayout(Stitcher(pair, min(pair.width, WIDEST)))
 
 

@@ -18,6 +18,7 @@ from pydantic import Field, FiniteFloat, TypeAdapter
 from panolog.prepare.video.decode import MAX_FRAMES
 from panolog.prepare.video.parallax import WIDTH, Anchor, Displacement, SphereBand
 from panolog.scene.files import write_bytes
+from panolog.scene.image_files import resize
 
 SHARP_WIDTH = 2048  # pixels at which sharpness is measured: finer structure is noise of the codec
 _BAND = 45.0  # degrees on either side of the horizon where sharpness is measured
@@ -221,9 +222,7 @@ def sharpness(grey: NDArray[np.uint8]) -> float:
 
 def _reduced(grey: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
     """`grey` (H, W) at most `width` wide."""
-    if grey.shape[1] <= width:
-        return grey
-    return np.asarray(cv2.resize(grey, (width, width // 2), interpolation=cv2.INTER_AREA), np.uint8)
+    return grey if grey.shape[1] <= width else resize(grey, (width, width // 2))
 
 
 def _seconds(time: float) -> float:
