@@ -51,7 +51,7 @@ class StaticRegion:
 def static_region(panoramas: Iterable[NDArray[np.uint8]]) -> StaticRegion:
     """What stays the same around the nadir of panoramas (WIDTH / 2, WIDTH, 3) that were taken at many places.
 
-    Raises ValueError if they are fewer than FEWEST.
+    Args: panoramas, FEWEST or more.
     """
     agreed = np.zeros((2 * _RADIUS, 2 * _RADIUS, 2), np.float32)
     strength = np.zeros((2 * _RADIUS, 2 * _RADIUS), np.float32)
@@ -63,8 +63,6 @@ def static_region(panoramas: Iterable[NDArray[np.uint8]]) -> StaticRegion:
         agreed += edges
         strength += np.hypot(edges[..., 0], edges[..., 1])
         count += 1
-    if count < FEWEST:
-        raise ValueError(f"{count} panoramas are too few to find what stays the same; {FEWEST} are needed")
     sigma = _SMOOTH * _DEGREE
     total = cv2.GaussianBlur(strength, (0, 0), sigma)
     same = cv2.GaussianBlur(np.hypot(agreed[..., 0], agreed[..., 1]), (0, 0), sigma)

@@ -21,7 +21,8 @@ def look_alikes(work: Workspace, most: int, progress: StageProgress) -> list[tup
     """Pairs of rows, ascending: each panorama with the `most` that share most of its largest features."""
     ids = work.ids()
     with pycolmap.Database.open(work.database) as database:
-        words = [_numbers(database.read_descriptors(number).data[:_LARGEST]) for number in ids]
+        # (N, 128) of each. Products of descriptors are whole and below 2^24: exact in any order.
+        words = [np.asarray(database.read_descriptors(it).data[:_LARGEST], np.float32) for it in ids]
     shared = np.zeros((len(ids), len(ids)), np.int64)
     for row, own in enumerate(words):
         progress("look-alikes", row, len(ids))
@@ -42,11 +43,6 @@ def look_alikes(work: Workspace, most: int, progress: StageProgress) -> list[tup
         if shared[row, other] > 0
     }
     return sorted(pairs)
-
-
-def _numbers(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(N, 128) descriptors as numbers. Their products are whole and below 2^24: exact in any order."""
-    return np.asarray(descriptors, np.float32)
 
 
 def _matches(close: NDArray[np.float32]) -> int:

@@ -31,11 +31,11 @@ def map_pairs(
     """
     shutil.rmtree(work.models, ignore_errors=True)
     work.models.mkdir(parents=True)
-    given = work, progress
-    models = _global(*given) if mapper == "global" else _incremental(*given, max_error, known)
-    if not models:
-        return None
-    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    if mapper == "global":
+        models = _global(work, progress)
+    else:
+        models = _incremental(work, progress, max_error, known)
+    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 
 def _incremental(

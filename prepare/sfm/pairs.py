@@ -11,6 +11,7 @@ import pycolmap
 
 from panolog.prepare.sfm.looks import look_alikes
 from panolog.prepare.sfm.workspace import Workspace
+from panolog.scene.files import atomic
 from panolog.scene.write import StageProgress
 
 Pairing = Literal["auto", "exhaustive", "sequential"]
@@ -130,9 +131,8 @@ def _learn_words(
     build.num_visual_words = min(_WORDS, max(1, len(sample) // 2))
     descriptors = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, sample)
     index.build(build, descriptors.to_float())
-    temporary = path.with_suffix(".part")
-    index.write(temporary)
-    temporary.replace(path)
+    with atomic(path) as temporary:
+        index.write(temporary)
 
 
 def _sorted(pairs: Sequence[tuple[int, int]]) -> Pairs:

@@ -27,7 +27,7 @@ from panolog.prepare.sources.find import Sources, find_sources
 from panolog.prepare.sources.gather import Gathered, gather
 from panolog.prepare.video.frames import FrameChoice, frame_times
 from panolog.prepare.world.exif import read_exif
-from panolog.prepare.world.georeference import Georeference, check_metres, georeference, scale_from_distance
+from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import natural_key, some_of, stem_of
 from panolog.scene.write import NewScene, Offset, PosedImage, StageProgress, require_new, write_scene
@@ -167,7 +167,8 @@ def _between(
             raise ConfigError(f"--distance: {name} is not there; name two of the {some}")
     if first == second:
         raise ConfigError(f"--distance {first} {second}: give two panoramas")
-    check_metres(metres)
+    if not 0 < metres < np.inf:
+        raise ConfigError(f"--distance: {metres:g} m is not a distance; give metres above 0")
     return first, second, metres
 
 

@@ -81,12 +81,6 @@ def georeference(
     )
 
 
-def check_metres(metres: float) -> None:
-    """Raises ConfigError if a distance is not positive and finite."""
-    if not 0 < metres < np.inf:
-        raise ConfigError(f"--distance: {metres:g} m is not a distance; give metres above 0")
-
-
 def scale_from_distance(
     names: Sequence[str], centers: Array, first: str, second: str, metres: float
 ) -> float:
