@@ -73,7 +73,7 @@ class Detail:
         self._labels = np.empty(len(means), np.int32)
         self._nodes: list[Node] = []
         self.tree = self._cut(means, rows, side, most)
-        self._cube = _merging_side(means, rows)
+        self._cube = _merging_side(means)
         self.sides = self._sides(means, levels)
 
     def leaves(self) -> Iterator[Leaf]:
@@ -132,13 +132,13 @@ def around(boxes: Sequence[Corners]) -> Corners:
     return np.min(lower, axis=0), np.max(upper, axis=0)
 
 
-def _merging_side(means: NDArray[np.float32], rows: NDArray[np.int32]) -> float:
+def _merging_side(means: NDArray[np.float32]) -> float:
     """The side of cubes of which the Gaussians occupy `_CUBES` times as many as they are.
 
     By a part of the model around its median, where it is as dense as elsewhere.
     """
     apart = np.abs(means - np.median(means[:: max(1, len(means) // _SAMPLE)], axis=0)).max(axis=1)
-    near = means[np.argpartition(apart, _SAMPLE)[:_SAMPLE]] if len(rows) > _SAMPLE else means
+    near = means[np.argpartition(apart, _SAMPLE)[:_SAMPLE]] if len(means) > _SAMPLE else means
     low, high = 0.0, float(np.ptp(near, axis=0).max()) or 1.0
     places = near - near.min(axis=0)
     for _ in range(24):

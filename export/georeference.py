@@ -139,8 +139,7 @@ class Georeference:
 def georeference_of(scene: Scene) -> Georeference:
     """What a scene says of its place: its cameras, and offset.json. Raises SceneError if that is wrong."""
     known = read_offset(scene.root)
-    centers = np.stack([panorama.center for panorama in scene.panoramas])
-    middle = tuple(np.round(centers.mean(axis=0)).tolist())
+    middle = tuple(np.round(scene.centers.mean(axis=0)).tolist())
     found = Georeference(_up(scene), middle, scene.offset)
     if known is None:
         return found

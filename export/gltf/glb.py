@@ -21,6 +21,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.export.order import means_of
 from panolog.export.splats import Splats, SplatSource
 from panolog.export.spz import encode
 from panolog.scene.errors import FormatError
@@ -46,7 +47,9 @@ def encode_glb(file: BinaryIO, source: SplatSource) -> None:
     """Writes what `write_glb` does to an open file. Raises FormatError as it does."""
     if not source.count:
         raise FormatError("there is no Gaussian to write; select more of the model")
-    lower, upper = _bounds(source)
+    means = means_of(source)
+    lower, upper = (side.astype(np.float64) for side in (means.min(axis=0), means.max(axis=0)))
+    del means
     origin = np.round((lower + upper) / 2)
     local = _Moved(source, origin)
     bounds = tuple((side - origin).astype(np.float32).tolist() for side in (lower, upper))
@@ -77,15 +80,6 @@ class _Moved:
     def pieces(self) -> Iterator[Splats]:
         for piece in self.source.pieces():
             yield replace(piece, means=(piece.means - self.origin).astype(np.float32))
-
-
-def _bounds(source: SplatSource) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper corner (3,) of the means."""
-    lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
-    for piece in source.pieces():
-        lower = np.minimum(lower, piece.means.min(axis=0))
-        upper = np.maximum(upper, piece.means.max(axis=0))
-    return lower, upper
 
 
 def _attributes(degree: int) -> dict[str, tuple[str, int]]:
