@@ -56,11 +56,6 @@ class FolderContent:
     left_out: list[str]  # what else of cameras is there, one line for each kind
 
 
-def find_image_files(folder: Path) -> list[Path]:
-    """`look_into` a folder for its images alone."""
-    return look_into(folder).images
-
-
 def pictures_below(source: Path) -> Path:
     """Where the pictures of a folder are: in its folder images or imgs, or in itself."""
     return next((source / name for name in ("images", "imgs") if (source / name).is_dir()), source)
@@ -123,7 +118,7 @@ def list_panoramas(scene: Path) -> list[PanoramaFile]:
     """
     root = scene.resolve()
     folder = image_folder(root)
-    files = find_image_files(folder)
+    files = look_into(folder).images
     masks = set(masks_among(files).values())
     files = [path for path in files if path not in masks]
     names = [path.relative_to(folder).as_posix() for path in files]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.check.evidence import POINTS, points_seen
 from panolog.prepare.networks.masks import share_of_sphere
-from panolog.prepare.panorama_files import find_image_files
+from panolog.prepare.panorama_files import look_into
 from panolog.prepare.provenance import read_mask
 from panolog.scene.files import some_of
 from panolog.scene.images import load_layers
@@ -105,7 +105,7 @@ def _unmatched(scene: Scene) -> list[str]:
     lines = []
     for layer, used in layers.items():
         folder = scene.root / layer
-        lost = [path for path in find_image_files(folder) if path not in used]
+        lost = [path for path in look_into(folder).images if path not in used]
         names = [path.relative_to(folder).as_posix() for path in lost]
         if names:
             lines.append(f"{layer}: {some_of(names)}: not used, as no panorama of the model is called so")

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from panolog.prepare.importers.interface import ENDINGS, ImportSource
-from panolog.prepare.panorama_files import find_image_files
+from panolog.prepare.panorama_files import look_into
 from panolog.scene.files import some_of, stem_of
 from panolog.scene.image_files import check_layer
 from panolog.scene.write import PosedImage
@@ -50,7 +50,7 @@ def find_masks(
         notes.append(f"{count} of {len(images)} panoramas have a mask in the source: it is in SCENE/masks")
     used = {mask.resolve() for mask in found if mask}
     for folder in folders:
-        if lost := [it.name for it in find_image_files(folder) if it.resolve() not in used]:
+        if lost := [it.name for it in look_into(folder).images if it.resolve() not in used]:
             notes.append(f"{folder}: {some_of(lost)}: left out, as masks of no panorama")
     notes += [
         f"{root / 'mask.png'}: left out; if black in it is to be ignored in all panoramas, "

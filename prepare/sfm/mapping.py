@@ -31,10 +31,7 @@ def map_pairs(
     """
     shutil.rmtree(work.models, ignore_errors=True)
     work.models.mkdir(parents=True)
-    if mapper == "global":
-        models = _global(work, progress)
-    else:
-        models = _incremental(work, progress, max_error, known)
+    models = _global(work, progress) if mapper == "global" else _incremental(work, progress, max_error, known)
     return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 

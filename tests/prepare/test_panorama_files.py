@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from panolog.prepare.panorama_files import find_image_files, look_into
+from panolog.prepare.panorama_files import look_into
 from panolog.prepare.video.decode import open_video
 from panolog.scene.errors import InputError
 
@@ -28,7 +28,7 @@ def test_links_are_followed_and_what_systems_add_is_left_out(tmp_path: Path) -> 
     (elsewhere / "above").symlink_to(folder)  # no end
     (folder / ".link").symlink_to(folder / "day 2")
     (folder / ".thumbnails" / "link").symlink_to(elsewhere)
-    found = [path.relative_to(folder).as_posix() for path in find_image_files(folder)]
+    found = [path.relative_to(folder).as_posix() for path in look_into(folder).images]
     assert found == ["day 1/b.png", "day 2/9.JPG", "day 2/10.jpg"]
     hidden = "._9.jpg, .thumbnails/9.jpg, @eaDir/9.jpg/THUMB_M.jpg"
     assert look_into(folder).left_out == [f"3 files ({hidden}): left out, as hidden files and thumbnails are"]
