@@ -33,7 +33,7 @@ def test_a_point_that_is_found_again_is_not_new_and_stays(off: float) -> None:
         PosedImage(f"{row}", Path(), np.eye(3), SHIFTS[row], (both, _seen(row, OWN))) for row in range(2)
     )
     scene = Scene(Path(), *SIZE, (), OWN, np.zeros((2, 3), np.uint8), (0, 1), (), "")
-    known = KnownScene(scene, images, (), {}, (), None, None)
+    known = KnownScene(scene, images, (), None, None)
     rows = np.arange(3)  # of the points found: the last is seen by the scene's panoramas alone
     sightings = [(rows, _seen(row, FOUND)) for row in range(2)]
     sightings.append((rows[:2], np.concatenate([_seen(2, FOUND[:1], off), _seen(2, FOUND[1:2])])))
