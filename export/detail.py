@@ -41,14 +41,6 @@ class Node:
     leaf: int | None  # its number, in the order of the tree
 
 
-@dataclass(frozen=True, eq=False)
-class Leaf:
-    """What a leaf shows on each level."""
-
-    node: Node
-    levels: tuple[Splats, ...]  # the first has all of its Gaussians; each in Morton order
-
-
 class Detail:
     """The leaves of a model and their levels of detail."""
 
@@ -71,19 +63,21 @@ class Detail:
         means = means_of(source)
         rows = np.arange(len(means), dtype=np.int32)
         self._labels = np.empty(len(means), np.int32)
-        self._nodes: list[Node] = []
+        self._count = 0  # leaves
         self.tree = self._cut(means, rows, side, most)
         self._cube = _merging_side(means)
         self.sides = self._sides(means, levels)
 
-    def leaves(self) -> Iterator[Leaf]:
-        """All leaves, in the order of their numbers. Raises OSError if the scratch disk is full."""
+    def leaves(self) -> Iterator[tuple[Splats, ...]]:
+        """What each leaf shows on each level, in the order of their numbers, each in Morton order.
+
+        The first level has all of its Gaussians. Raises OSError if the scratch disk is full.
+        """
         pieces = (piece.columns() for piece in self._source.pieces())
         labels = self._labels.astype(np.int64)
-        runs = sorted_runs(self._scratch, pieces, labels, len(self._nodes))
-        for node, columns in zip(self._nodes, runs, strict=True):
+        for columns in sorted_runs(self._scratch, pieces, labels, self._count):
             own = Splats(**columns)
-            yield Leaf(node, tuple(self._levels(own.select(morton_order(own.means)))))
+            yield tuple(self._levels(own.select(morton_order(own.means))))
 
     def _cut(self, means: NDArray[np.float32], rows: NDArray[np.int32], side: float, most: int) -> Node:
         """The node of some rows, cut in the middle of its longest axis: of the rows if there are too many."""
@@ -99,9 +93,9 @@ class Detail:
             parts = rows[left], rows[~left]
         large = len(rows) > _LEAST and float(upper[axis] - lower[axis]) > side
         if len(rows) <= most and not (large and all(map(len, parts))):
-            self._labels[rows] = len(self._nodes)
-            self._nodes.append(Node(lower, upper, len(rows), None, len(self._nodes)))
-            return self._nodes[-1]
+            self._labels[rows] = number = self._count
+            self._count += 1
+            return Node(lower, upper, len(rows), None, number)
         del own
         children = (self._cut(means, parts[0], side, most), self._cut(means, parts[1], side, most))
         return Node(lower, upper, len(rows), children, None)

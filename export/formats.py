@@ -103,9 +103,8 @@ def _ply(model: ChosenModel, path: Path) -> None:
     def parts() -> Iterator[Gaussians]:
         done = 0
         for piece in found.pieces():
-            part = piece.gaussians(exact=exact)
-            done += len(part)
-            yield part.with_tensors(part.tensors(), sky=max(0, min(len(part), done - first)))
+            done += len(piece)
+            yield replace(piece.gaussians(exact=exact), sky=max(0, min(len(piece), done - first)))
 
     write_ply_parts(path, parts(), count=found.count, sky=sky, exact=exact, exported=found.degree)
 

@@ -1,6 +1,7 @@
 """Models in the formats of others: SOG, SPZ and compressed PLY, and PLYs that were turned for viewers."""
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 from panolog.export.compressed_ply import read_compressed_ply
@@ -55,13 +56,13 @@ def convert_to_ply(path: Path, output: StrPath, frame: Frame, *, exact: bool) ->
     if is_ply(path):
         found = read_ply(path)
         back = Splats.of(found).turned(frame.inverse).gaussians(exact=found.exact)
-        write_ply(output, back.with_tensors(back.tensors(), sky=found.sky))
+        write_ply(output, replace(back, sky=found.sky))
         return
     model = read_model(path).turned(frame.inverse).gaussians(exact=exact)
     sky = sky_of(path)
     if is_spz(path) and sky.is_file():
         apart = read_model(sky).turned(frame.inverse).gaussians(exact=exact)
-        model = concatenate(model, apart.with_tensors(apart.tensors(), sky=len(apart)))
+        model = concatenate(model, replace(apart, sky=len(apart)))
     write_ply(output, model)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.export.detail import SIDE, Corners, Detail, Leaf, Node, around
+from panolog.export.detail import SIDE, Corners, Detail, Node, around
 from panolog.export.gltf.glb import BASE, SPZ, encode_glb
 from panolog.export.splats import InMemory, Splats, SplatSource
 from panolog.scene.errors import FormatError
@@ -67,7 +67,7 @@ def write_tiles(
         scratch = temporary / "scratch"
         scratch.mkdir()
         detail = Detail(source, scratch, side=side, levels=levels)
-        leaves = [_write_leaf(temporary, leaf, detail.sides) for leaf in detail.leaves()]
+        leaves = [_write_leaf(temporary, *leaf, detail.sides) for leaf in enumerate(detail.leaves())]
         shutil.rmtree(scratch)
         root = _tile_of(detail.tree, leaves)
         write_bytes(temporary / TILESET, _tileset(root, to_ecef))
@@ -124,18 +124,18 @@ def _tile_of(node: Node, leaves: list[_Tile]) -> _Tile:
     return _Tile(corners, max(_size(corners), *(child.error for child in children)), None, children)
 
 
-def _write_leaf(folder: Path, leaf: Leaf, sides: tuple[float, ...]) -> _Tile:
+def _write_leaf(folder: Path, leaf: int, levels: tuple[Splats, ...], sides: tuple[float, ...]) -> _Tile:
     """The chain of tiles of a leaf, whose files it writes."""
     chosen = [0]
-    for level in range(1, len(leaf.levels)):
-        if len(leaf.levels[level]) < _FEWER * len(leaf.levels[chosen[-1]]):
+    for level in range(1, len(levels)):
+        if len(levels[level]) < _FEWER * len(levels[chosen[-1]]):
             chosen.append(level)
-    corners = around([_corners(leaf.levels[level]) for level in chosen])
+    corners = around([_corners(levels[level]) for level in chosen])
     tile: _Tile | None = None
     for level in chosen:
-        name = f"{leaf.node.leaf}-{level}.glb"
+        name = f"{leaf}-{level}.glb"
         blob = BytesIO()
-        encode_glb(blob, InMemory(leaf.levels[level]))
+        encode_glb(blob, InMemory(levels[level]))
         write_bytes(folder / name, blob.getvalue())
         error = sides[level] * _PIXELS
         tile = _Tile(corners, error, name, () if tile is None else (tile,))

@@ -101,7 +101,7 @@ def write_streamed(
         chunks, boxes = _Chunks(temporary, pool, most), list[Corners]()
         places: list[dict[str, _Place]] = []
         for leaf in detail.leaves():
-            shown = [(level, splats) for level, splats in enumerate(leaf.levels) if len(splats)]
+            shown = [(level, splats) for level, splats in enumerate(leaf) if len(splats)]
             places.append({str(level): chunks.add(level, splats) for level, splats in shown})
             boxes.append(around([bounds(splats) for _, splats in shown]))
         chunks.finish()

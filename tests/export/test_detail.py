@@ -28,12 +28,12 @@ def wall(count: int, degree: int = 1, size: float = 0.05) -> Splats:
 def test_levels_have_fewer_gaussians_of_the_same_colours(tmp_path: Path, degree: int) -> None:
     detail = Detail(InMemory(wall(20_000, degree)), tmp_path, side=8, levels=4)
     leaves = list(detail.leaves())
-    counts = np.sum([[len(level) for level in leaf.levels] for leaf in leaves], axis=0)
+    counts = np.sum([[len(level) for level in leaf] for leaf in leaves], axis=0)
     assert detail.sides[0] == 0
     assert detail.sides[2] == 2 * detail.sides[1]
     assert (np.diff(counts) < -0.5 * counts[:-1]).all()
     for level in range(4):
-        splats = Splats.joined([leaf.levels[level] for leaf in leaves])
+        splats = Splats.joined([leaf[level] for leaf in leaves])
         assert splats.degree == degree
         apart = np.abs(splats.means[:, 0] - 20) > detail.sides[level]
         left = splats.means[:, 0] < 20
@@ -49,4 +49,4 @@ def test_the_coarsest_level_is_small(tmp_path: Path) -> None:
 def test_one_place(tmp_path: Path) -> None:
     one = wall(10_000).select(np.zeros(10_000, np.int64))
     detail = Detail(InMemory(one), tmp_path, most=3000, levels=2)
-    assert sum(len(leaf.levels[0]) for leaf in detail.leaves()) == 10_000
+    assert sum(len(leaf[0]) for leaf in detail.leaves()) == 10_000

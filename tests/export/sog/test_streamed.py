@@ -42,7 +42,7 @@ def test_each_leaf_is_where_the_index_says(streamed: Path, tmp_path: Path) -> No
     for leaf, wanted in zip(found, detail.leaves(), strict=True):
         for level, place in leaf["lods"].items():
             part = files[place["file"]].select(slice(place["offset"], place["offset"] + place["count"]))
-            own = wanted.levels[int(level)]
+            own = wanted[int(level)]
             assert len(part) == len(own)
             np.testing.assert_allclose(part.means, own.means, rtol=2e-4, atol=2e-3)
             lower, upper = bounds(own)
