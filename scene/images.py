@@ -1,6 +1,6 @@
 """Panoramas for training: decoded in the background, resized, kept within a memory budget.
 
-On a GPU the threads that decode also move each view there (`CudaUpload`). As many views as have room stay on
+On a GPU the threads that decode also move each view there (`CudaMover`). As many views as have room stay on
 it; of the others those that are used next are there, and the rest waits decoded in the host's memory.
 """
 
@@ -34,7 +34,7 @@ from panolog.scene.image_files import (
 )
 from panolog.scene.model import Panorama, Scene
 from panolog.scene.tensors.decoded import DecodedLayers
-from panolog.scene.tensors.transfer import CudaMover, Moving, pack
+from panolog.scene.tensors.transfer import CudaMover, Mover, Moving, pack
 
 _THREADS = min(4, os.cpu_count() or 1)  # on the CPU: decoding keeps up with training long before this
 MOST_THREADS = 8  # for a GPU: each holds a pinned view and has one more on the GPU
@@ -68,14 +68,6 @@ class View:
         return {name: layer for name in _LAYERS if (layer := getattr(self, name)) is not None}
 
 
-@dataclass(frozen=True, eq=False)
-class Staged:
-    """A view on its way to a device."""
-
-    view: View  # with the tensors of `moving`
-    moving: Moving | None = None
-
-
 def pixels(layer: Tensor, v: NDArray[np.int64], u: NDArray[np.int64]) -> NDArray[Any]:
     """The values (M, ...) of a layer in rows v and columns u (M,): only they leave its device."""
     at = tuple(torch.from_numpy(index).to(layer.device) for index in (v, u))
@@ -83,39 +75,8 @@ def pixels(layer: Tensor, v: NDArray[np.int64], u: NDArray[np.int64]) -> NDArray
     return chosen
 
 
-class Upload:
-    """How views get to the device: on the CPU they are there."""
-
-    def stage(self, view: View) -> Staged:
-        """Begins to move a view; called by any thread that decodes."""
-        return Staged(view)
-
-    def finish(self, staged: Staged) -> View:
-        """The view, for what is computed next; called by the thread that computes."""
-        return staged.view
-
-
-class CudaUpload(Upload):
-    """By a `CudaMover`. What is computed waits for its view, the host does not."""
-
-    def __init__(self, device: str) -> None:
-        """Args: device, such as "cuda"."""
-        self._mover = CudaMover(torch.device(device))
-
-    def stage(self, view: View) -> Staged:
-        """As `Upload.stage`: returns while the copy runs."""
-        layers = view.layers()
-        moving = self._mover.begin(layers, partial(pack, layers))
-        return Staged(View.of(view.row, moving.tensors), moving)
-
-    def finish(self, staged: Staged) -> View:
-        """As `Upload.finish`: the current stream waits for the copy."""
-        if staged.moving is not None:
-            self._mover.end(staged.moving)
-        return staged.view
-
-
-_Loaded: TypeAlias = "Future[tuple[View | None, Staged]]"  # the decoded view, if it is to be kept
+# The decoded view, if it is to be kept; the one for the device, and on a GPU what it waits for.
+_Loaded: TypeAlias = "Future[tuple[View | None, View, Moving | None]]"
 
 
 class PanoramaCache:
@@ -139,7 +100,7 @@ class PanoramaCache:
         device: str = "cpu",
         room: int = 0,
         threads: int = 1,
-        upload: Upload | None = None,
+        mover: Mover | None = None,
     ) -> None:
         """Opens nothing yet.
 
@@ -159,7 +120,7 @@ class PanoramaCache:
         self._width = width
         self._locate = locate
         self._cpu = device == "cpu"
-        self._upload = upload or (Upload() if self._cpu else CudaUpload(device))
+        self._mover = mover or (None if self._cpu else CudaMover(torch.device(device)))
         self.threads = _THREADS if self._cpu else max(1, min(threads, MOST_THREADS))
         self._staying: dict[int, _Loaded] = {}
         self._views: OrderedDict[int, _Loaded] = OrderedDict()  # the last is the most recently used
@@ -193,7 +154,10 @@ class PanoramaCache:
 
         Raises SceneError: one of its files cannot be decoded; KeyError: `row` is not one of the cache's rows.
         """
-        return self._upload.finish(self._request(row).result()[1])
+        _, view, moving = self._request(row).result()
+        if self._mover is not None and moving is not None:
+            self._mover.end(moving)
+        return view
 
     def close(self) -> None:
         """Drops all views and ends the threads."""
@@ -229,10 +193,14 @@ class PanoramaCache:
 
     def _load(
         self, panorama: Panorama, row: int, width: int, decoded: View | None, keep: bool
-    ) -> tuple[View | None, Staged]:
+    ) -> tuple[View | None, View, Moving | None]:
         """Decodes a view, unless it is, and begins to move it to the device."""
         view = load_view(panorama, row, width, self._locate, self._layers) if decoded is None else decoded
-        return view if keep else None, self._upload.stage(view)
+        if self._mover is None:
+            return None, view, None
+        layers = view.layers()
+        moving = self._mover.begin(layers, partial(pack, layers))
+        return view if keep else None, View.of(row, moving.tensors), moving
 
     def _leave(self, row: int, loaded: _Loaded) -> None:
         """A view leaves the device: from a GPU its decoded form stays in the host's memory for a while."""

@@ -3,14 +3,15 @@
 And the marks of tests that need a real one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import pytest
 import torch
 from torch import Tensor
 
-from panolog.scene.images import Staged, Upload, View
+from panolog.scene.images import View
+from panolog.scene.tensors.transfer import Mover, Moving
 
 ON_A_CARD = (pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA: no card"))
 on_all_devices = pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=ON_A_CARD)])
@@ -52,8 +53,8 @@ def view_on_device(view: View) -> View:
     return View.of(view.row, {name: moved(layer) for name, layer in view.layers().items()})
 
 
-class ToDevice(Upload):
-    """Moves views to that device."""
+class ToDevice(Mover):
+    """Moves tensors to that device."""
 
-    def stage(self, view: View) -> Staged:
-        return Staged(view_on_device(view))
+    def begin(self, layout: Mapping[str, Tensor], fill: Callable[[Tensor], None]) -> Moving:
+        return Moving({name: moved(layer) for name, layer in layout.items()})

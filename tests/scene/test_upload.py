@@ -3,6 +3,7 @@
 import threading
 import weakref
 from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,15 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from panolog.scene import image_files, images
 from panolog.scene.errors import ImageError
-from panolog.scene.images import PanoramaCache, Staged, Upload, View, load_view, passing_views
+from panolog.scene.images import PanoramaCache, View, load_view, passing_views
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.scene.tensors import transfer
+from panolog.scene.tensors.transfer import Mover, Moving
 from tests.on_device import needs_a_card
 from tests.renderer.cuda.fake_cuda import Torch
 from tests.scenes import HEIGHT, WIDTH, write_scene
@@ -45,30 +48,35 @@ def layered(tmp_path: Path) -> Scene:
     return read_scene(root)
 
 
-class Recorder(Upload):
+class Recorder(Mover):
     """Moves views to copies of their tensors, and says what it was called for."""
 
-    def __init__(self) -> None:
+    def __init__(self, scene: Scene) -> None:
+        views = (load_view(scene.panoramas[row], row, WIDTH) for row in ROWS)
+        self._rows = {view.image.numpy().tobytes(): view.row for view in views}
         self.staged: Counter[int] = Counter()
         self.threads: set[str] = set()
         self.finished: list[int] = []
         self.here = self.most = 0  # views on the device: now, and at most
         self._lock = threading.RLock()
 
-    def stage(self, view: View) -> Staged:
+    def begin(self, layout: Mapping[str, Tensor], fill: Callable[[Tensor], None]) -> Moving:
         with self._lock:
-            self.staged[view.row] += 1
+            self.staged[self._row(layout)] += 1
             self.threads.add(threading.current_thread().name)
             self.here += 1
             self.most = max(self.most, self.here)
-        moved = View.of(view.row, {name: layer.clone() for name, layer in view.layers().items()})
-        weakref.finalize(moved, self._gone)
-        return Staged(moved)
+        moved = {name: layer.clone() for name, layer in layout.items()}
+        weakref.finalize(moved["image"], self._gone)
+        return Moving(moved)
 
-    def finish(self, staged: Staged) -> View:
+    def end(self, moving: Moving) -> dict[str, Tensor]:
         assert threading.current_thread() is threading.main_thread()
-        self.finished.append(staged.view.row)
-        return staged.view
+        self.finished.append(self._row(moving.tensors))
+        return moving.tensors
+
+    def _row(self, tensors: Mapping[str, Tensor]) -> int:
+        return self._rows[tensors["image"].numpy().tobytes()]
 
     def _gone(self) -> None:
         with self._lock:
@@ -79,7 +87,7 @@ def run(scene: Scene, recorder: Recorder, *, budget: int, room: int, threads: in
     """Three epochs, requested ahead as training does."""
     order = [row for epoch in EPOCHS for row in epoch]
     with PanoramaCache(
-        scene, ROWS, WIDTH, budget, device="cuda", room=room, threads=threads, upload=recorder
+        scene, ROWS, WIDTH, budget, device="cuda", room=room, threads=threads, mover=recorder
     ) as cache:
         for step, row in enumerate(order):
             cache.prefetch(order[step : step + 1 + cache.ahead(4)])
@@ -103,7 +111,7 @@ def test_threads_that_decode_views_move_them_and_do_so_again_only_where_there_is
         return load_view(panorama, row, *rest)
 
     monkeypatch.setattr(images, "load_view", counted)
-    recorder = Recorder()
+    recorder = Recorder(scene)
     run(scene, recorder, budget=budget, room=room, threads=threads)
     assert recorder.threads <= {f"decode_{i}" for i in range(threads)}
     assert (max(decoded.values()) > 1) == again
@@ -117,7 +125,7 @@ def test_layers_are_decoded_once_although_views_have_no_room(
     layered: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each picture is decoded in each epoch; of layers as many stay as there is room for."""
-    files: Counter[str] = Counter()
+    files, recorder = Counter[str](), Recorder(layered)
 
     def counted(path: Path, *rest: Any) -> NDArray[Any]:
         files[path.parent.name] += 1
@@ -130,7 +138,7 @@ def test_layers_are_decoded_once_although_views_have_no_room(
     found: list[list[int]] = []
     for budget in (0, view, 6 * view - 1):
         files.clear()
-        with PanoramaCache(layered, ROWS, WIDTH, budget, device="cuda", upload=Recorder()) as cache:
+        with PanoramaCache(layered, ROWS, WIDTH, budget, device="cuda", mover=recorder) as cache:
             for row in order:
                 for name, layer in cache.get(row).layers().items():
                     assert torch.equal(layer, expected[row][name]), name
@@ -141,10 +149,10 @@ def test_layers_are_decoded_once_although_views_have_no_room(
 
 
 def test_a_damaged_image_is_named_by_get_although_it_never_gets_to_the_device(scene: Scene) -> None:
+    rooms = {0: Recorder(scene), 6 * VIEW: Recorder(scene)}
     scene.panoramas[1].image.write_bytes(b"\x89PNG\r\n\x1a\n and no more")
-    for room in (0, 6 * VIEW):
-        recorder = Recorder()
-        with PanoramaCache(scene, ROWS, WIDTH, 6 * VIEW, device="cuda", room=room, upload=recorder) as cache:
+    for room, recorder in rooms.items():
+        with PanoramaCache(scene, ROWS, WIDTH, 6 * VIEW, device="cuda", room=room, mover=recorder) as cache:
             for _ in range(2):
                 with pytest.raises(ImageError, match=r"1\.png"):
                     cache.get(1)
@@ -152,7 +160,7 @@ def test_a_damaged_image_is_named_by_get_although_it_never_gets_to_the_device(sc
         assert set(recorder.staged) == {0}
 
 
-# CudaUpload, with a torch whose GPU is the CPU
+# CudaMover, with a torch whose GPU is the CPU
 
 
 @pytest.fixture

@@ -128,7 +128,7 @@ def model(count: int) -> Gaussians:
 
 
 def view(width: int) -> View:
-    """With all its layers, which are parts of one tensor as `scene.images.CudaUpload` makes them."""
+    """With all its layers, which are parts of one tensor as `CudaMover` makes them."""
     size = (width // 2, width)
     mask, sky = (empty(*size, dtype=torch.bool) for _ in range(2))
     seen = View(0, empty(*size, 3, dtype=torch.uint8), mask, sky, empty(*size))

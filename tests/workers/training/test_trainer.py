@@ -208,7 +208,7 @@ def test_a_preview_shows_a_view_that_is_on_a_device(
     coarse: TrainSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, shown = coarse.scene.load(), []
-    on_device: tuple[dict[str, Any], ...] = ({"device": "cuda", "upload": ToDevice()}, {})
+    on_device: tuple[dict[str, Any], ...] = ({"device": "cuda", "mover": ToDevice()}, {})
     for options in on_device:
         with PanoramaCache(scene, coarse.views, WIDTH, 1, **options) as cache:
             trainer = Trainer(replace(coarse, iterations=1), scene, cache)
