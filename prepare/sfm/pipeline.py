@@ -236,7 +236,7 @@ def new_scene(
     images = list[PosedImage]()
     for row, *pose in poses:
         panorama = found.panoramas[row]
-        images.append(PosedImage(panorama.name, panorama.path, *pose, layers=panorama.layers))
+        images.append(PosedImage(panorama.name, panorama.path, *pose, panorama.layers))
     images.sort(key=lambda image: natural_key(image.name))
     return NewScene(images, found.size, model.points, colors, split=split, offset=offset)
 

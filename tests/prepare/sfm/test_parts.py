@@ -18,16 +18,14 @@ from tests.prepare.sfm.reports import in_a_row
 COUNT = 7
 
 
-def _in_parts(panoramas: Any, layers: Any, folder: Path, **_: object) -> list[Reconstruction]:
+def _in_parts(panoramas: Any, folder: Path, **_: object) -> list[Reconstruction]:
     """Four panoramas and three, each part in a row."""
     folder.mkdir(exist_ok=True)
 
     def part(rows: tuple[int, ...], others: list[tuple[int, ...]]) -> Reconstruction:
         missing = {row: (0, 0) for row in range(COUNT) if row not in rows}
         model = in_a_row(rows)
-        return Reconstruction(
-            panoramas, layers, (128, 64), model, [], [], missing, frozenset(), others, 100, 9
-        )
+        return Reconstruction(panoramas, (128, 64), model, [], [], missing, frozenset(), others, 100, 9)
 
     return [part((0, 1, 2, 3), [(4, 5, 6)]), part((4, 5, 6), [(0, 1, 2, 3)])]
 
