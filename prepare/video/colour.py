@@ -1,8 +1,9 @@
 """Colours of decoded frames, by the matrix and the range that their tags name."""
 
 import re
+from collections.abc import Callable
 from functools import cache
-from typing import Protocol, TypeVar
+from typing import Any
 
 import av
 import av.filter
@@ -11,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Picture = NDArray[np.uint8]
-Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 # Of FFmpeg's AVColorSpace, which is ITU-T H.273, to the names of its filter `scale`.
 _MATRICES = {1: "bt709", 4: "fcc", 5: "bt470", 6: "smpte170m", 7: "smpte240m", 9: "bt2020", 10: "bt2020"}
@@ -21,13 +21,6 @@ _HDR = {16: "PQ", 18: "HLG"}  # of AVColorTransferCharacteristic
 _HIGH = 576  # rows: untagged frames of more are BT.709, as in players, and others BT.601
 _FLAGS = "bicubic+accurate_rnd+full_chroma_int+bitexact"  # rounded correctly, the same on all processors
 _PLANAR = re.compile(r"yuvj?a?4\d\dp(?:(\d+)le)?")  # names of formats whose first plane is the luma
-
-
-class Placing(Protocol):
-    """A `Layout`, or another way from frames to panoramas."""
-
-    def panorama(self, picture: NDArray[Pixel]) -> NDArray[Pixel]:
-        """The panorama of a picture (H, W, ...)."""
 
 
 class ColourError(ValueError):
@@ -52,15 +45,18 @@ class Converter:
         self._graph.push(frame)
         return np.asarray(self._graph.vpull().to_ndarray(), np.uint8)
 
-    def grey(self, frame: av.VideoFrame, layout: Placing) -> Picture:
-        """(H, W) the luma of the panorama, where possible without a conversion."""
+    def grey(self, frame: av.VideoFrame, placed: Callable[[NDArray[Any]], NDArray[Any]]) -> Picture:
+        """(H, W) the luma of the panorama, where possible without a conversion.
+
+        Args: placed, makes the panorama of a picture (H, W), as `Layout.panorama`.
+        """
         found = _PLANAR.fullmatch(frame.format.name)
         bits = int(found.group(1) or 8) if found else 0
         if not 8 <= bits <= 16:
-            return layout.panorama(np.asarray(cv2.cvtColor(self.bgr(frame), cv2.COLOR_BGR2GRAY), np.uint8))
+            return placed(np.asarray(cv2.cvtColor(self.bgr(frame), cv2.COLOR_BGR2GRAY), np.uint8))
         plane = frame.planes[0]
         values = np.frombuffer(memoryview(plane), np.uint8 if bits == 8 else "<u2")
-        luma = layout.panorama(values.reshape(plane.height, -1)[:, : plane.width])
+        luma = placed(values.reshape(plane.height, -1)[:, : plane.width])
         levels = _levels(bits, check_colours(frame)[1])
         return np.asarray(cv2.LUT(luma, levels) if bits == 8 else levels[luma & (2**bits - 1)], np.uint8)
 

@@ -188,7 +188,7 @@ class Video:
         None as there.
         """
         layout = self.layout.scaled(width)
-        return self._converted(None, lambda it: self._converter.grey(it, layout))
+        return self._converted(None, lambda it: self._converter.grey(it, layout.panorama))
 
     def notes(self) -> list[str]:
         """Messages about a video that was decoded, one line each."""
