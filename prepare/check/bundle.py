@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.check.evidence import Array
-from panolog.prepare.check.residuals import Tracks, measure_residuals
+from panolog.prepare.check.evidence import Array, Tracks
+from panolog.prepare.check.residuals import measure_residuals
 from panolog.renderer.motion import Common
 from panolog.scene.colmap import Observations
 from panolog.scene.colmap_files import EQUIRECTANGULAR

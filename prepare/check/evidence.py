@@ -1,21 +1,22 @@
 """What the check measures on: some decoded panoramas of a scene, and the points that each of them sees."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.colmap import read_colmap
+from panolog.scene.colmap import ColmapImage, read_colmap
 from panolog.scene.image_files import decode_with_alpha
 from panolog.scene.model import Panorama, Scene, of_one_color
 from panolog.scene.projection import project_to_fractions, project_to_pixels
 from panolog.scene.read import model_folder
 
 Array = NDArray[np.float64]
+Tracks: TypeAlias = Mapping[str, ColmapImage]
 Found = TypeVar("Found")
 MEMORY = 400_000_000  # bytes of decoded panoramas
 MOST_VIEWS, FEWEST_VIEWS = 48, 8
@@ -87,22 +88,30 @@ def _spread(scene: Scene) -> tuple[int, ...]:
     return tuple(np.linspace(0, total - 1, min(count, total)).astype(int).tolist())
 
 
+def read_tracks(scene: Scene) -> Tracks | None:
+    """What each panorama has observed, by its name; None for a scene without observations.
+
+    Raises SceneError if the model is damaged.
+    """
+    if not any(len(panorama.observed) for panorama in scene.panoramas):
+        return None
+    return {image.name: image for image in read_colmap(model_folder(scene.root)).images}
+
+
 def _tracks(scene: Scene, views: Sequence[int]) -> tuple[list[NDArray[np.int64]], list[Array] | None]:
     """What each panorama sees, and where in units of the width; without tracks only `views` see any.
 
     A model whose images have no lines of observations says what each sees, but not where.
     """
-    if not any(len(panorama.observed) for panorama in scene.panoramas):
+    if (images := read_tracks(scene)) is None:
         decoded, nothing = set(views), np.empty(0, np.int64)
         return [
             likely_seen(scene.points, panorama.center) if row in decoded else nothing
             for row, panorama in enumerate(scene.panoramas)
         ], None
-    model = read_colmap(model_folder(scene.root))
-    if not any(len(image.points) for image in model.images):
+    if not any(len(image.points) for image in images.values()):
         observed = [panorama.observed for panorama in scene.panoramas]
         return [seen[_some(len(seen), row)] for row, seen in enumerate(observed)], None
-    images = {image.name: image for image in model.images}
     rows, pixels = [], []
     for index, panorama in enumerate(scene.panoramas):
         image = images.get(panorama.name)

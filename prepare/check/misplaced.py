@@ -21,8 +21,9 @@ from panolog.prepare.check.evidence import (
     is_colorless,
     likely_seen,
     project,
+    read_tracks,
 )
-from panolog.prepare.check.residuals import FEWEST, measure_residuals, read_tracks
+from panolog.prepare.check.residuals import FEWEST, measure_residuals
 from panolog.scene.errors import SceneError
 from panolog.scene.image_files import decode_with_alpha
 from panolog.scene.model import Scene

@@ -1,27 +1,11 @@
 """How far the sparse points are from where each panorama has observed them."""
 
-from collections.abc import Mapping
-from typing import TypeAlias
-
 import numpy as np
 
-from panolog.prepare.check.evidence import Array, offsets
-from panolog.scene.colmap import ColmapImage, read_colmap
+from panolog.prepare.check.evidence import Array, Tracks, offsets
 from panolog.scene.model import Scene
-from panolog.scene.read import model_folder
 
 FEWEST = 20  # observations of a panorama whose median is taken
-Tracks: TypeAlias = Mapping[str, ColmapImage]
-
-
-def read_tracks(scene: Scene) -> Tracks | None:
-    """What each panorama has observed, by its name; None for a scene without observations.
-
-    Raises SceneError if the model is damaged.
-    """
-    if not any(len(panorama.observed) for panorama in scene.panoramas):
-        return None
-    return {image.name: image for image in read_colmap(model_folder(scene.root)).images}
 
 
 def measure_residuals(scene: Scene, tracks: Tracks) -> Array:

@@ -10,10 +10,10 @@ from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import command_line
 from panolog.prepare.check.blank import find_blank
 from panolog.prepare.check.bundle import MENDS, adjust
+from panolog.prepare.check.evidence import read_tracks
 from panolog.prepare.check.exposure import describe, differing_exposures, measure_exposures
 from panolog.prepare.check.misplaced import find_misplaced
 from panolog.prepare.check.residuals import describe as describe_residuals
-from panolog.prepare.check.residuals import read_tracks
 from panolog.scene.files import some_of
 from panolog.scene.model import Scene
 from panolog.scene.stores.outline import url_of

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from panolog.prepare.check.bundle import MENDS, adjust
-from panolog.prepare.check.evidence import project
-from panolog.prepare.check.residuals import Tracks, measure_residuals
+from panolog.prepare.check.evidence import Tracks, project
+from panolog.prepare.check.residuals import measure_residuals
 from panolog.renderer.motion import moved
 from panolog.scene.colmap import ColmapImage
 from panolog.scene.colmap_files import EQUIRECTANGULAR, ColmapCamera
