@@ -236,7 +236,8 @@ def new_scene(
     images = list[PosedImage]()
     for row, *pose in poses:
         panorama = found.panoramas[row]
-        images.append(PosedImage(panorama.name, panorama.path, *pose, panorama.layers))
+        image = PosedImage(panorama.name, panorama.path, *pose)
+        images.append(replace(image, layers=panorama.layers))
     images.sort(key=lambda image: natural_key(image.name))
     return NewScene(images, found.size, model.points, colors, split=split, offset=offset)
 

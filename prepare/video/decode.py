@@ -28,12 +28,12 @@ from panolog.prepare.video.lenses import (
 )
 from panolog.prepare.video.spherical import read_spherical, spherical_of
 from panolog.prepare.video.streams import (
-    LARGE,
     WIDEST,
     Effort,
     begun,
     decoded,
     largest_streams,
+    often,
     open_container,
     prepare_stream,
 )
@@ -41,7 +41,6 @@ from panolog.scene.errors import SceneError
 from panolog.scene.pictures.kinds import STITCH
 
 MAX_FRAMES = 1_000_000  # nine hours at 30 frames per second
-_ENOUGH = 7.5  # frames per second of a large video that are looked at, at least
 _NARROWEST = 256  # pixels: enough to track anything
 _SAMPLED = 2**20  # bytes at the beginning, the middle and the end that identify a video
 _ENDS_EARLY = 0.95  # of the frames in the header, which is an estimate where there is no index
@@ -114,8 +113,7 @@ class Video:
     @property
     def often(self) -> int:
         """Every how manieth frame is enough of a large video, for `_ENOUGH` a second; 1 of others."""
-        rate = float(self._stream.average_rate or 0)
-        return 1 if self.width < LARGE else max(1, int(rate / _ENOUGH))
+        return often(self._stream, self.width)
 
     @property
     def started(self) -> datetime | None:

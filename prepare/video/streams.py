@@ -14,8 +14,8 @@ WIDEST = 12_288  # pixels: more than any camera records
 FORMATS = "mov,matroska,avi,mpegts,mpeg,flv,ogg,asf"  # no playlists: they name other files and addresses
 Effort = Literal["exact", "fast", "keys"]
 _THREADS = 8  # of a video at most: each holds a frame
-LARGE = 3000  # pixels: narrower frames are decoded fast enough
-_FAST = 20  # frames per second, of which every second one will do
+_LARGE = 3000  # pixels: narrower frames are decoded fast enough
+_FAST, _ENOUGH = 20, 7.5  # frames per second, of which every second one will do; that are looked at, at least
 _DECODING = {
     "max_pixels": str(WIDEST**2),  # two eyes above each other
     "err_detect": "explode",  # rather than to patch frames up
@@ -61,12 +61,17 @@ def prepare_stream(stream: av.VideoStream, effort: Effort) -> av.VideoStream:
     if effort != "exact":
         stream.thread_type = "AUTO"
     stream.thread_count = 1 if effort == "exact" else min(_THREADS, os.cpu_count() or 1)
-    if effort != "exact" and stream.width >= LARGE and (stream.average_rate or 0) >= _FAST:
+    if effort != "exact" and stream.width >= _LARGE and (stream.average_rate or 0) >= _FAST:
         stream.codec_context.skip_frame = "NONREF"
     if effort == "keys":
         stream.codec_context.skip_frame = "NONKEY"
     stream.codec_context.options = _DECODING
     return stream
+
+
+def often(stream: av.VideoStream, width: int) -> int:
+    """Every how manieth frame is enough of a large video, for `_ENOUGH` a second; 1 of others."""
+    return 1 if width < _LARGE else max(1, int(float(stream.average_rate or 0) / _ENOUGH))
 
 
 def decoded(
