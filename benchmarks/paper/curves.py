@@ -26,7 +26,7 @@ def quality_curve(results: Results, scene: str) -> str | None:
             _run(axes, run, BLOCK_COLORS[number % len(BLOCK_COLORS)])
         axes.set_xlim(left=0)
         machines = {run.machine for run in runs}
-        axes.set_xlabel("seconds since the first task began" + " on several machines" * (len(machines) > 1))
+        axes.set_xlabel("seconds since the first task began" + ", on several machines" * (len(machines) > 1))
         axes.set_ylabel("WS-PSNR, dB, held out")
 
     return svg(draw, f"{scene}: quality over seconds")

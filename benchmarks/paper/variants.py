@@ -25,7 +25,7 @@ _SWITCHES = {  # settings of the panolog recipe that mean something only togethe
     ),
     "block growth": ("stage2.growth", "stage2.opacity_decay"),
     "angle": ("densify.measure", "densify.views", "densify.long_axis"),
-    "distance": ("optimizer.unit", "optimizer.least_pixels"),
+    "distance": ("optimizer.unit", "optimizer.least_pixels", "optimizer.largest"),
     "depth": ("depth.unit", "depth.sky", "depth.wT"),
 }
 _SECOND = ("recipe", "refine", "stage2.", "passes.", "checkpoint.", "preview.")  # after scores

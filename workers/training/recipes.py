@@ -54,6 +54,8 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "optimizer.position_final": 1e-6,
         "optimizer.short_runs": 0.5,  # a short run at the rates of a long one ends before shapes arrive
         "optimizer.least_pixels": 0.3,  # what is thinner is a needle, for who comes closer
+        "optimizer.largest": 1.0,  # else haze is part of the brightness of the sky, until a block removes it
+        "optimizer.opacity_final": 2.5e-3,  # opacities that never rest cost what they jitter
         "optimizer.average": 0.125,  # what single views pull out of place at the end evens out
         "stage2.exterior": "baked",  # an iteration costs what a block keeps, not what it throws away
         "stage2.position": 0.3,  # positions begin near where they end

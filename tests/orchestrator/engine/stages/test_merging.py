@@ -123,6 +123,7 @@ def test_a_pass_has_low_rates_and_adds_nothing(iterations: int, recipe: str) -> 
     assert later.iterations == iterations / 10 and later.densify.until == 0
     block, repair = (Schedule(c, c.iterations, 1.0, refine=True).rates(1) for c in (config, later))
     assert repair.pop("means") == pytest.approx(0.2 * block.pop("means"), rel=0.05)  # decays from there
+    assert repair.pop("opacities") == pytest.approx(0.5 * block.pop("opacities"), rel=0.002)  # as means
     assert repair == pytest.approx({name: 0.5 * rate for name, rate in block.items()})
     assert later.depth.w0 <= config.depth.wT
 
