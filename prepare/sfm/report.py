@@ -124,10 +124,13 @@ class SfmReport:
             )
         for pair in content["contradictions"]:
             one, other = pair["between"]
+            but = f"{pair['points']} fit their poses"
+            if pair["points"] == pair["matches"]:
+                but = "stand so close that they should share more"
             yield (
-                f"contradiction: {one} and {other} share {pair['matches']} features, but {pair['points']} "
-                "fit their poses: one of them stands elsewhere than their matches say, as happens where "
-                "windows repeat. Take more panoramas around them, or leave some out"
+                f"contradiction: {one} and {other} share {pair['matches']} features, but {but}: one of them "
+                "stands elsewhere, as happens where windows repeat. Take more panoramas around them, or "
+                "leave some out"
             )
         if self.into is None:
             yield self._frame()

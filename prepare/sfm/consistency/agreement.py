@@ -91,3 +91,9 @@ def motion_between(found: Posed, between: tuple[int, int]) -> Motion | None:
     shift = end - rotation @ start
     length = float(np.linalg.norm(shift))
     return None if length == 0 else Motion(rotation, shift / length)
+
+
+def apart(found: Posed, between: tuple[int, int]) -> float:
+    """How far two panoramas of a reconstruction are from each other, in its units."""
+    one, other = (-turn.T @ shift for turn, shift in (found.poses[row] for row in between))
+    return float(np.linalg.norm(one - other))

@@ -3,6 +3,8 @@
 Two panoramas that share as much of the sphere as neighbours do must see the same points. If those of one are
 elsewhere in the other, one of the two poses is wrong: rows of equal windows have matched one window further
 on, and from there everything fits again, one window off. Neither residuals nor weak links show that.
+Nor does a single pair where a walk jumps to a look-alike, and what lies between is missing: all that lead
+across agree. But they put panoramas side by side that do not share what neighbours do, as the ground.
 
 In the order of capture, neighbours are known. A pair that is farther off than a walk along them can drift
 only looks alike, but for where the order was followed only by a guess on the way from one to the other; and
@@ -20,14 +22,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from panolog.prepare.sfm.consistency.agreement import Posed, agrees, deviations, has_moved, judged
+from panolog.prepare.sfm.consistency.agreement import (
+    Posed,
+    agrees,
+    apart,
+    deviations,
+    has_moved,
+    judged,
+)
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
 from panolog.prepare.sfm.consistency.motion import Motion
 from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, components, tree_path, widest_tree
 
-_AS_NEIGHBOURS = 0.9  # of the median coverage of the pairs that carry the reconstruction
+_AS_NEIGHBOURS = 0.9  # of the median coverage, or share, of the pairs that carry the reconstruction
 _MARGIN = 0.85  # of the least coverage on the way between two without an order: with less they look alike
 _SHARED = 0.75  # of the median share of features of the pairs that carry: copies of houses stand apart
+_CLOSE = 0.5  # of the median step: who stands closer shares as much as neighbours do, or is a look-alike
 _DRIFTED = 20.0  # degrees that a walk may be off where it returns
 _RIVALLED = 0.3  # of the edges of the tree that may have a rival
 _MOST = 0.02  # contradictions for each panorama, but for those of the tree, of which there may be none
@@ -41,7 +51,7 @@ class Contradiction:
 
     between: Edge  # rows of the panoramas
     matches: int  # verified ones, of which a point is known
-    points: int  # of these, whose points are where they are seen
+    points: int  # of these, whose points are where they are seen; all of them: too few for two so close
 
 
 def find_contradictions(
@@ -55,6 +65,8 @@ def find_contradictions(
     of_tree = [pair for pair in evidence.pairs if pair.between in skeleton.tree]
     usual = [[it.coverage, it.share, it.parallax] for it in of_tree] or [[0.0] * 3]
     covered, share, parallax = np.median(usual, axis=0).tolist()
+    steps = [apart(found, it.between) for it in of_tree if found.poses.keys() >= set(it.between)]
+    near = _CLOSE * float(np.median(steps or [0.0]))
     contradictions, agreeing, against = [], list[Pair](), list[tuple[Pair, Contradiction, float]]()
     for pair in evidence.pairs:
         carries = pair.between in skeleton.tree
@@ -65,6 +77,8 @@ def find_contradictions(
                 contradictions.append(Contradiction(pair.between, len(pair.matches), 0))
         elif fits:
             agreeing.append(pair)
+            if pair.share < _AS_NEIGHBOURS * share and apart(found, pair.between) < near:
+                contradictions.append(Contradiction(pair.between, len(pair.telling), len(pair.telling)))
         else:
             off = off[judged(pair, off)]
             fit = Contradiction(pair.between, len(off), int((off <= bound).sum()))
@@ -144,7 +158,7 @@ def consistent_part(
     skeleton: Skeleton,
     evidence: Evidence,
 ) -> list[int]:
-    """The largest part of panoramas without a contradiction between them, ascending.
+    """The largest part of panoramas without a contradiction between those that the tree connects, ascending.
 
     The tree is cut where it is weakest between two that contradict each other, and the smaller side left out;
     where too many geometries have rivals, at all of these before. Panoramas whose poses are known stay, and
@@ -162,8 +176,8 @@ def consistent_part(
             continue
         path = [edge for edge in tree_path(tree | star, it.between) if edge in tree]
         if not path:
-            free = set(it.between) - skeleton.given
-            part -= {max(free - carried or free)}
+            loose = set(it.between) - skeleton.given - carried
+            part -= {max(loose)} if loose else set()  # the tree has the others on different sides
             continue
         guesses = skeleton.guessed.intersection(path) if known else frozenset()
         tree -= guesses or {min(path, key=lambda edge: (coverage[edge], edge))}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 
+from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.report import write_report
 from tests.prepare.sfm.reports import faulty
 
@@ -34,6 +35,13 @@ def test_json_and_plot_show_the_same(tmp_path: Path) -> None:
     assert panorama is not None
     red = (panorama[..., 2] > 150) & (panorama[..., 1] < 100) & (panorama[..., 0] < 60)
     assert red.sum() > 200  # the links, the pair and the panorama without a pose
+
+
+def test_a_contradiction_of_two_that_fit_but_share_too_little_says_so() -> None:
+    report = faulty()
+    report = replace(report, found=replace(report.found, contradictions=[Contradiction((0, 2), 90, 90)]))
+    (line,) = (line for line in report.lines() if line.startswith("contradiction"))
+    assert "a.jpg and c.jpg share 90 features, but stand so close that they should share more" in line
 
 
 def test_a_panorama_that_shares_nothing_names_no_other() -> None:

@@ -36,7 +36,9 @@ def square(
     ground: bool = True,
     order: NDArray[np.int64] | None = None,
 ) -> Square:
-    """Args: ground, whether there are points that do not repeat; order, of the names (count,)."""
+    """Args: count, places on the way; ground, whether there are points that do not repeat; order, (K,) which
+    of these places panoramas have, in the order of their names.
+    """
     random = np.random.default_rng(1)
     points, copy_of = _points(random, _FRONT, _FLOOR * ground)
     centers, rotations = _way(random, count)
@@ -57,8 +59,8 @@ def square(
         for number, seen in zip(ids, rows, strict=True):
             own = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, words[look[seen]])
             database.write_descriptors(number, own)
-        for a in range(count):
-            for b in range(a + 1, count):
+        for a in range(len(centers)):
+            for b in range(a + 1, len(centers)):
                 for turn in range(4):
                     turned = Rotation.from_euler("z", 90 * turn, degrees=True).apply(centers[a])
                     if np.linalg.norm(turned - centers[b]) < (_ALIKE if turn else _NEAR):

@@ -18,21 +18,26 @@ def _contradictions(
     covers: float,
     shared: tuple[float, float] = (0.3, 0.3),
     guessed: frozenset[Edge] = frozenset(),
+    agree: float = 0.3,
+    last: float = 0.5,
 ) -> set[Edge]:
     """Of a walk within a ring of houses, each of which looks as that ten degrees further on.
 
     Args: pairs that agree besides the neighbours, and pairs with copies; covers, the coverage of the latter;
-        shared, of the features by these, and by the neighbours 2 and 3; guessed, of the walk.
+        shared, of the features by these, and by the neighbours 2 and 3; guessed, of the walk; agree, shared
+        by the pairs that agree besides the neighbours; last, metres from the first panorama to the last,
+        neighbours being 0.1 apart.
     """
     random = np.random.default_rng(0)
     turn = np.deg2rad(np.arange(AROUND))
     points = np.column_stack([8 * np.sin(turn), random.uniform(-3, 3, AROUND), 8 * np.cos(turn)])
     shifts = np.array([[0.1 * row, 0.0, 0.0] for row in range(COUNT)])
+    shifts[-1, 0] = last
     rays = [points + shift for shift in shifts]
     same = np.repeat(np.arange(AROUND)[:, None], 2, axis=1)
     copies = np.column_stack([same[:, 0], (same[:, 0] + 10) % AROUND])
     walk = [(row, row + 1) for row in range(COUNT - 1)]
-    shares = {(2, 3): shared[1]}
+    shares = dict.fromkeys(agreeing, agree) | {(2, 3): shared[1]}
     pairs = [Pair(edge, same, 0.9, share=shares.get(edge, 0.3)) for edge in (*walk, *agreeing)]
     pairs += [Pair(edge, copies, covers, share=shared[0]) for edge in against]
     unit = tuple(ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
@@ -68,3 +73,15 @@ def test_without_an_order_copies_count_if_they_share_as_much_as_what_connects(
     weak: float, counts: bool
 ) -> None:
     assert _contradictions([], [(1, 4)], False, 0.9, (0.16, weak)) == ({(1, 4)} if counts else set())
+
+
+@pytest.mark.parametrize(
+    ("shared", "last", "counts"), [(0.2, 0.13, True), (0.3, 0.13, False), (0.2, 0.17, False)]
+)
+@pytest.mark.parametrize("ordered", [True, False])
+def test_what_stands_closer_than_neighbours_shares_as_much(
+    shared: float, last: float, counts: bool, ordered: bool
+) -> None:
+    """The walk returns to the second panorama, or to where it looks the same."""
+    found = _contradictions([(1, 5)], [], ordered, 0.9, agree=shared, last=last)
+    assert found == ({(1, 5)} if counts else set())

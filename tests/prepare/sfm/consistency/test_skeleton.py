@@ -127,6 +127,8 @@ def test_the_part_that_agrees_is_cut_where_the_tree_is_weakest() -> None:
         assert consistent_part(range(10), doubt, skeleton, evidence) == list(part)
     later = Skeleton(False, frozenset((row, row + 1) for row in range(1, 9)))  # nothing carries the first
     assert consistent_part(range(10), [Contradiction((0, 5), 80, 3)], later, evidence) == [*range(1, 10)]
+    sides = Skeleton(False, frozenset(walk) - {(4, 5)})  # each side is a part of its own anyway
+    assert consistent_part(range(10), [Contradiction((2, 9), 80, 3)], sides, evidence) == [*range(10)]
 
 
 def test_panoramas_whose_poses_are_known_need_no_pairs_and_one_edge_joins_others_with_them() -> None:
