@@ -46,6 +46,11 @@ def first_line(text: str) -> str:
     return (text.strip().splitlines() or [""])[0]
 
 
+def last_line(text: str) -> str:
+    """The last line of a text that is not blank; "" where it has none."""
+    return text.strip().rpartition("\n")[2].strip()
+
+
 class PanologError(Exception):
     """Root of all errors that PanoLOG raises on purpose."""
 

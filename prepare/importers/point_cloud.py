@@ -44,7 +44,10 @@ def read_point_cloud(path: Path | None, memory: int = MEMORY) -> PointCloud:
 
 
 def _read_ascii(table: Table, file: BinaryIO) -> PointCloud:
-    """As openMVG writes by default: each line is a vertex. Args: file, at the first one."""
+    """Reads the rows of an ASCII PLY, which openMVG writes by default: each line is a vertex.
+
+    Args: table, what the header declares; file, at the first vertex. Raises PlyError if a row is damaged.
+    """
     path = table.path
     if table.count > path.stat().st_size // 6:  # a vertex has at least `0 0 0` and a line's end
         raise PlyError(f"{path}: its header declares {table.count:,} vertices, more than there can be")

@@ -28,7 +28,7 @@ from panolog.orchestrator.runs.queue.entries import Entry, Share, State
 from panolog.orchestrator.runs.queue.shares import Capacity, NeverFitsError, environment
 from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.runs.records import Outcome
-from panolog.scene.errors import QueueError, RunLockedError
+from panolog.scene.errors import QueueError, RunLockedError, last_line
 
 PROGRAM = (sys.executable, "-m", "panolog.orchestrator.cli")
 # The shell waits for a line, then becomes the program: with the same number and moment of start.
@@ -270,8 +270,8 @@ class _Runner:
         path = log_of(self.queue.folder, entry.id)
         with suppress(OSError), path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _TAIL))
-            if text := file.read(_TAIL).decode(errors="replace").strip():
-                return text.rpartition("\n")[2].strip().removeprefix("panolog: ")
+            if line := last_line(file.read(_TAIL).decode(errors="replace")):
+                return line.removeprefix("panolog: ")
         return f"see {path}"
 
     def _written(self, work: Callable[[], _Answer]) -> _Answer:

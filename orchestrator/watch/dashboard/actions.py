@@ -12,7 +12,7 @@ from panolog.orchestrator.runs.preparation.settings import read_settings
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.dashboard.messages import Actions
 from panolog.orchestrator.watch.views.history import History
-from panolog.scene.errors import InputError
+from panolog.scene.errors import InputError, last_line
 from panolog.scene.stores.url import is_url
 
 RESUME = "resume"
@@ -103,4 +103,4 @@ def _last_line(entry: RunEntry) -> str:
         text = entry.folder.read(entry.folder.root / _LOG, _TAIL).decode(errors="replace")
     except InputError:
         return f"see {_LOG}"
-    return text.strip().rpartition("\n")[2].strip() or f"see {_LOG}"
+    return last_line(text) or f"see {_LOG}"

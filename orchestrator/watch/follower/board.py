@@ -56,7 +56,7 @@ class Board:
     def pause(self, tries: int, least: float = 0.0) -> bool:
         """Waits between two tries: until the run has ended, or longer each time; then for a short time.
 
-        Args: tries, that came before this pause's; least, seconds. Returns whether there is time for another.
+        Args: tries, before the one that failed; least, seconds. Returns whether there is time for another.
         """
         seconds = max(least, min(_FIRST_S * 2**tries, _LONGEST_S))
         if self._news.ended:
