@@ -199,13 +199,7 @@ def inverse_prior(raw: Tensor, kind: Literal["inverse", "depth"]) -> Tensor:
 
 
 def align_depth(
-    scene: Scene,
-    view: View,
-    seed: int,
-    *,
-    kind: Literal["inverse", "depth"] = "inverse",
-    min_points: int = MIN_POINTS,
-    max_residual: float = MAX_RESIDUAL,
+    scene: Scene, view: View, seed: int, *, kind: Literal["inverse", "depth"] = "inverse"
 ) -> Alignment:
     """Aligns one panorama's prior to the sparse points that it observes (eq. 4).
 
@@ -219,8 +213,6 @@ def align_depth(
     Args:
         view: the decoded panorama; its image is not used.
         kind: "inverse" or "depth": what the depth image holds.
-        min_points: usable points below which the prior is refused.
-        max_residual: median residual, as a fraction of the points' spread, above which it is refused.
 
     Raises AlignmentError: there are too few points or the result is implausible; the message is the reason;
     ValueError: the view has no depth image.
@@ -235,21 +227,21 @@ def align_depth(
     prior, inverse, share, usable = _at_points(scene.points[rows], panorama, view, kind)
     first = first[usable]
     given = _usable(panorama.depth_affine)
-    if len(prior) < min_points:
+    if len(prior) < MIN_POINTS:
         if given is None:
-            raise AlignmentError(f"only {len(prior)} sparse points on it, {min_points} are needed")
+            raise AlignmentError(f"only {len(prior)} sparse points on it, {MIN_POINTS} are needed")
         found = Alignment(*given, residual=None)
         if len(prior) >= FEWEST:
             found = _measured(prior, inverse, given, 0.0)
-        return _plausible(replace(found, given=True), max_residual)
-    if tracked or first.sum() < min_points:
+        return _plausible(replace(found, given=True))
+    if tracked or first.sum() < MIN_POINTS:
         fitted = fit_affine(prior, inverse, seed, share)
     else:
         fitted = _fit_likely(prior, inverse, share, first, seed)
         prior, inverse = prior[first], inverse[first]
     if panorama.depth_affine is not None:
         fitted = _better(panorama.depth_affine, prior, inverse, fitted)
-    return _plausible(fitted, max_residual)
+    return _plausible(fitted)
 
 
 def _at_points(
@@ -292,13 +284,13 @@ def _better(affine: tuple[float, float], prior: Array, inverse: Array, fitted: A
     return replace(fitted, note=note)
 
 
-def _plausible(found: Alignment, max_residual: float) -> Alignment:
+def _plausible(found: Alignment) -> Alignment:
     """The alignment itself. Raises AlignmentError if it cannot be right."""
     if not (math.isfinite(found.scale) and math.isfinite(found.offset)):
         raise AlignmentError(f"its affine {found.scale} · prior + {found.offset} is not finite")
-    if found.residual is not None and not found.residual <= max_residual:
+    if found.residual is not None and not found.residual <= MAX_RESIDUAL:
         raise AlignmentError(
-            f"its residual is {found.residual:.2f} of the points' spread, above {max_residual:.2f}"
+            f"its residual is {found.residual:.2f} of the points' spread, above {MAX_RESIDUAL:.2f}"
         )
     if not found.scale > 0:
         raise AlignmentError(f"its scale is {found.scale:.3g}, which is not positive")

@@ -9,8 +9,6 @@ import pytest
 import torch
 
 from panolog.scene.depth_alignment import (
-    MAX_RESIDUAL,
-    MIN_POINTS,
     MOST_POINTS,
     AlignmentError,
     align_depth,
@@ -21,7 +19,6 @@ from panolog.scene.depth_alignment import (
 from panolog.scene.images import View, load_layers, load_view
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
-from panolog.workers.training.config import DepthConfig
 from tests.data import shared
 from tests.workers.small import AFFINE, WIDTH, small_scene
 
@@ -91,11 +88,6 @@ def test_fit_is_exact_without_noise_also_where_inverse_depths_are_not_positive(l
 def test_fit_refuses_a_constant_prior() -> None:
     with pytest.raises(AlignmentError, match="the same at all"):
         fit_affine(np.full(50, 0.3), np.linspace(0.1, 1, 50), 0)
-
-
-def test_training_has_the_same_defaults() -> None:
-    config, defaults = DepthConfig(), ("inverse", MIN_POINTS, MAX_RESIDUAL)
-    assert (config.kind, config.min_points, config.max_residual) == defaults
 
 
 def test_align_takes_inverse_depth_and_depth(scene: Scene) -> None:

@@ -14,7 +14,6 @@ class ExposureConfig(Group):
         default=False,
         description="whether each panorama has its own exposure; auto: if `scene check` sees differences",
     )
-    offset: bool = Field(default=False, description="whether black levels are learnt too, not only gains")
     begin: float = Field(
         default=0.3,
         ge=0,

@@ -1,4 +1,4 @@
-"""The exposure of each panorama, learnt in Stage I: gains in linear light, and perhaps black levels.
+"""The exposure of each panorama, learnt in Stage I: gains in linear light.
 
 With sRGB's curve, a gain g in linear light maps an encoded value x to a·(x + k) - k with a = g^(1/2.4) and
 k = 0.055, exactly above its short linear part. So log g has one meaning at all brightnesses, and the rendered
@@ -23,16 +23,14 @@ from panolog.workers.capture.config import ExposureConfig
 _NAME, _VISITS = "exposure.values", "exposure.visits"  # in checkpoints
 _SLOWEST = 0.05  # of a step, in long runs
 _MOST = 1.5  # natural logarithm: a view may be 4.5 times as bright as the seed says, or as dark
-_STIFF = 10.0  # pixels without error that hold the black levels at 0
 _LEAST = 1e-6  # squared: below it the view is black and says nothing of a gain
 
 
 class Exposures:
     """Those of the views of one task."""
 
-    def __init__(self, start: Tensor, views: Sequence[int], config: ExposureConfig) -> None:
+    def __init__(self, start: Tensor, views: Sequence[int]) -> None:
         """Args: start (V, 2, 3) float64, `Panorama.exposure` of each of the views, on the device."""
-        self._config = config
         self._at = {row: at for at, row in enumerate(views)}
         self._start = start
         self._values = start.clone()
@@ -45,7 +43,7 @@ class Exposures:
         if config.learn is False or (config.learn == "auto" and all(value is None for value in known)):
             return None
         start = np.stack([np.zeros((2, 3)) if value is None else value for value in known])
-        return Exposures(torch.from_numpy(start).to(device), views, config)
+        return Exposures(torch.from_numpy(start).to(device), views)
 
     def of_view(self, row: int) -> Tensor:
         """(2, 3) float32 factors and summands of a view's colours: `View.exposure`."""
@@ -58,21 +56,12 @@ class Exposures:
         w·s², w·r and w·s·r, of the errors r and s = x + k; status (1,): nothing is learnt unless it is 0.
         """
         at = self._at[row]
-        log_gain, offset = self._values[at]
-        factor = torch.exp(log_gain / CURVE)
-        w, s, ss, r, sr = sums.unbind(1)
-        if self._config.offset:
-            stiff = w + _STIFF
-            pull = r + _STIFF * offset
-            rest = (ss - s * s / stiff).clamp(min=_LEAST)
-            by_factor = -(sr - s * pull / stiff) / rest
-            by_offset = -(pull + s * by_factor) / stiff
-        else:
-            by_factor, by_offset = -r / s.clamp(min=_LEAST), torch.zeros_like(r)
+        factor = torch.exp(self._values[at, 0] / CURVE)
+        _, s, _, r, _ = sums.unbind(1)
+        by_factor = -r / s.clamp(min=_LEAST)
         rate = (2 / (3 + self._visits[at])).clamp(min=_SLOWEST)  # late visits even out each other's noise
-        change = torch.stack([CURVE * by_factor / factor, by_offset]) * rate
         values = self._values.clone()
-        values[at].add_(change.clamp(-0.5, 0.5))
+        values[at, 0] += (CURVE * by_factor / factor * rate).clamp(-0.5, 0.5)
         learnt = values[:, 0] - self._start[:, 0]
         learnt = (learnt - learnt.mean(0)).clamp(-_MOST, _MOST)
         values = torch.stack([self._start[:, 0] + learnt, values[:, 1]], dim=1)

@@ -45,7 +45,7 @@ class _Strategy:
             )
         extent = extent_of(places, baseline(places))
         self._schedule = Schedule(config, iterations, extent, refine=False)
-        self._centers, self._sky, self._seed = places, sky, seed
+        self._sky, self._seed = sky, seed
         self._growth: Growth | None = None
         self._statistics: Statistics
 
@@ -80,8 +80,7 @@ class _Strategy:
         schedule = self._schedule
         if self._growth is None:
             count, pixels = len(parameters["means"]) - self._sky, raster.alpha[0].numel()
-            place = Place(None, count, pixels, self._centers)
-            self._growth = Growth(schedule, place, self._seed, "coarse")
+            self._growth = Growth(schedule, Place(None, count, pixels), self._seed, "coarse")
             self._statistics = Statistics.zeros(count, raster.alpha.device, schedule.config.densify)
         if schedule.collects(iteration):
             seen = zip(raster.screen.grad, raster.visible, raster.cameras, strict=True)

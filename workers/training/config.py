@@ -52,17 +52,6 @@ class DepthConfig(Group):
     kind: Literal["inverse", "depth"] = Field(
         default="inverse", description="radial inverse depth or radial depth in depth images; eq. 4: inverse"
     )
-    min_points: int = Field(
-        default=20,
-        ge=2,
-        description="sparse points an image needs for its alignment; ten for each unknown of eq. 4",
-    )
-    max_residual: float = Field(
-        default=0.5,
-        gt=0,
-        description="median residual of an alignment as a fraction of the median spread of the inverse"
-        " depths; at 1 the image says no more than a constant, so half of that is refused",
-    )
 
 
 class SkyConfig(Group):
@@ -88,10 +77,6 @@ class SkyConfig(Group):
     )
     views: int = Field(
         default=16, ge=1, description="training panoramas, evenly chosen, whose mean colours the sky"
-    )
-    train_scales: bool = Field(
-        default=False,
-        description="whether Stage I trains the sky's scales; sec. 3.2.1 has colour, rotation, opacity",
     )
 
     def number(self, pixels: int) -> int:
@@ -128,12 +113,7 @@ class DensifyConfig(Group):
     percent_dense: float = Field(
         default=0.01,
         gt=0,
-        description="largest scale that is cloned, above it is split, in units of `large`; 3DGS",
-    )
-    large: Literal["extent", "distance"] = Field(
-        default="extent",
-        description="unit of `percent_dense`: the extent of the task's cameras, as in 3DGS, or a Gaussian's"
-        " distance from the nearest of them: a hundredth is then the same angle in a town and in a yard",
+        description="largest scale, in extents, that is cloned, above it is split; 3DGS",
     )
     prune_opacity: float = Field(
         default=0.005, ge=0, lt=1, description="opacity below which they are removed, o_min of eq. 12; 3DGS"
@@ -298,10 +278,6 @@ class Stage2Config(Group):
     )
     scale: float = Field(
         default=1.0, gt=0, le=1, description="factor of the rate of scales, besides `rate`; 1 = as the paper"
-    )
-    reset: Literal["all", "cell", "none"] = Field(
-        default="all",
-        description="whose opacities are reset: of all, which bounds a block softly (app. D), of its cell",
     )
     exterior: Literal["full", "frozen", "baked"] = Field(
         default="full",

@@ -103,15 +103,15 @@ def densify(
     state: ModelState,
     statistics: Statistics,
     config: DensifyConfig,
-    extent: float | NDArray[np.float64],
+    extent: float,
     random: np.random.Generator,
 ) -> None:
     """Clone small and split large Gaussians with large screen gradients, prune transparent ones (3DGS).
 
     New Gaussians start with zero moments. The rows of the statistics no longer match afterwards.
 
-    Args: statistics of the scene Gaussians; extent in world units, or (S,) one for each of them, that
-    `percent_dense` is a fraction of; random for the split positions.
+    Args: statistics of the scene Gaussians; extent in world units, that `percent_dense` is a fraction of;
+    random for the split positions.
     """
     kept, clones, splits, sky = _sources(state.gaussians, statistics, config, extent)
     source = torch.cat([kept, clones, splits, sky])
@@ -125,13 +125,6 @@ def densify(
         _place_splits(state, slice(start, start + 2 * pairs), random)
 
 
-def camera_distances(means: Tensor, centers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(S,) distances, above 0, of means (S, 3) from the nearest of the centers (K, 3), in world units."""
-    distances, _ = cKDTree(centers).query(means.detach().cpu().numpy())
-    apart: NDArray[np.float64] = np.maximum(distances, np.finfo(np.float32).tiny)
-    return apart
-
-
 def rate_units(
     means: Tensor, centers: NDArray[np.float64], schedule: Schedule, baseline: float
 ) -> dict[str, Tensor]:
@@ -141,7 +134,8 @@ def rate_units(
     """
     units, config = {}, schedule.config
     near = config.sh.near * baseline / schedule.length**2  # as far in all in a run of any length
-    distance = torch.from_numpy(camera_distances(means, centers).astype(np.float32)).to(means.device)
+    apart = cKDTree(centers).query(means.cpu().numpy())[0].astype(np.float32)
+    distance = torch.from_numpy(np.maximum(apart, np.finfo(np.float32).tiny)).to(means.device)
     if config.optimizer.unit == "distance":
         units["means"] = distance
     if near > 0:
@@ -150,17 +144,13 @@ def rate_units(
 
 
 def _sources(
-    gaussians: Gaussians,
-    statistics: Statistics,
-    config: DensifyConfig,
-    extent: float | NDArray[np.float64],
+    gaussians: Gaussians, statistics: Statistics, config: DensifyConfig, extent: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rows int64 that stay, that are cloned, that are split (twice each), and of the sky."""
     scene = gaussians.scene
     # compared as logits: the rounding of a vectorised sigmoid depends on how threads divide the rows
     removed = gaussians.opacities[scene] < logit(config.prune_opacity)
-    bound = np.log(config.percent_dense * np.asarray(extent, np.float64)).astype(np.float32)
-    large = gaussians.scales[scene].amax(1) > torch.from_numpy(np.asarray(bound)).to(gaussians.scales.device)
+    large = gaussians.scales[scene].amax(1) > float(np.float32(math.log(config.percent_dense * extent)))
     gradient = statistics.mean()
     chosen = gradient >= config.gradient
     if config.split_gradient > 0:
@@ -269,12 +259,9 @@ def _keep(state: ModelState, kept: Tensor) -> None:
     state.rearrange(source, torch.zeros_like(source, dtype=torch.bool), state.gaussians.sky)
 
 
-def reset_opacities(state: ModelState, ceiling: float, rows: NDArray[np.bool_]) -> None:
-    """Clamp the opacities of scene Gaussians to `ceiling` and zero their moments (3DGS; app. D).
-
-    Args: rows (S,) which of the scene Gaussians.
-    """
-    at = torch.from_numpy(rows.nonzero()[0]).to(state.gaussians.means.device)
-    state.gaussians.opacities[at] = state.gaussians.opacities[at].clamp(max=logit(ceiling))
-    state.exp_avg["opacities"][at] = 0
-    state.exp_avg_sq["opacities"][at] = 0
+def reset_opacities(state: ModelState, ceiling: float) -> None:
+    """Clamp the opacities of the scene Gaussians to `ceiling` and zero their moments (3DGS; app. D)."""
+    scene = state.gaussians.scene
+    state.gaussians.opacities[scene] = state.gaussians.opacities[scene].clamp(max=logit(ceiling))
+    state.exp_avg["opacities"][scene] = 0
+    state.exp_avg_sq["opacities"][scene] = 0

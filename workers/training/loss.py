@@ -40,17 +40,6 @@ class DepthTargets:
         valid = sky | (prior > 0) if self.config.sky else ~sky & (prior > 0)
         return target, valid if view.mask is None else valid & view.mask
 
-    def _align(self, view: View) -> Alignment:
-        config = self.config
-        return align_depth(
-            self.scene,
-            view,
-            self.seed,
-            kind=config.kind,
-            min_points=config.min_points,
-            max_residual=config.max_residual,
-        )
-
     def align(self, view: View) -> Alignment | None:
         """The alignment of a view, by its mask when it is first seen; None without usable depth."""
         if view.inverse_depth is None:
@@ -59,7 +48,8 @@ class DepthTargets:
         if row not in self._aligned:
             name = self.scene.panoramas[row].name
             try:
-                found = self._aligned[row] = self._align(view)
+                found = align_depth(self.scene, view, self.seed, kind=self.config.kind)
+                self._aligned[row] = found
                 if found.note:
                     self.notices.append(f"{name}: {found.note}")
             except AlignmentError as error:

@@ -140,16 +140,14 @@ def check_kind(tensors: Mapping[str, Tensor], config: TrainConfig) -> None:
         )
 
 
-def trained_rows(gaussians: Gaussians, degree: int, *, refine: bool, sky_scales: bool) -> dict[str, int]:
+def trained_rows(gaussians: Gaussians, degree: int, *, refine: bool) -> dict[str, int]:
     """How many rows of each parameter train: of the sky in Stage I its appearance, in Stage II nothing.
 
-    Args: degree of spherical harmonics in use; refine, Stage II; sky_scales, whether Stage I trains those of
-    the sky too.
+    Args: degree of spherical harmonics in use; refine, Stage II.
     """
     count, scene = len(gaussians), gaussians.scene.stop
     used = [name for name in gaussians.tensors() if degree > 0 or name != "shN"]
-    still = ("means",) if sky_scales else ("means", "scales")
-    return dict.fromkeys(used, scene if refine else count) | dict.fromkeys(still, scene)
+    return dict.fromkeys(used, scene if refine else count) | {"means": scene, "scales": scene}
 
 
 class Average:

@@ -23,7 +23,6 @@ from panolog.scene.random_streams import generator
 from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.densify import (
     Statistics,
-    camera_distances,
     densify,
     drop_large,
     drop_unrisen,
@@ -54,7 +53,6 @@ class Place:
     cell: Volume | None  # of a block
     start: int  # what the budget follows: `Trainer.start`
     pixels: int  # of a panorama
-    centers: Floats  # (K, 3) of the task's cameras, world units
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +93,7 @@ class Growth:
             self._grow(state, statistics, iteration)
             statistics = self._anew(state, statistics)
         if schedule.resets(iteration):
-            cell = self.place.cell if schedule.config.stage2.reset == "cell" else None
-            reset_opacities(state, reset.opacity, inside(state.gaussians, cell))
+            reset_opacities(state, reset.opacity)
         if last and schedule.drops_unrisen:
             drop_unrisen(state, reset.opacity)
             statistics = self._anew(state, statistics)
@@ -108,10 +105,7 @@ class Growth:
         random = generator(self.seed, self.task, "split", iteration)
         match config.method:
             case "clone-split":
-                means = state.gaussians.means[state.gaussians.scene]
-                apart = config.large == "distance"
-                extent = camera_distances(means, place.centers) if apart else schedule.extent
-                densify(state, statistics, config, extent, random)
+                densify(state, statistics, config, schedule.extent, random)
                 if schedule.prunes_large(iteration):
                     drop_large(state, config.prune_scale * schedule.extent)
             case "relocate":

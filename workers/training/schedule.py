@@ -95,10 +95,10 @@ class Schedule:
     def resets(self, iteration: int) -> bool:
         """Whether opacities are reset after this iteration: while densifying, never near the end (app. D).
 
-        They never are where Gaussians are relocated, or in Stage II if `stage2.reset` is none.
+        They never are where Gaussians are relocated.
         """
         reset = self.config.reset
-        if self.config.densify.method == "relocate" or (self.refine and self.config.stage2.reset == "none"):
+        if self.config.densify.method == "relocate":
             return False
         due = iteration % self.interval(reset.every, reset.every_floor) == 0
         return due and self.collects(iteration) and iteration <= (1 - reset.quiet) * self.iterations

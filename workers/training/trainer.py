@@ -327,7 +327,6 @@ class Trainer:
         """An iteration as it is to be done."""
         degree, weight = self.schedule.sh_degree(iteration), self.loss.depth_weight(iteration)
         around = self._around(view.row)
-        sky_scales = self.spec.config.sky.train_scales
         problem = Problem(
             model=self.state.gaussians.tensors(),
             camera=self._camera(view.row),
@@ -350,9 +349,7 @@ class Trainer:
             problem=problem,
             state=self.state,
             rates=self.schedule.rates(iteration),
-            rows=trained_rows(
-                self.state.gaussians, degree, refine=self.schedule.refine, sky_scales=sky_scales
-            ),
+            rows=trained_rows(self.state.gaussians, degree, refine=self.schedule.refine),
             sizes=self.schedule.sizes(self.spec.width),
             statistics=self.statistics if self.schedule.collects(iteration) else None,
             learning=self.learning if self.spec.cell is None else None,
@@ -368,7 +365,7 @@ class Trainer:
         if last:
             self.state.gaussians = self.average.take(self.state.gaussians)
         if changes:
-            place = Place(self.spec.cell, self.start, self.spec.width**2 // 2, self.centers)
+            place = Place(self.spec.cell, self.start, self.spec.width**2 // 2)
             growth = Growth(self.schedule, place, self.spec.seed, str(self.spec.task))
             before = self.statistics
             self.statistics, invalid = growth.after(self.state, before, iteration)

@@ -132,7 +132,7 @@ def test_the_settings_of_a_run_are_complete() -> None:
     assert older.recipe == "paper" and older.overlap is None
     assert (older.partition.aspect, older.depth.unit, older.depth.sky) == (0.5, "baseline", True)
     assert older.densify.prune_scale == 0
-    gone = {"pyramid": {"steps": []}, "densify": {"scale_decay": 0.0, "until": 7}}
+    gone = {"pyramid": {"steps": []}, "densify": {"scale_decay": 0.0, "large": "extent", "until": 7}}
     assert RunConfig.model_validate(gone, context=RESOLVED).densify.until == 7
     with pytest.raises(ValidationError, match="pyramid"):  # it would continue otherwise than it began
         RunConfig.model_validate({"pyramid": {"steps": [0.5]}}, context=RESOLVED)

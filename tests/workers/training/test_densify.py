@@ -17,7 +17,6 @@ from panolog.scene.gaussians import logit
 from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.densify import (
     Statistics,
-    camera_distances,
     densify,
     drop_large,
     rate_units,
@@ -66,16 +65,6 @@ def test_small_ones_clone_large_ones_split_transparent_ones_go_and_sky_stays() -
     assert sizes.tolist() == pytest.approx([0.05, 0.05, 0.05, 0.5 / 1.6, 0.5 / 1.6, 50, 50])
     assert torch.equal(state.gaussians.means[1], state.gaussians.means[2])
     assert not torch.equal(state.gaussians.means[3], state.gaussians.means[4])
-
-
-def test_what_is_large_may_be_a_matter_of_distance() -> None:
-    state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0)  # at x = 0, 100 and 200
-    distances = camera_distances(state.gaussians.means, np.array([[1.0, 0, 0], [210, 0, 0]]))
-    assert distances.tolist() == [1, 99, 10]
-    random = np.random.default_rng(0)
-    densify(state, statistics_of([LOUD] * 3), DensifyConfig(large="distance"), distances, random)
-    sizes = state.gaussians.scales[:, 0].exp().tolist()  # bounds: 0.01, 0.99, 0.1
-    assert sizes == pytest.approx([0.05, 0.05, *[0.05 / 1.6, 0.5 / 1.6] * 2])
 
 
 def test_large_ones_may_split_by_absolute_gradients() -> None:
@@ -282,13 +271,11 @@ def test_large_ones_go_but_for_the_sky() -> None:
     assert state.gaussians.sky == 1 and len(state.exp_avg["means"]) == 2
 
 
-@pytest.mark.parametrize("rows", [[True, True, True], [False, True, True]])
-def test_reset_spares_the_sky_and_what_it_is_not_for(rows: list[bool]) -> None:
+def test_reset_spares_the_sky() -> None:
     state = state_of([0.1] * 4, [0.5, 0.008, 0.9, 0.9], sky=1)
-    reset_opacities(state, 0.01, np.array(rows))
-    first, moment = (0.01, 0) if rows[0] else (0.5, 7)
-    assert state.gaussians.opacities.sigmoid().tolist() == pytest.approx([first, 0.008, 0.01, 0.9])
-    assert state.exp_avg["opacities"].tolist() == state.exp_avg_sq["opacities"].tolist() == [moment, 0, 0, 7]
+    reset_opacities(state, 0.01)
+    assert state.gaussians.opacities.sigmoid().tolist() == pytest.approx([0.01, 0.008, 0.01, 0.9])
+    assert state.exp_avg["opacities"].tolist() == state.exp_avg_sq["opacities"].tolist() == [0, 0, 0, 7]
     assert (state.exp_avg["means"] == 7).all()
 
 

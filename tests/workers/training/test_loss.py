@@ -45,7 +45,7 @@ def test_implausible_images_are_left_out_and_named_once(scene: Scene) -> None:
         "the same at all": replace(view, inverse_depth=torch.full_like(noise, 0.5)),
     }
     for reason, wrong in cases.items():
-        targets = DepthTargets(scene, DepthConfig(max_residual=0.3), 0)
+        targets = DepthTargets(scene, DepthConfig(), 0)
         assert targets.target(wrong) is None and targets.target(wrong) is None
         assert len(targets.notices) == 1
         assert "pano_1.png is left out" in targets.notices[0] and reason in targets.notices[0]

@@ -35,7 +35,6 @@ CAPTURED: Groups = {
 }
 COARSE: dict[str, Groups] = {
     "usual": {},
-    "distance": {"densify": {"large": "distance", "percent_dense": 0.2}},
     "absolute": {"densify": {"split_gradient": 3e-3}},
     "averaged": {"optimizer": {"average": 0.25}},
     "relocated": {"densify": RELOCATED, "depth": {"points": 0.8}},
