@@ -53,58 +53,53 @@ class CalibrateSpec(TaskSpec):
     most: int  # Gaussians that the second model may have, sky included
 
     def run(self) -> Iterator[Progress | Calibration]:
-        """`calibrate`."""
-        return calibrate(self)
-
-
-def calibrate(spec: CalibrateSpec) -> Iterator[Progress | Calibration]:
-    """The measurements, last; before, signs that it works. Raises as `training.trainer.train`."""
-    scene = spec.scene.load()
-    decode = _decode_seconds(spec, scene)
-    views = _views(spec, scene, decode)
-    sh = spec.config.sh.model_copy(update={"every": 1})  # all degrees at once, as after a part of a run
-    config = spec.config.model_copy(update={"sh": sh})
-    trial = TrainSpec(
-        task=spec.task,
-        scene=spec.scene,
-        views=views,
-        width=spec.width,
-        iterations=spec.iterations,
-        config=config,
-        seed=spec.seed,
-        device=spec.device,
-        locate=spec.locate,
-    )
-    each = view_bytes(scene.panoramas[views[0]], spec.width)
-    started = time.monotonic()
-    with open_cache(spec, scene, views, len(views) * each) as cache:
-        _require_pixels(scene, [cache.get(row) for row in views])
-        trainer = Trainer(trial, scene, cache)
-        yield from trainer.begin()
-        begin = time.monotonic() - started
-        yield Progress(spec.task, 1, _PARTS, 0.0)
-        cache.prefetch(views)
-        initial = _iteration_cost(trainer, views, _STEPS, spec.seconds / 2)
-        yield Progress(spec.task, 2, _PARTS, 0.0)
-        share = _densified_share(trainer)
-        _grow(trainer, _target(spec, trainer, share, initial.seconds))
-        grown = _iteration_cost(trainer, views, _GROWN_STEPS, spec.seconds / 2)
-        yield Progress(spec.task, 3, _PARTS, 0.0)
-        single = _single_thread_seconds(trainer, views, grown)
-        yield Progress(spec.task, 4, _PARTS, 0.0)
-        evaluation = _evaluation_seconds(trainer, views[0])
-    yield Calibration(
-        width=spec.width,
-        threads=ops.threads(),
-        images=len(views) * each,
-        begin=begin,
-        decode=decode,
-        share=share,
-        initial=initial,
-        grown=grown,
-        single=single,
-        look=evaluation,
-    )
+        """The measurements, last; before, signs that it works. Raises as `training.trainer.train`."""
+        scene = self.scene.load()
+        decode = _decode_seconds(self, scene)
+        views = _views(self, scene, decode)
+        sh = self.config.sh.model_copy(update={"every": 1})  # all degrees at once, as after a part of a run
+        config = self.config.model_copy(update={"sh": sh})
+        trial = TrainSpec(
+            task=self.task,
+            scene=self.scene,
+            views=views,
+            width=self.width,
+            iterations=self.iterations,
+            config=config,
+            seed=self.seed,
+            device=self.device,
+            locate=self.locate,
+        )
+        each = view_bytes(scene.panoramas[views[0]], self.width)
+        started = time.monotonic()
+        with open_cache(self, scene, views, len(views) * each) as cache:
+            _require_pixels(scene, [cache.get(row) for row in views])
+            trainer = Trainer(trial, scene, cache)
+            yield from trainer.begin()
+            begin = time.monotonic() - started
+            yield Progress(self.task, 1, _PARTS, 0.0)
+            cache.prefetch(views)
+            initial = _iteration_cost(trainer, views, _STEPS, self.seconds / 2)
+            yield Progress(self.task, 2, _PARTS, 0.0)
+            share = _densified_share(trainer)
+            _grow(trainer, _target(self, trainer, share, initial.seconds))
+            grown = _iteration_cost(trainer, views, _GROWN_STEPS, self.seconds / 2)
+            yield Progress(self.task, 3, _PARTS, 0.0)
+            single = _single_thread_seconds(trainer, views, grown)
+            yield Progress(self.task, 4, _PARTS, 0.0)
+            evaluation = _evaluation_seconds(trainer, views[0])
+        yield Calibration(
+            width=self.width,
+            threads=ops.threads(),
+            images=len(views) * each,
+            begin=begin,
+            decode=decode,
+            share=share,
+            initial=initial,
+            grown=grown,
+            single=single,
+            look=evaluation,
+        )
 
 
 def _require_pixels(scene: Scene, views: Sequence[View]) -> None:

@@ -41,25 +41,20 @@ class EvaluateSpec(TaskSpec):
         return () if self.seams is None else self.seams.faces
 
     def run(self) -> Iterator[Event]:
-        """`evaluate`."""
-        return evaluate(self)
+        """Renders and measures each view: an Evaluated and a Progress for each; first, perhaps, LpipsMissing.
 
+        A panorama that cannot be decoded has LeftOut in place of Evaluated. Then come the seams.
 
-def evaluate(spec: EvaluateSpec) -> Iterator[Event]:
-    """Renders and measures each view: one Evaluated and one Progress for each; first, perhaps, LpipsMissing.
-
-    A panorama that cannot be decoded has LeftOut in place of Evaluated. Then come the seams.
-
-    Raises InputError if the PLY or an image cannot be read, or too many images cannot be decoded.
-    """
-    host = spec.model.load()
-    steps = _Steps(Meter(spec.task, len(spec.views), spec.device), len(spec.views), len(host))
-    seams = None if spec.seams is None else SeamMeasurement(spec, spec.seams, spec.near, steps.done)
-    steps.meter.iterations += 0 if seams is None else seams.renders
-    if spec.views:
-        yield from _evaluate_views(spec, host.to(spec.device), steps)
-    if seams is not None:
-        yield from seams.measure(host)
+        Raises InputError if the PLY or an image cannot be read, or too many images cannot be decoded.
+        """
+        host = self.model.load()
+        steps = _Steps(Meter(self.task, len(self.views), self.device), len(self.views), len(host))
+        seams = None if self.seams is None else SeamMeasurement(self, self.seams, self.near, steps.done)
+        steps.meter.iterations += 0 if seams is None else seams.renders
+        if self.views:
+            yield from _evaluate_views(self, host.to(self.device), steps)
+        if seams is not None:
+            yield from seams.measure(host)
 
 
 @dataclass

@@ -56,48 +56,41 @@ class ScoreSpec(TaskSpec):
     labels: Source[NDArray[np.int64]]  # (N - sky,) block of each scene Gaussian, 0 to `blocks` - 1
     blocks: int
     config: TrainConfig
-    sizes: tuple[int, ...] | None = (
-        None  # (blocks,) Gaussians that those of a block stand for; None = themselves
-    )
+    sizes: tuple[int, ...] | None = None  # (blocks,) Gaussians that each block's stand for; None = themselves
 
     def run(self) -> Iterator[Event]:
-        """`score`."""
-        return score(self)
+        """One forward and backward pass for each view; yields Progress and at last Scored (eq. 10).
 
+        The rendering loss L_k is the photometric part of eq. 6. The depth part is left out: it measures the
+        prior, not what the camera sees; its weight has decayed to w_T by the end of Stage I; and images that
+        have no usable prior would be scored by another measure than the others.
 
-def score(spec: ScoreSpec) -> Iterator[Event]:
-    """One forward and backward pass for each view; yields Progress and at last Scored (eq. 10).
+        A panorama that cannot be decoded is left out: its scores are 0, so geometry alone assigns it.
+        There is no limit, so that only the blocks with too many of them fail; unless `images.damaged` is 0.
 
-    The rendering loss L_k is the photometric part of eq. 6. The depth part is left out: it measures the
-    prior, not what the camera sees; its weight has decayed to w_T by the end of Stage I; and images that
-    have no usable prior would be scored by another measure than the others.
-
-    A panorama that cannot be decoded is left out: its scores are 0, so geometry alone assigns it. There is no
-    limit, so that only the blocks with too many of them fail; unless `images.damaged` is 0.
-
-    Raises InputError if an image cannot be read or too many cannot be decoded, RunError if a gradient is not
-    finite, ValueError unless the labels are one block for each scene Gaussian.
-    """
-    scene, labels = spec.scene.load(), spec.labels.load()
-    model = spec.model.load().to(spec.device)
-    _check_labels(labels, model, spec)
-    model = replace(model, means=model.means.detach().clone().requires_grad_())
-    near = near_distance(scene, spec.config)
-    meter = Meter(spec.task, len(spec.views), spec.device)
-    scores = _Scores(spec, scene, labels, meter)
-    budget = int(spec.config.cache.memory * 2**30)  # each view is used once: none stays on a GPU
-    with open_cache(spec, scene, spec.views, budget) as cache:
-        damaged = 1.0 if spec.config.images.damaged else 0.0  # in training each block has its limit
-        views = SoundViews(spec.task, scene, spec.views, cache, damaged)
-        for k, row in enumerate(spec.views):
-            cache.prefetch(spec.views[k + 1 : k + 1 + cache.ahead(2)])
-            if (view := views.get(row)) is not None:
-                scores.add(k, *_gradient(spec, scene, model, view, near))
-            yield from views.notices()
-            if meter.due() or k + 1 == len(spec.views):
-                scores.read()
-                yield meter.progress(k + 1, len(model))
-    yield Scored(spec.task, spec.views, scores.values.cpu())
+        Raises InputError if an image cannot be read or too many cannot be decoded, RunError if a gradient is
+        not finite, ValueError unless the labels are one block for each scene Gaussian.
+        """
+        scene, labels = self.scene.load(), self.labels.load()
+        model = self.model.load().to(self.device)
+        _check_labels(labels, model, self)
+        model = replace(model, means=model.means.detach().clone().requires_grad_())
+        near = near_distance(scene, self.config)
+        meter = Meter(self.task, len(self.views), self.device)
+        scores = _Scores(self, scene, labels, meter)
+        budget = int(self.config.cache.memory * 2**30)  # each view is used once: none stays on a GPU
+        with open_cache(self, scene, self.views, budget) as cache:
+            damaged = 1.0 if self.config.images.damaged else 0.0  # in training each block has its limit
+            views = SoundViews(self.task, scene, self.views, cache, damaged)
+            for k, row in enumerate(self.views):
+                cache.prefetch(self.views[k + 1 : k + 1 + cache.ahead(2)])
+                if (view := views.get(row)) is not None:
+                    scores.add(k, *_gradient(self, scene, model, view, near))
+                yield from views.notices()
+                if meter.due() or k + 1 == len(self.views):
+                    scores.read()
+                    yield meter.progress(k + 1, len(model))
+        yield Scored(self.task, self.views, scores.values.cpu())
 
 
 def _check_labels(labels: NDArray[np.int64], model: Gaussians, spec: ScoreSpec) -> None:

@@ -8,7 +8,7 @@ import pytest
 from panolog.renderer import ops
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
-from panolog.workers.calibration import CalibrateSpec, calibrate
+from panolog.workers.calibration import CalibrateSpec
 from panolog.workers.events import Calibration
 from panolog.workers.specs import Value
 from panolog.workers.training.config import DensifyConfig, SkyConfig, TrainConfig
@@ -18,7 +18,7 @@ from tests.workers.trainings import threads
 
 def calibrated(folder: Path, *, most: int = 1_000, seconds: float = 10.0, **densify: float) -> Calibration:
     config = TrainConfig(sky=SkyConfig(count=50), densify=DensifyConfig.model_validate(densify))
-    *_, found = calibrate(spec_of(small_scene(folder), config=config, seconds=seconds, most=most))
+    *_, found = spec_of(small_scene(folder), config=config, seconds=seconds, most=most).run()
     assert isinstance(found, Calibration)
     return found
 
@@ -73,4 +73,4 @@ def test_masks_that_leave_nothing_are_refused_before_anything_is_trained(tmp_pat
         assert mask is not None
         cv2.imwrite(str(mask), np.zeros((WIDTH // 2, WIDTH), np.uint8))
     with pytest.raises(InputError, match="the masks leave nothing of 4 panoramas"):
-        list(calibrate(spec_of(scene)))
+        list(spec_of(scene).run())

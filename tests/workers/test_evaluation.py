@@ -10,7 +10,6 @@ from panolog.renderer.motion import moved
 from panolog.renderer.render import render_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
-from panolog.workers.evaluation import evaluate
 from panolog.workers.events import Evaluated, LpipsMissing, Progress
 from panolog.workers.tasks import EVAL
 from panolog.workers.training.initialise import scene_gaussians
@@ -20,7 +19,7 @@ from tests.workers.trainings import evaluation_of
 
 def test_each_view_has_its_metrics_and_its_render(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("panolog.workers.evaluation.load_lpips", lambda _: (None, "no lpips here"))
-    events = list(evaluate(evaluation_of(scene, scene_gaussians(scene), (4, 0))))
+    events = list(evaluation_of(scene, scene_gaussians(scene), (4, 0)).run())
     assert [type(event) for event in events] == [LpipsMissing, Evaluated, Progress, Evaluated, Progress]
     assert events[0] == LpipsMissing(EVAL, "no lpips here")
     first, last = events[1], events[-1]
@@ -58,7 +57,7 @@ def erring(folder: Path, gain: float = 1.0) -> tuple[Scene, Gaussians]:
 
 def fitted(scene: Scene, model: Gaussians) -> Evaluated:
     spec = evaluation_of(scene, model, pose_fit=0.2)
-    (event,) = (event for event in evaluate(spec) if isinstance(event, Evaluated))
+    (event,) = (event for event in spec.run() if isinstance(event, Evaluated))
     return event
 
 
@@ -77,7 +76,7 @@ def test_a_pose_that_errs_is_fitted_and_measured_beside_its_own(tmp_path: Path) 
     before, after = psnrs(event)
     assert after > before + 8
     assert event.pose_fit is not None and event.pose_fit["pixels"] == pytest.approx(2.1, abs=0.6)
-    plain = next(evaluate(evaluation_of(scene, model)))
+    plain = next(evaluation_of(scene, model).run())
     assert isinstance(plain, Evaluated)
     assert (plain.metrics, plain.png, plain.pose_fit) == (event.metrics, event.png, None)
 

@@ -16,7 +16,6 @@ from panolog.scene.depth_alignment import Alignment, align_depth
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import load_layers
 from panolog.scene.model import Scene
-from panolog.workers.evaluation import evaluate
 from panolog.workers.events import Evaluated
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
@@ -69,7 +68,7 @@ def without_masks(scene: Scene) -> Scene:
 
 
 def metrics(scene: Scene, model: Gaussians) -> dict[str, float | None]:
-    events = evaluate(evaluation_of(scene, model))
+    events = evaluation_of(scene, model).run()
     return next(event.metrics for event in events if isinstance(event, Evaluated))
 
 

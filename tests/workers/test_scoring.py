@@ -15,7 +15,7 @@ from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.workers.events import Progress, Scored
-from panolog.workers.scoring import ScoreSpec, _gradient, in_shards, score
+from panolog.workers.scoring import ScoreSpec, _gradient, in_shards
 from panolog.workers.specs import Value
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
@@ -62,7 +62,7 @@ def test_scores_are_those_of_the_definition(scene: Scene, sphere: bool) -> None:
     spec = replace(spec, config=TrainConfig.model_validate({"loss": {"sphere": sphere}}))
     means = spec.model.load().means
     before = means.clone()
-    *progress, last = score(spec)
+    *progress, last = spec.run()
     assert torch.equal(means, before) and not means.requires_grad
     assert isinstance(last, Scored)
     assert last.cameras == (0, 1, 3)
@@ -100,9 +100,9 @@ def test_a_view_that_is_masked_altogether_scores_zero(tmp_path: Path) -> None:
 def test_labels_must_fit(scene: Scene) -> None:
     spec = spec_of(scene)
     with pytest.raises(ValueError, match="labels for"):
-        list(score(replace(spec, labels=Value(spec.labels.load()[:-1]))))
+        list(replace(spec, labels=Value(spec.labels.load()[:-1])).run())
     with pytest.raises(ValueError, match="0 to 1"):
-        list(score(replace(spec, blocks=2)))
+        list(replace(spec, blocks=2).run())
 
 
 def test_gradients_that_are_not_finite_stop_the_run(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,7 +113,7 @@ def test_gradients_that_are_not_finite_stop_the_run(scene: Scene, monkeypatch: p
 
     monkeypatch.setattr("torch.autograd.grad", broken)
     with pytest.raises(RunError, match="pano_0"):
-        list(score(spec))
+        list(spec.run())
 
 
 @pytest.mark.parametrize(

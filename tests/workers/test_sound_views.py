@@ -9,9 +9,7 @@ import torch
 from panolog.scene.errors import ImageError, SceneError
 from panolog.scene.images import PanoramaCache
 from panolog.scene.model import Scene
-from panolog.workers.evaluation import evaluate
 from panolog.workers.events import Checkpoint, Evaluated, Event, LeftOut, Preview, Scored
-from panolog.workers.scoring import score
 from panolog.workers.sound_views import SoundViews
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE
@@ -111,7 +109,7 @@ def test_scoring_gives_damaged_panoramas_no_score(tmp_path: Path, damaged: tuple
         truncate(scene, row)
     model = scene_gaussians(scene)
     spec = score_of(scene, model, (1, 2, 3), config=CONFIG)
-    events = list(score(spec))
+    events = list(spec.run())
     left_out = [event.view for event in events if isinstance(event, LeftOut)]
     assert left_out == [f"pano_{row}.png" for row in damaged]
     scored = events[-1]
@@ -119,14 +117,14 @@ def test_scoring_gives_damaged_panoramas_no_score(tmp_path: Path, damaged: tuple
     assert scored.cameras == (1, 2, 3)
     assert [bool((row == 0).all()) for row in scored.scores] == [row in damaged for row in (1, 2, 3)]
     with pytest.raises(ImageError):
-        list(score(replace(spec, config=NONE)))
+        list(replace(spec, config=NONE).run())
 
 
 def test_evaluation_measures_the_rest(tmp_path: Path) -> None:
     scene = small_scene(tmp_path)
     truncate(scene, 3)
     spec = evaluation_of(scene, scene_gaussians(scene), (3, 4))
-    views = [event.view for event in evaluate(spec) if isinstance(event, LeftOut | Evaluated)]
+    views = [event.view for event in spec.run() if isinstance(event, LeftOut | Evaluated)]
     assert views == ["pano_3.png", "pano_4.png"]
     with pytest.raises(ImageError, match="0 of 1 panoramas may be left out"):
-        list(evaluate(replace(spec, views=(3,))))
+        list(replace(spec, views=(3,)).run())

@@ -15,7 +15,7 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Scored, Trained
-from panolog.workers.scoring import ScoreSpec, score
+from panolog.workers.scoring import ScoreSpec
 from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE, TaskId
@@ -79,7 +79,7 @@ def score_of(scene: Scene, model: Gaussians, views: tuple[int, ...], **fields: A
 
 def scored(spec: ScoreSpec) -> Tensor:
     """(views, blocks) the scores at the end of a task."""
-    *_, last = score(spec)
+    *_, last = spec.run()
     assert isinstance(last, Scored)
     return last.scores
 

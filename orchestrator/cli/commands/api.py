@@ -20,7 +20,7 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
-from panolog.workers import evaluation
+from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Checkpoint, Evaluated, Event, LeftOut, LpipsMissing
 from panolog.workers.loop.views import known_rows
 from panolog.workers.specs import Value
@@ -106,7 +106,7 @@ def evaluate(
     ['cc_lpips', 'cc_psnr']
     """
     scene = _scene(scene)
-    spec = evaluation.EvaluateSpec(
+    spec = EvaluateSpec(
         scene=Value(scene),
         views=known_rows(scene, scene.test if views is None else views, "views"),
         width=width or scene.width,
@@ -116,7 +116,7 @@ def evaluate(
         device=choose_device(device),
     )
     measured, reason, left_out = {}, None, {}
-    for event in evaluation.evaluate(spec):
+    for event in spec.run():
         if isinstance(event, LpipsMissing):
             reason = event.message
         if isinstance(event, Evaluated):

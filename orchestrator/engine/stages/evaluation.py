@@ -49,7 +49,7 @@ class Evaluation:
     seams: list[Seam] = field(default_factory=list)
 
     def add(self, event: Event) -> None:
-        """Takes an event of `workers.evaluate.evaluate`. Raises OSError if a picture cannot be written."""
+        """Takes an event of `EvaluateSpec.run`. Raises OSError if a picture cannot be written."""
         if isinstance(event, LpipsMissing):
             self.lpips_reason = event.message
         if isinstance(event, LeftOut) and event.view in self._held_out:
