@@ -19,7 +19,7 @@ from panolog.scene.gaussians import EXACT, Gaussians
 from panolog.workers.events import Checkpoint, Notice
 from panolog.workers.specs import Source
 from panolog.workers.tasks import TaskId
-from panolog.workers.training.optimizer import AVERAGE, MOMENT
+from panolog.workers.training.optimizer import AVERAGE, MOMENT, drawable
 
 _SUM = "crc32"  # in the metadata
 _ROWS = 2**16  # of a model in memory at a time
@@ -141,12 +141,5 @@ class SavedModel:
                     tensors = {name: (part / self.averaged).float() for name, part in tensors.items()}
                 sky = max(0, stop - max(start, self.count - self.sky))
                 piece = Gaussians(**tensors, sky=sky, exact=self.exact)
-                yield piece.select(_finite(piece) | (torch.arange(len(piece)) >= piece.scene.stop))
-
-
-def _finite(piece: Gaussians) -> torch.Tensor:
-    """(N,) which can be drawn: the others would have been removed at the next densification."""
-    valid = (piece.quats != 0).any(1)
-    for tensor in piece.tensors().values():
-        valid &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
-    return valid
+                # the others would have been removed at the next densification
+                yield piece.select(drawable(piece) | (torch.arange(len(piece)) >= piece.scene.stop))

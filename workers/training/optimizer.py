@@ -108,17 +108,21 @@ class ModelState:
 
     def drop_invalid(self) -> int:
         """Remove Gaussians with a parameter that is not finite or a zero quaternion; returns how many."""
-        tensors = self.gaussians.tensors()
-        valid = torch.ones(len(self.gaussians), dtype=torch.bool, device=self.gaussians.means.device)
-        for tensor in tensors.values():
-            valid &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
-        valid &= (self.gaussians.quats != 0).any(1)
+        valid = drawable(self.gaussians)
         invalid = len(valid) - int(valid.sum())
         if invalid:
             sky = int(valid[len(valid) - self.gaussians.sky :].sum())
             source = valid.nonzero()[:, 0]
             self.rearrange(source, torch.zeros_like(source, dtype=torch.bool), sky)
         return invalid
+
+
+def drawable(gaussians: Gaussians) -> Tensor:
+    """(N,) bool, the Gaussians whose parameters are finite and whose quaternion is not zero."""
+    valid = (gaussians.quats != 0).any(1)
+    for tensor in gaussians.tensors().values():
+        valid &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
+    return valid
 
 
 def gaussians_of(tensors: Mapping[str, Tensor]) -> Gaussians:
