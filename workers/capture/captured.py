@@ -1,7 +1,7 @@
 """What is known of how panoramas were captured, besides what their scene says; how later stages get it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -48,19 +48,11 @@ class Captured:
             panorama = replace(panorama, movers=self.movers[at])
         return panorama
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all parts."""
-        return sum(part.nbytes for part in self._parts().values())
-
-    def _parts(self) -> dict[str, Array]:
-        named = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: part for name, part in named.items() if part is not None}
-
     def save(self, path: Path) -> None:
         """Writes it by atomic rename. Raises OSError if the disk takes no file."""
+        parts = {name: part for name, part in vars(self).items() if part is not None}
         with atomic(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **self._parts())
+            np.savez_compressed(file, allow_pickle=False, **parts)
 
     @staticmethod
     def load(path: Path) -> "Captured":

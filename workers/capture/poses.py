@@ -115,7 +115,7 @@ class Poses:
         radians that one of the images is wide.
         """
         self._at = {row: at for at, row in enumerate(views)}
-        self._originals, self._metrics, self._bounds = originals, metrics, bounds
+        self._originals, self._metrics, self.bounds = originals, metrics, bounds
         self._schedule = schedule
         count = len(views)
         self._pixel = pixel
@@ -187,7 +187,7 @@ class Poses:
 
     def _bounded(self, at: int, motion: Array) -> Array:
         """A motion within the bound of its camera."""
-        angle, bound = self._metrics[at].angle(motion), self._bounds[at]
+        angle, bound = self._metrics[at].angle(motion), self.bounds[at]
         return motion if angle <= bound else motion * (bound / angle)
 
     def _hold_gauge(self) -> None:
@@ -208,14 +208,10 @@ class Poses:
         poses = [moved(*pose, motion) for pose, motion in zip(self._originals, self._motion, strict=True)]
         return np.stack([np.column_stack(pose) for pose in poses])
 
-    def bounds(self) -> Array:
-        """(V,) radians that each view may move at most."""
-        return self._bounds
-
     def at_bound(self) -> NDArray[np.bool_]:
         """(V,) which views would have moved on, if they could."""
         angles = [metric.angle(motion) for metric, motion in zip(self._metrics, self._motion, strict=True)]
-        return np.array(angles) >= _AT_BOUND * self._bounds
+        return np.array(angles) >= _AT_BOUND * self.bounds
 
     def tensors(self) -> dict[str, Tensor]:
         """For a checkpoint."""

@@ -155,9 +155,9 @@ def test_no_view_moves_farther_than_its_bound(scene: Scene) -> None:
     made = poses(scene, rate=5.0, most=2.0)
     pulled(made, motions(3, 1.0))
     angles = np.array([m.angle(x) for m, x in zip(made._metrics, made._motion, strict=True)])
-    assert (angles <= made.bounds() * (1 + 1e-9)).all()
+    assert (angles <= made.bounds * (1 + 1e-9)).all()
     assert made.at_bound().any()
-    assert made.bounds()[1:] == pytest.approx(2 * 2 * np.pi / 1024)
+    assert made.bounds[1:] == pytest.approx(2 * 2 * np.pi / 1024)
 
 
 def test_true_poses_stay(scene: Scene) -> None:
