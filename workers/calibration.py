@@ -185,12 +185,12 @@ def _grow(trainer: Trainer, target: int) -> None:
     }
     config = spec.config.densify.model_copy(update=everything)
     random = generator(spec.seed, str(spec.task), "grow", 0)
-    trainer.reset_statistics()
+    trainer.statistics = trainer.statistics.anew(trainer.state.gaussians.scene.stop)
     while (count := len(trainer.statistics.views)) and count < target:
         chosen = torch.from_numpy(random.permutation(count)[: target - count])
         trainer.statistics.gradient[chosen.to(spec.device)] = torch.inf
         densify(trainer.state, trainer.statistics, config, trainer.schedule.extent, random)
-        trainer.reset_statistics()
+        trainer.statistics = trainer.statistics.anew(trainer.state.gaussians.scene.stop)
 
 
 def _single_thread_seconds(trainer: Trainer, views: Sequence[int], grown: IterationCost) -> float:

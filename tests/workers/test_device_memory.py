@@ -29,7 +29,7 @@ from panolog.scene.random_streams import generator
 from panolog.scene.tensors.transfer import packed_bytes, unpack
 from panolog.workers import device_memory
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.densify import densify
+from panolog.workers.training.densify import Statistics, densify
 from panolog.workers.training.optimizer import ModelState
 from panolog.workers.training.pipeline import AHEAD
 from panolog.workers.training.trainer import Trainer
@@ -145,7 +145,7 @@ def training(scene: Scene, count: int, width: int, chosen: float) -> Iterator[tu
     with PanoramaCache(scene, scene.train, WIDTH, 2**20) as cache, on_card, memory:
         trainer = Trainer(spec, scene, cache)
         trainer.state = ModelState.start(model(count))
-        trainer.reset_statistics()
+        trainer.statistics = Statistics.zeros(trainer.state.gaussians.scene.stop, DEVICE, spec.config.densify)
         yield trainer, memory
 
 

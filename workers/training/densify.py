@@ -36,6 +36,10 @@ class Statistics:
         gradient, views, absolute = (torch.zeros(count, device=device) for _ in range(3))
         return Statistics(gradient, views, config, absolute if config.split_gradient > 0 else None)
 
+    def anew(self, count: int) -> "Statistics":
+        """Those of so many Gaussians before the first view, measured in the same way."""
+        return Statistics.zeros(count, self.gradient.device, self.config)
+
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor], config: DensifyConfig) -> "Statistics":
         """The inverse of `tensors`."""

@@ -88,15 +88,15 @@ class Growth:
         schedule, reset = self.schedule, self.schedule.config.reset
         last, invalid = iteration == schedule.iterations, 0
         if (schedule.ends_interval(iteration) or last) and (invalid := state.drop_invalid()):
-            statistics = self._anew(state, statistics)
+            statistics = statistics.anew(state.gaussians.scene.stop)
         if schedule.densifies(iteration):
             self._grow(state, statistics, iteration)
-            statistics = self._anew(state, statistics)
+            statistics = statistics.anew(state.gaussians.scene.stop)
         if schedule.resets(iteration):
             reset_opacities(state, reset.opacity)
         if last and schedule.drops_unrisen:
             drop_unrisen(state, reset.opacity)
-            statistics = self._anew(state, statistics)
+            statistics = statistics.anew(state.gaussians.scene.stop)
         return Grown(statistics, invalid)
 
     def _grow(self, state: ModelState, statistics: Statistics, iteration: int) -> None:
@@ -114,10 +114,6 @@ class Growth:
                 relocate(state, statistics, config, room, random)
             case _:
                 assert_never(config.method)
-
-    def _anew(self, state: ModelState, statistics: Statistics) -> Statistics:
-        """What is collected by row begins anew: the rows have changed."""
-        return Statistics.zeros(state.gaussians.scene.stop, statistics.gradient.device, statistics.config)
 
 
 def relocate(

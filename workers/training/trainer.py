@@ -165,7 +165,8 @@ class Trainer:
         self.state = ModelState.start(replace(gaussians, exact=self.exact).to(self.spec.device))
         given = self.centers, self.schedule, scene_length(self.scene)
         self.state.units = rate_units(self.state.gaussians.means, *given)
-        self.reset_statistics()
+        count, config = self.state.gaussians.scene.stop, self.spec.config.densify
+        self.statistics = Statistics.zeros(count, self.spec.device, config)
 
     def _first(self) -> Generator[Progress, None, Gaussians]:
         """What Stage I starts with."""
@@ -374,12 +375,6 @@ class Trainer:
             if invalid:
                 message = f"{invalid} Gaussians were not finite at iteration {iteration}: removed"
                 yield Notice(self.spec.task, message)
-
-    def reset_statistics(self) -> None:
-        """What is collected by row begins anew: the rows have changed."""
-        count, config = self.state.gaussians.scene.stop, self.spec.config.densify
-        self.statistics = Statistics.zeros(count, self.spec.device, config)
-        self.average.clear()
 
     def _preview(self) -> Preview:
         """A held-out panorama or the first training view as rendered now; of Stage I with a snapshot."""
