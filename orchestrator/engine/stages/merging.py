@@ -111,20 +111,26 @@ def join_districts(folder: RunFolder, scene: Scene, districts: Districts, iterat
     """
     started = time.monotonic()
     tasks = [TaskId.district(number) for number in range(districts.count)]
-    files = [(folder.model(task), districts.cell(task.number)) for task in tasks]
     learnt = [Captured.load(path) for task in tasks if (path := folder.captured(task)).exists()]
     if learnt:
         save_captured(folder, joined(learnt), scene)
-    sky = _mean([read_sky(path) for path, _ in files])
+    folder.make(folder.model(COARSE).parent)
+    files = [(folder.model(task), districts.cell(task.number)) for task in tasks]
+    return _saved(folder, COARSE, _join(folder.model(COARSE), files), iterations, started)
+
+
+def _join(path: Path, files: Sequence[tuple[Path, Volume | None]]) -> int:
+    """Writes what each file has in its cell, None = all, in order, and one sky; returns how many they are."""
+    sky = _mean([read_sky(file) for file, _ in files])
 
     def parts() -> Iterator[Gaussians]:
-        for path, cell in files:
-            yield from (retained(piece, cell, 0.0) for piece in read_ply_chunks(path))
+        for file, cell in files:
+            for piece in read_ply_chunks(file):
+                scenery = torch.arange(len(piece)) < piece.scene.stop
+                yield piece.select(scenery) if cell is None else retained(piece, cell, 0.0)
         yield sky
 
-    folder.make(folder.model(COARSE).parent)
-    count = _write(folder.model(COARSE), parts, len(sky), files[0][0])
-    return _saved(folder, COARSE, count, iterations, started)
+    return _write(path, parts, len(sky), files[0][0])
 
 
 def _mean(skies: Sequence[Gaussians]) -> Gaussians:
@@ -149,17 +155,7 @@ def merge_unfinished(
             found.append((folder.model(task), cell))
         elif folder.checkpoint(task).exists():
             found.append((write_saved(folder, task, scene), cell))
-    skies = [read_sky(path) for path, _ in found]
-    sky = skies[0] if len(skies) == 1 else _mean(skies)
-
-    def parts() -> Iterator[Gaussians]:
-        for path, cell in found:
-            for piece in read_ply_chunks(path):
-                scenery = piece.select(torch.arange(len(piece)) < piece.scene.stop)
-                yield scenery if cell is None else retained(scenery, cell, 0.0)
-        yield sky
-
-    _write(folder.point_cloud, parts, len(sky), found[0][0])
+    _join(folder.point_cloud, found)
     missing = len(tasks) - len(found)
     what = f"{missing} of {len(tasks)} districts were not begun: the model has nothing there"
     return [*([Noticed(MERGE, what)] if missing else []), _merged(folder, started)]
