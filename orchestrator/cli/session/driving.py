@@ -23,7 +23,7 @@ from panolog.orchestrator.engine.estimates.preflight import Preflight, examine, 
 from panolog.orchestrator.engine.scheduling.pool import Pool
 from panolog.orchestrator.engine.stages.captures import save_measured
 from panolog.orchestrator.engine.stages.first_look import first_look
-from panolog.orchestrator.engine.stages.measuring import Measuring
+from panolog.orchestrator.engine.stages.measuring import measure_captures
 from panolog.orchestrator.engine.stages.scenes import measured_scene
 from panolog.orchestrator.runs import folder as run_folder
 from panolog.orchestrator.runs import info as run_info
@@ -86,11 +86,11 @@ class Driving:
     def measure(self, info: RunInfo) -> None:
         """Measures how panoramas were captured, if Stage I is to learn that; shows the place before.
 
-        Raises SceneError as `Measuring`.
+        Raises SceneError as `measure_captures`.
         """
         reserve_own(self.journal)
         self._show_points(info.config)
-        measured = Measuring(self.scene, info.config, self._does, self._warn).found()
+        measured = measure_captures(self.scene, info.config, self._does, self._warn)
         self.journal.until_done(lambda: save_measured(self.folder, measured, self.scene))
 
     def preflight(self, workers: Pool, info: RunInfo) -> RunConfig:
@@ -115,8 +115,8 @@ class Driving:
         settings = found.config.model_dump(mode="json")
         done = PreflightSaved(folder.relative(folder.preflight), seconds, settings)
         if budget := journal.state.money.budget:
-            used = journal.state.money.until(time.time()).used.cost
-            require_enough(seconds, budget, workers.nodes(), used=used)
+            now = time.time()
+            require_enough(seconds, budget, workers.nodes(), now, journal.state.money.until(now).used.cost)
         lines = [_FAR.format(self.scene.offset)] if any(self.scene.offset) else []
         in_layers = look_at_layers(self.scene)
         lines += [*in_layers.lines, *in_layers.inverted, *([] if self.scene.test else [NOTHING_HELD_OUT])]

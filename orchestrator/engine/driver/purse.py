@@ -6,7 +6,6 @@ evaluation and delivery.
 
 import math
 import socket
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -122,7 +121,7 @@ def require_enough(
     estimate: Mapping[str, float | None],
     budget: BudgetSet,
     nodes: Sequence[Node],
-    now: float | None = None,
+    now: float,
     used: float = 0.0,
 ) -> None:
     """Raises ConfigError if a new run could not train at all within a budget.
@@ -137,7 +136,7 @@ def require_enough(
         cost = f"{rate * needed:.2g} {budget.prices.get('currency', '')}"
         spent = f", and {used:.2g} are used" if used else ""
         raise ConfigError(f"--max-cost {budget.max_cost:g}: {what}, which cost {cost}{spent}; give more")
-    left = math.inf if budget.deadline is None else budget.deadline - (time.time() if now is None else now)
+    left = math.inf if budget.deadline is None else budget.deadline - now
     if left <= needed:
         raise ConfigError(f"--deadline: {duration(max(0.0, left))} are left, and {what}; give more")
 

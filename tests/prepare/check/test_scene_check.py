@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.orchestrator.engine.stages.measuring import Measuring
+from panolog.orchestrator.engine.stages.measuring import measure_captures
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.state import ignore
 from panolog.prepare.check.blank import find_blank
@@ -167,7 +167,7 @@ def test_panoramas_of_one_color_are_named(town: Scene, tmp_path: Path) -> None:
     names = [town.panoramas[row].name for row in blank]
     found, warned = check_scene(scene), list[str]()
     assert list(found.blank) == names
-    Measuring(scene, RunConfig(width=64), ignore, warned.append).found()
+    measure_captures(scene, RunConfig(width=64), ignore, warned.append)
     said = " ".join(it for it in warned if "of one other colour" in it)
     assert all(name in found.problems[0] and name in said for name in names)
     others = [replace(it, mask=mask if row in blank else None) for row, it in enumerate(scene.panoramas)]

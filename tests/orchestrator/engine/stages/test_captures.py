@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 
 from panolog.orchestrator.engine.stages.captures import save_captured, save_measured
-from panolog.orchestrator.engine.stages.measuring import Measured, Measuring
+from panolog.orchestrator.engine.stages.measuring import Measured, measure_captures
 from panolog.orchestrator.engine.stages.movers import PICTURES, moving_share
 from panolog.orchestrator.engine.stages.scenes import learnt_scene, measured_scene
 from panolog.orchestrator.runs.config import RunConfig
@@ -48,7 +48,7 @@ def shaken(scene: Scene) -> Scene:
 def measured(scene: Scene, refine: bool | str) -> tuple[Measured, list[str]]:
     lines: list[str] = []
     config = RunConfig.model_validate({"poses": {"refine": refine}})
-    return Measuring(scene, config, lines.append, lines.append).found(), lines
+    return measure_captures(scene, config, lines.append, lines.append), lines
 
 
 def test_poses_that_do_not_fit_their_tracks_are_adjusted(truth: Scene, folder: RunFolder) -> None:

@@ -140,7 +140,7 @@ def test_a_limit_of_cost_counts_the_making_of_the_scene(
     assert (made["status"], made["stage"]) == ("failed", "prepare")
     assert made["money"]["used"]["cost"] > 1e-6
     with pytest.raises(ConfigError, match=r"--max-cost 1e-06: .*are used; give more"):
-        purse.require_enough({}, BudgetSet(max_cost=1e-6, prices={"currency": "USD"}), [], used=1e-6)
+        purse.require_enough({}, BudgetSet(max_cost=1e-6, prices={"currency": "USD"}), [], 0.0, used=1e-6)
     session.resume(folder.root, None, *work, wanted=Wanted(removed=frozenset({"max_cost"})))
     assert folder.point_cloud.exists()
     assert shown("status", folder.root)["money"]["used"]["cost"] > made["money"]["used"]["cost"]
