@@ -94,7 +94,7 @@ BlocksOption = Annotated[
     str | None, option("2x1x1|8|auto", "Blocks along x, y, z; so many balanced ones; or as many as it takes.")
 ]
 FrameOption = Annotated[
-    str,
+    Literal["export", "model"],
     option(
         "export|model",
         "Axes of FILE if it is no plain PLY: as `panolog export` writes it, or as the run's model.",
@@ -145,13 +145,6 @@ def wanted(
     from panolog.orchestrator.runs.money.prices import find_prices
 
     return Wanted.of(max_cost, deadline, find_prices(prices))
-
-
-def axes_of(frame: str) -> Literal["export", "model"]:
-    """The value of `FrameOption`. Raises InputError for any other."""
-    if frame not in ("export", "model"):
-        raise InputError(f"--frame {frame}: write export or model")
-    return "model" if frame == "model" else "export"
 
 
 def run_config(

@@ -248,9 +248,9 @@ def _check(given: dict[str, Any]) -> str:
             f"{output}: is a run already; {command('resume', output)} resumes it, or give another -o"
         )
     with progress_bar("checking the scene"):
-        from panolog.orchestrator.cli.session import session
+        from panolog.orchestrator.cli.session import preparing
 
-        session.check(given["source"], output, config, options)
+        preparing.found(given["source"], config, options).check_output(output)
     return str(config.device)
 
 

@@ -16,7 +16,6 @@ from panolog.orchestrator.cli.options import (
     ModelArg,
     PageOption,
     RunArg,
-    axes_of,
 )
 from panolog.orchestrator.cli.stores import opened
 from panolog.orchestrator.cli.usage import argument, flag, option
@@ -57,7 +56,7 @@ def evaluate(
         report = evaluate_run(
             run,
             model=model,
-            axes=axes_of(frame),
+            axes=frame,
             crop_bottom=crop_bottom,
             seams=seams,
             device=device,
@@ -101,7 +100,7 @@ def render(
             output,
             view,
             model=model,
-            axes=axes_of(frame),
+            axes=frame,
             poses=poses,
             frames=path,
             device=device,

@@ -149,7 +149,7 @@ def render_views(
         raise InputError(f"a video cannot have {size[0]}x{size[1]} pixels: both must be even")
     paths = [output / _VIDEO] if view.fps else _paths(output, views)
     _make(output)
-    draw = _drawer(shown, view, width, job.near if job else 0.0)
+    draw = _drawer(shown, view, lens, width, job.near if job else 0.0)
     with _video(paths[0], size, view.fps) if view.fps else _pictures(paths) as write:
         for done, pose in enumerate(views):
             progress("rendering", done, len(views))
@@ -228,9 +228,10 @@ def _make(output: Path) -> None:
         raise InputError(f"{output}: cannot be created: {error.strerror}") from error
 
 
-def _drawer(model: Gaussians, view: ViewSpec, width: int, near: float) -> Callable[[Pose], Image]:
-    """What renders a pose, where panoramas are `width` pixels wide."""
-    lens = view.lens(width)
+def _drawer(
+    model: Gaussians, view: ViewSpec, lens: Lens | None, width: int, near: float
+) -> Callable[[Pose], Image]:
+    """What renders a pose, as a panorama `width` pixels wide or through a lens."""
     if lens is None:
         return lambda pose: render_panorama(model, pose.rotation, pose.translation, width, near)
     direction = facing(view.yaw, view.pitch)

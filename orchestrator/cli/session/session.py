@@ -259,11 +259,6 @@ class _Beginning:
         return _retained(self.folder, self.journal, config)
 
 
-def check(source: preparing.Given, root: Path, config: RunConfig, options: Options) -> None:
-    """All that `start` checks before it makes anything. Raises InputError as it does."""
-    preparing.found(source, config, options).check_output(root)
-
-
 def estimate_run(
     scene: Scene, config: RunConfig, address: str | None, prices: PriceList | None = None
 ) -> "Preflight":
