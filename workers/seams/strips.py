@@ -16,6 +16,7 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.render import SH_DEGREE, render, to_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import exposed
+from panolog.scene.projection import rays_of_fractions
 from panolog.workers.metrics import decibel, sphere_weights
 
 _CHUNK = 2**18  # pixels whose points are in memory at a time
@@ -106,10 +107,7 @@ def _part(
 def directions(pixels: NDArray[np.int64], width: int) -> Array:
     """(P, 3) unit rays in camera axes of pixels of a panorama, row by row (app. B)."""
     v, u = np.divmod(pixels, width)
-    azimuth = ((u + 0.5) / width - 0.5) * 2 * np.pi
-    elevation = ((v + 0.5) / (width // 2) - 0.5) * np.pi
-    across = np.cos(elevation)
-    return np.stack([across * np.sin(azimuth), np.sin(elevation), across * np.cos(azimuth)], axis=1)
+    return rays_of_fractions((np.stack([u, v], axis=1) + 0.5) / (width, width // 2))
 
 
 @dataclass

@@ -171,7 +171,6 @@ def _needs(scene: "Scene", preflight: "Preflight") -> Iterator[Finding]:
 
     held_out = f"{len(scene.train)} to train on, {len(scene.test)} held out"
     estimate, cuda = preflight.estimate, preflight.config.device == "cuda"
-    need = gib(max(stage.device if cuda else stage.host for stage in estimate.stages))
     yield Finding("scene", f"{len(scene.panoramas)} panoramas {scene.width}x{scene.height}, {held_out}")
     yield Finding("sparse points", f"{len(scene.points):,}")
     for node in preflight.nodes:
@@ -184,7 +183,7 @@ def _needs(scene: "Scene", preflight: "Preflight") -> Iterator[Finding]:
     for stage in estimate.stages:
         yield Finding(STAGES[stage.name], stage_line(stage))
     yield Finding("Gaussians, roughly", f"{estimate.coarse:,} after Stage I, sky included")
-    yield Finding(f"{'GPU ' * cuda}memory of the job", f"about {need} for one task")
+    yield Finding(f"{'GPU ' * cuda}memory of the job", f"about {gib(estimate.memory)} for one task")
     yield Finding("disk of the job", f"about {gib(estimate.disk)} of {gib(preflight.free)} free here")
     yield Finding("time of the job", time_of(estimate.seconds))
     if preflight.problem:

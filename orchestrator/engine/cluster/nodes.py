@@ -37,7 +37,7 @@ class RayNodes:
         self.home: str = ray.get_runtime_context().get_node_id()
         self._known: dict[str, Node] = {}
         self._pending: dict[str, tuple[dict[str, Any], Any]] = {}
-        self._alive: frozenset[str] = frozenset()
+        self.ids: frozenset[str] = frozenset()  # Node.id of those that are alive, as of the last query
         self.queried = float("-inf")  # time.monotonic() of the last query
         self._draining: dict[str, int] = {}  # deadlines in milliseconds since the epoch, 0 = none
         self._query()
@@ -50,7 +50,7 @@ class RayNodes:
         if time.monotonic() - self.queried > _INTERVAL_S:
             self._query()
         self._collect()
-        nodes = (self._known[id] for id in sorted(self._alive) if id in self._known)
+        nodes = (self._known[id] for id in sorted(self.ids) if id in self._known)
         return tuple(node for node in nodes if node.cpus or node.gpus or node.id == self.home)
 
     def draining(self) -> dict[str, LeaveNotice]:
@@ -65,17 +65,12 @@ class RayNodes:
         """Whether the cluster has given a machine up."""
         if time.monotonic() - self.queried > _INTERVAL_S:
             self._query()
-        return id not in self._alive
-
-    @property
-    def ids(self) -> frozenset[str]:
-        """Node.id of those that are alive, as of the last query."""
-        return self._alive
+        return id not in self.ids
 
     @property
     def joining(self) -> int:
         """How many machines that are alive have not described themselves yet, as of the last query."""
-        return len(self._alive & self._pending.keys())
+        return len(self.ids & self._pending.keys())
 
     def refresh(self) -> None:
         """Queries Ray anew the next time: a machine may be gone."""
@@ -95,12 +90,12 @@ class RayNodes:
         # If the head does not answer, Ray itself ends this process (gcs_rpc_server_reconnect_timeout_s).
         self.queried = time.monotonic()
         raw = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
-        self._alive = frozenset(raw)
+        self.ids = frozenset(raw)
         # Ray's own libraries use this; its public list of nodes does not say it without a dashboard.
         self._draining = state.get_draining_nodes()
         if self.home not in raw:
             raise ClusterLostError("Ray has ended on the driver's machine: its raylet is lost")
-        for id in self._alive - self._known.keys() - self._pending.keys():
+        for id in self.ids - self._known.keys() - self._pending.keys():
             gpus = int(raw[id]["Resources"].get("GPU", 0))
             if id == self.home:  # asking takes a process of its own elsewhere
                 self._know(raw[id], *describe(gpus, self._name))

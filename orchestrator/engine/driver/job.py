@@ -114,14 +114,9 @@ class Specs:
     """
 
     def __init__(self, job: Job, sharing: Sharing) -> None:
-        self._job = job
+        self.job = job  # with the scene that the specs are of
         self._sharing = sharing
         self._known: dict[tuple[Path, int, int, float | None], Surroundings] = {}
-
-    @property
-    def job(self) -> Job:
-        """The job, with the scene that the specs are of."""
-        return self._job
 
     def of(self, task: TaskId) -> TrainSpec | ScoreSpec | EvaluateSpec:
         """The spec of a task.
@@ -131,14 +126,14 @@ class Specs:
         """
         match task.stage:
             case Stage.DISTRICT | Stage.COARSE:
-                return self._train(task, self._job.views(task), district=self._job.district(task))
+                return self._train(task, self.job.views(task), district=self.job.district(task))
             case Stage.SCORE:
-                views, reduces = self._job.shards[task.number], self._job.config.stage2.reduces
+                views, reduces = self.job.shards[task.number], self.job.config.stage2.reduces
                 return self._reduced(task, views) if reduces else self.score(task, views)
             case Stage.BLOCK | Stage.ROUND:
                 block = task.number
                 views, cell = self.plan.cameras(block), self.plan.cell(block)
-                compared = self._compared(block, self._job.config.stage2.compare)
+                compared = self._compared(block, self.job.config.stage2.compare)
                 initial = self._initial(task, (block,), (*views, *compared))
                 return self._train(task, views, initial, cell, compared=compared)
             case Stage.REPAIR:
@@ -146,8 +141,8 @@ class Specs:
             case Stage.MEASURE:
                 return self._measure(task)
             case Stage.EVAL:
-                crop = self._job.config.eval.crop_bottom
-                return self.evaluate(self._job.folder.point_cloud, crop, self.faces)
+                crop = self.job.config.eval.crop_bottom
+                return self.evaluate(self.job.folder.point_cloud, crop, self.faces)
             case Stage.PREPARE | Stage.CALIBRATE | Stage.PLAN | Stage.UNION | Stage.MERGE | Stage.DELIVER:
                 raise ValueError(f"{task} is not a task of a worker")
             case _:
@@ -155,12 +150,12 @@ class Specs:
 
     def score(self, task: TaskId, views: tuple[int, ...]) -> ScoreSpec:
         """The scores of some cameras with the Stage I model."""
-        return self._scored(task, views, self._job.folder.model(COARSE), self._labels)
+        return self._scored(task, views, self.job.folder.model(COARSE), self._labels)
 
     def _scored(
         self, task: TaskId, views: tuple[int, ...], model: Path, labels: Source[NDArray[np.int64]]
     ) -> ScoreSpec:
-        job, locate = self._job, self._locate(views, model)
+        job, locate = self.job, self._locate(views, model)
         return ScoreSpec(
             task=task,
             scene=self._part(views),
@@ -179,7 +174,7 @@ class Specs:
 
         Args: faces of the plan whose seams are measured too.
         """
-        scene, coarse = self._job.scene, self._job.folder.model(COARSE) if faces else None
+        scene, coarse = self.job.scene, self.job.folder.model(COARSE) if faces else None
         locate = self._locate((*scene.test, *(scene.train if faces else ())), *filter(None, (model, coarse)))
         seams = Seams(faces, self._plan, ModelFile(coarse, locate)) if coarse else None
         return self._evaluation(EVAL, scene.test, ModelFile(model, locate), seams, crop_bottom)
@@ -187,7 +182,7 @@ class Specs:
     def _evaluation(
         self, task: TaskId, views: tuple[int, ...], model: ModelFile, seams: Seams | None, crop_bottom: float
     ) -> EvaluateSpec:
-        job = self._job
+        job = self.job
         refined = job.folder.poses.exists() and bool(views)
         return EvaluateSpec(
             task=task,
@@ -206,7 +201,7 @@ class Specs:
 
     def _measure(self, task: TaskId) -> EvaluateSpec:
         """A shard of the evaluation, with levels of detail as fine as no metric shows."""
-        job, folder, (views, faces) = self._job, self._job.folder, self.measures[task.number]
+        job, folder, (views, faces) = self.job, self.job.folder, self.measures[task.number]
         looks = Looks.of(job.scene, self.plan, faces) if faces else Looks({}, {})
         models = {folder.seen(task): folder.point_cloud}
         if faces:
@@ -224,22 +219,22 @@ class Specs:
     @cached_property
     def faces(self) -> tuple[Plane, ...]:
         """Those whose seams are measured."""
-        config = self._job.config
-        planned = config.refine and self._job.folder.plan.exists()  # a run that has ended early may have none
+        config = self.job.config
+        planned = config.refine and self.job.folder.plan.exists()  # a run that has ended early may have none
         return most_seen(self.plan, self._seams, config.eval.seams) if planned else ()
 
     @cached_property
     def measures(self) -> tuple[tuple[tuple[int, ...], tuple[Plane, ...]], ...]:
         """The held-out panoramas or the faces of each shard of the evaluation; none where it is one task."""
-        if self._job.config.measured_detail is None:
+        if self.job.config.measured_detail is None:
             return ()
-        views = ((rows, ()) for rows in shards_of(self._job.scene.test, reduces=True))
+        views = ((rows, ()) for rows in shards_of(self.job.scene.test, reduces=True))
         return (*views, *(((), faces) for faces in in_shards(self.faces, FACES)))
 
     @cached_property
     def repaired(self) -> Regions:
         """What is near faces, each of which is trained once more if the settings have it."""
-        plan, passes = self.plan, self._job.config.passes
+        plan, passes = self.plan, self.job.config.passes
         faces = self._seams if passes.repair else ()
         return Regions(plan.aabb, plan.grid, faces, passes.reach * plan.baseline)
 
@@ -251,7 +246,7 @@ class Specs:
         """The tasks of each pass over the blocks' union."""
         blocks = np.flatnonzero(self.plan.trained).tolist()
         tasks = {Stage.ROUND: lambda: map(TaskId.round, blocks), Stage.REPAIR: self._repairs}
-        found = (tuple(map(str, tasks[stage]())) for stage in self._job.config.passes.stages)
+        found = (tuple(map(str, tasks[stage]())) for stage in self.job.config.passes.stages)
         return tuple(filter(None, found))
 
     def _repairs(self) -> Iterator[TaskId]:
@@ -262,12 +257,12 @@ class Specs:
     @cached_property
     def means(self) -> NDArray[np.float32]:
         """(N, 3) of the scene Gaussians of the Stage I model."""
-        return read_scene_means(self._job.folder.model(COARSE))
+        return read_scene_means(self.job.folder.model(COARSE))
 
     @cached_property
     def plan(self) -> Plan:
         """The partition, here."""
-        return read_plan(self._job.folder.plan)
+        return read_plan(self.job.folder.plan)
 
     def _compared(self, block: int, count: int) -> tuple[int, ...]:
         """At most so many panoramas that train a block, and as many others, on which it is compared."""
@@ -278,21 +273,21 @@ class Specs:
     @cached_property
     def _scores(self) -> csc_array:
         """(K, B) of the plan: read here, and only to compare blocks."""
-        return read_scores(self._job.folder.scores, self.plan.rows, self.plan.grid.count).tocsc()
+        return read_scores(self.job.folder.scores, self.plan.rows, self.plan.grid.count).tocsc()
 
     def _part(self, rows: tuple[int, ...]) -> Source[Scene]:
-        scene = self._job.scene
+        scene = self.job.scene
         if len(rows) >= len(scene.train):
             return self._whole
         return ScenePart(self._panoramas, scene.cloud_of(rows))
 
     @cached_property
     def _whole(self) -> Source[Scene]:
-        return self._sharing.put(self._job.scene)
+        return self._sharing.put(self.job.scene)
 
     @cached_property
     def _panoramas(self) -> Source[Scene]:
-        return self._sharing.put(self._job.scene.without_points())
+        return self._sharing.put(self.job.scene.without_points())
 
     @cached_property
     def _plan(self) -> Source[Plan]:
@@ -300,11 +295,11 @@ class Specs:
 
     @cached_property
     def _labels(self) -> Source[NDArray[np.int64]]:
-        return self._sharing.put(block_labels(self._job.scene, self.means, self._job.config))
+        return self._sharing.put(block_labels(self.job.scene, self.means, self.job.config))
 
     def _surroundings(self, *models: Path, detail: float | None = None) -> list[Surroundings]:
         """Those of models of the whole place, as their files are now; kept of the last ones."""
-        job, wanted = self._job, dict[tuple[Path, int, int, float | None], Path]()
+        job, wanted = self.job, dict[tuple[Path, int, int, float | None], Path]()
         for path in models:
             now = path.stat()
             wanted[path, now.st_ino, now.st_mtime_ns, detail] = path
@@ -316,7 +311,7 @@ class Specs:
 
     def _reduced(self, task: TaskId, views: tuple[int, ...]) -> ScoreSpec:
         """The same with levels of detail of the Stage I model."""
-        job, path = self._job, self._job.folder.seen(task)
+        job, path = self.job, self.job.folder.seen(task)
         job.folder.make(path.parent)
         (surroundings,) = self._surroundings(job.folder.model(COARSE))
         labels = self._sharing.put(surroundings.write_seen(path, job.scene.centers[list(views)]))
@@ -324,15 +319,15 @@ class Specs:
 
     def _repair(self, task: TaskId) -> TrainSpec:
         """What is near a face, on the panoramas of both of its blocks that are near it too."""
-        face, compare = self.repaired.faces[task.number], self._job.config.stage2.compare
+        face, compare = self.repaired.faces[task.number], self.job.config.stage2.compare
         views, checks = views_at(self.plan, face, compare)
         initial = self._initial(task, (face.below, face.above), (*views, *checks))
         return self._train(task, views, initial, self.repaired.margin(task.number), compared=checks)
 
     def _initial(self, task: TaskId, blocks: tuple[int, ...], views: tuple[int, ...]) -> Path:
         """The model that a task starts from. Args: blocks that it trains, or parts of; views it renders."""
-        folder, whole = self._job.folder, self._job.start(task)
-        if not self._job.config.stage2.reduces:
+        folder, whole = self.job.folder, self.job.start(task)
+        if not self.job.config.stage2.reduces:
             return folder.model(whole)
         path = folder.initial(task)
         if not path.exists():
@@ -351,9 +346,9 @@ class Specs:
         compared: tuple[int, ...] = (),
         district: Volume | None = None,
     ) -> TrainSpec:
-        job, path = self._job, self._job.folder.checkpoint(task)
+        job, path = self.job, self.job.folder.checkpoint(task)
         config = job.config.later(task.stage) if task.stage in job.config.passes.stages else job.config
-        saved, shown = path if path.exists() else None, shown_row(self._job.scene, cell or district)
+        saved, shown = path if path.exists() else None, shown_row(self.job.scene, cell or district)
         locate = self._locate((*views, *compared), *filter(None, (initial, saved)), shown=shown)
         return TrainSpec(
             task=task,
@@ -374,7 +369,7 @@ class Specs:
         )
 
     def _locate(self, views: Iterable[int], *made: Path, shown: int | None = None) -> Locate:
-        panoramas = self._job.scene.panoramas
+        panoramas = self.job.scene.panoramas
         picture = [] if shown is None else [panoramas[shown].image]
         files = (file for row in views for file in panoramas[row].files)
         return self._sharing.share_files((*files, *picture), made)

@@ -55,6 +55,11 @@ class Estimate:
         return None if None in seconds else sum(filter(None, seconds))
 
     @property
+    def memory(self) -> int:
+        """Bytes of the largest task, where it computes."""
+        return max(stage.device or stage.host for stage in self.stages)
+
+    @property
     def coarse(self) -> int:
         """Gaussians after Stage I, sky included."""
         return next(stage.gaussians for stage in self.stages if stage.name is Stage.COARSE)

@@ -65,7 +65,6 @@ class Preflight:
         }
 
     def summary(self) -> str:
-        memory = max(stage.device or stage.host for stage in self.estimate.stages)
         trained = [
             f"{_TRAINED[it.name]} {it.gaussians:,}" for it in self.estimate.stages if it.name in _TRAINED
         ]
@@ -73,7 +72,7 @@ class Preflight:
         divided = ", ".join(f"{key}={value}" for key, value in self.chosen.items() if key in DIVISIONS)
         return (
             f"{time_of(self.estimate.seconds)} with blocks {self.estimate.blocks},"
-            f" {gib(memory)} of memory for the largest task, {gib(self.estimate.disk)} of disk"
+            f" {gib(self.estimate.memory)} of memory for the largest task, {gib(self.estimate.disk)} of disk"
             f"; Gaussians, roughly: {', '.join(trained)}"
             + (f"; so that tasks fit into memory: {divided}" if divided else "")
             + (
@@ -111,7 +110,7 @@ def examine(
     """
 
     def need() -> int:
-        return _most_memory(_whole(scene, config, assumed(scene, config)))
+        return _whole(scene, config, assumed(scene, config)).memory
 
     joined = await_machine(pool, need, say, cuda=config.device == "cuda")
     basis = replace(calibrate(pool, scene, config), joined=joined)
@@ -148,7 +147,7 @@ def require_memory(scene: Scene | None, config: RunConfig) -> None:
     if scene is None or config.memory is None or config.memory * 2**30 >= device_memory.CONTEXT:
         return
     bare = change(config, {"densify.max_gaussians": 1, "cache.memory": config.memory})
-    least = math.ceil(10 * _most_memory(_whole(scene, bare, assumed(scene, bare))) / 2**30) / 10
+    least = math.ceil(10 * _whole(scene, bare, assumed(scene, bare)).memory / 2**30) / 10
     raise InputError(
         f"{scene.root}: --memory {config.memory:g}GiB is too little for any task: at --width {config.width}"
         f" give at least {least:g}GiB"
@@ -159,10 +158,6 @@ def _whole(scene: Scene, config: RunConfig, basis: Basis) -> Estimate:
     """Of a job on one machine, one task after another."""
     one = config if config.decided else change(config, {"blocks": "1x1x1"})
     return Estimator(scene, one, basis, ()).estimate()
-
-
-def _most_memory(estimate: Estimate) -> int:
-    return max(stage.device or stage.host for stage in estimate.stages)
 
 
 def _potential(
@@ -181,7 +176,7 @@ def _potential(
     )
     estimate = _whole(scene, config, basis)
     refining = [stage.seconds for stage in estimate.stages if stage.name is Stage.BLOCK]
-    return tuple(scaling.potential(_most_memory(estimate), sum(filter(None, refining)), nodes))
+    return tuple(scaling.potential(estimate.memory, sum(filter(None, refining)), nodes))
 
 
 def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[Node]) -> Estimator:

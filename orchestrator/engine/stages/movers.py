@@ -1,17 +1,17 @@
 """RUN/movers/: what Stage I takes for movers, as masks of their panoramas, and pictures of the worst ones."""
 
-import json
 from collections.abc import Iterator
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.runs.folder import RunFolder
+from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.image_files import decode_panorama
 from panolog.scene.model import Panorama, Scene
+from panolog.workers.metrics import sphere_weights
 
 PICTURES = 6  # panoramas with the largest movers that are shown
 _WIDTH, _QUALITY = 1024, 82  # pixels, at most, and JPEG quality of these
@@ -35,19 +35,15 @@ def write_movers(folder: RunFolder, scene: Scene) -> None:
         folder.make(path.parent)
         write_bytes(path, bytes(cv2.imencode(".png", mask)[1]))
     pictured = list(_pictures(folder, [scene.panoramas[row] for row in worst[:PICTURES]]))
-    content = {
-        "panoramas": [{"name": scene.panoramas[row].name, "share": share} for row, share in shares.items()],
-        "pictures": pictured,
-    }
-    write_bytes(folder.mover_shares, (json.dumps(content, indent=1) + "\n").encode())
+    named = [{"name": scene.panoramas[row].name, "share": share} for row, share in shares.items()]
+    write_json(folder.mover_shares, {"panoramas": named, "pictures": pictured})
 
 
 def moving_share(movers: NDArray[np.bool_] | None) -> float:
     """The part of the sphere that cells (h, w) of an equirectangular picture cover; 0 without any."""
     if movers is None:
         return 0.0
-    height = len(movers)
-    area = np.cos(((np.arange(height) + 0.5) / height - 0.5) * np.pi)
+    area = sphere_weights(len(movers))
     return float((movers.mean(axis=1) * area).sum() / area.sum())
 
 
