@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from panolog.orchestrator.cli.usage import argument, flag, option
 from panolog.scene.errors import InputError
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from panolog.orchestrator.runs.money.limits import Wanted
     from panolog.orchestrator.runs.preparation.settings import Options
 
+T = TypeVar("T")
 # Panels of the help, besides that of the basic options.
 _SETTINGS, _MACHINES, _TOLD = "Settings", "Machines and the driver", "Notifications and logs"
 BUDGET = "Cost and time (docs/money.md)"
@@ -109,17 +110,6 @@ UpOption = Annotated[
     _making("up|right|down|left", "Two lenses, not stitched: where up is in the first circle. Default: up."),
 ]
 FramesOption = Annotated[int | None, _making("N", "Video: take at most N frames of each.", min=2)]
-DistanceOption = Annotated[
-    tuple[str, str, float] | None,
-    _making("NAME NAME METRES", "Distance between two of them; sets the scale."),
-]
-TrajectoryOption = Annotated[Path | None, _making("FILE", "Known trajectory, TUM or CSV (docs/sfm.md).")]
-GpsOption = Annotated[
-    bool, flag("Scale and north from GPS in EXIF.", "--gps/--no-gps", panel=_MADE, show_default=False)
-]
-PartialOption = Annotated[
-    bool, flag("Accept poses of half of the panoramas or fewer.", "--partial", panel=_MADE)
-]
 
 
 def followed(
@@ -173,14 +163,53 @@ def run_config(
     return load_config(config, settings or (), flags)
 
 
-def preparation(
+def reconstruction(
     parallax: ParallaxOption = None,
     frames: FramesOption = None,
     up: UpOption = None,
-    distance: DistanceOption = None,
-    trajectory: TrajectoryOption = None,
-    gps: GpsOption = True,
-    partial: PartialOption = False,
+    distance: Annotated[
+        tuple[str, str, float] | None,
+        _making("NAME NAME METRES", "Distance between two of them; sets the scale."),
+    ] = None,
+    trajectory: Annotated[Path | None, _making("FILE", "Known trajectory, TUM or CSV (docs/sfm.md).")] = None,
+    gps: Annotated[
+        bool, flag("Scale and north from GPS in EXIF.", "--gps/--no-gps", panel=_MADE, show_default=False)
+    ] = True,
+    partial: Annotated[
+        bool, flag("Accept poses of half of the panoramas or fewer.", "--partial", panel=_MADE)
+    ] = False,
+) -> dict[str, Any]:
+    """The options that find poses: fields of `SfmSettings`, as far as they are not the defaults."""
+    values = {"parallax": parallax, "frames": frames, "up": up, "distance": distance}
+    values |= {"trajectory": trajectory, "gps": None if gps else False, "partial": partial or None}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def grouped(**groups: Callable[..., Any]) -> Callable[[Callable[..., T]], Callable[..., T]]:
+    """Replaces parameters of a function by the options of the functions that make their values."""
+    shared = {name: inspect.signature(make).parameters for name, make in groups.items()}
+
+    def replaced(command: Callable[..., T]) -> Callable[..., T]:
+        @wraps(command)
+        def wrapper(**options: Any) -> T:
+            made = {name: groups[name](**{one: options.pop(one) for one in shared[name]}) for name in groups}
+            return command(**made, **options)
+
+        parameters = [
+            new.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            for name, parameter in inspect.signature(command).parameters.items()
+            for new in (shared[name].values() if name in shared else (parameter,))
+        ]
+        wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # read by typer
+        wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        return wrapper
+
+    return replaced
+
+
+@grouped(sfm=reconstruction)
+def preparation(
+    sfm: dict[str, Any],
     nadir: Annotated[
         float | None,
         _making(
@@ -205,32 +234,6 @@ def preparation(
     """The options that make a scene of panoramas or a video, as far as they are not the defaults."""
     from panolog.orchestrator.runs.preparation.settings import Options
 
-    values = {"parallax": parallax, "frames": frames, "up": up, "distance": distance}
-    sfm: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
-    sfm |= {"trajectory": str(trajectory)} if trajectory is not None else {}
-    sfm |= {"gps": False} if not gps else {}
-    sfm |= {"partial": True} if partial else {}
+    sfm |= {"trajectory": str(sfm["trajectory"])} if "trajectory" in sfm else {}
     mask, depth = (None if model is None else str(model) for model in (mask_model, depth_model))
     return Options(sfm=sfm, nadir=nadir, static=static, mask_model=mask, depth_model=depth)
-
-
-def grouped(**groups: Callable[..., Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Replaces parameters of a command by the options of the functions that make their values."""
-    shared = {name: inspect.signature(make).parameters for name, make in groups.items()}
-
-    def replaced(command: Callable[..., None]) -> Callable[..., None]:
-        @wraps(command)
-        def wrapper(**options: Any) -> None:
-            made = {name: groups[name](**{one: options.pop(one) for one in shared[name]}) for name in groups}
-            command(**made, **options)
-
-        parameters = [
-            new.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-            for name, parameter in inspect.signature(command).parameters.items()
-            for new in (shared[name].values() if name in shared else (parameter,))
-        ]
-        wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # read by typer
-        wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-        return wrapper
-
-    return replaced

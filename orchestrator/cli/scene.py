@@ -2,24 +2,22 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
 from panolog.orchestrator.cli.options import (
     AnySceneArg,
-    DistanceOption,
     FramesOption,
-    GpsOption,
     JsonOption,
     LinkOption,
     NewSceneOption,
     ParallaxOption,
-    PartialOption,
     SceneArg,
-    TrajectoryOption,
     UpOption,
+    grouped,
+    reconstruction,
 )
 from panolog.orchestrator.cli.usage import Command, Group, argument, flag, option
 from panolog.scene.errors import InputError
@@ -123,11 +121,13 @@ def stitch(
 
 
 @app.command(cls=Command)
+@grouped(options=reconstruction)
 def sfm(
     source: Annotated[
         list[Path], argument("SOURCE...", "Folders of panoramas and 360° videos, one or several.")
     ],
     output: NewSceneOption,
+    *,
     into: Annotated[
         Path | None,
         option("SCENE", "Add them to this scene, of which nothing moves; -o gets both.", "--into"),
@@ -139,13 +139,7 @@ def sfm(
     mapper: Annotated[
         Literal["incremental", "global"], option("HOW", "Mapper: incremental or global.")
     ] = "incremental",
-    parallax: ParallaxOption = None,
-    frames: FramesOption = None,
-    up: UpOption = None,
-    distance: DistanceOption = None,
-    trajectory: TrajectoryOption = None,
-    gps: GpsOption = True,
-    partial: PartialOption = False,
+    options: dict[str, Any],
     link: LinkOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -153,21 +147,9 @@ def sfm(
     from panolog.orchestrator.runs.machines.machine import memory_of_preparation
     from panolog.prepare.sfm.joining.join import join_scene
     from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
-    from panolog.prepare.video.selection import PARALLAX
 
-    settings = SfmSettings(
-        pairing=pairs,
-        mapper=mapper,
-        partial=partial,
-        parts=partial,
-        gps=gps,
-        distance=distance,
-        parallax=PARALLAX if parallax is None else parallax,
-        frames=frames,
-        up=up,
-        link=link,
-        trajectory=trajectory,
-    )
+    parts = options.get("partial", False)
+    settings = SfmSettings(**options, pairing=pairs, mapper=mapper, parts=parts, link=link)
     with progress_bar("reading the panoramas", resumable=True) as show:
         free = memory_of_preparation()
         if into is not None:

@@ -114,7 +114,7 @@ def test_a_task_shows_the_most_central_held_out_panorama_of_its_part(
 ) -> None:
     """Stage I has the whole place, with more held-out panoramas than a block may have."""
     scene = replace(offer.job.scene, train=(0, 3), test=(1, 2, 4))
-    vars(offer.specs).update(_job=replace(offer.job, scene=scene))
+    offer.specs.job = replace(offer.job, scene=scene)
     offer.specs.plan.cell = lambda _: Half(least)  # type: ignore[method-assign, assignment, return-value]
     block, coarse = offer.specs.of(TaskId.block(0)), offer.specs.of(COARSE)
     assert isinstance(block, TrainSpec) and isinstance(coarse, TrainSpec)
