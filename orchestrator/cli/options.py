@@ -2,12 +2,13 @@
 
 import inspect
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from panolog.orchestrator.cli.usage import argument, flag, option
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from panolog.orchestrator.runs.config import RunConfig
@@ -22,6 +23,7 @@ _MADE = "Panoramas or a video instead of a scene"
 _setting, _machine, _note, _limit, _making = (
     partial(option, panel=panel) for panel in (_SETTINGS, _MACHINES, _TOLD, BUDGET, _MADE)
 )
+_RESUMES = 10  # of a supervisor in a row without progress
 HTML = (".html", ".htm")  # endings of a page that is one file
 
 
@@ -58,23 +60,6 @@ LinkOption = Annotated[bool, flag("Link the panoramas instead of copying them.",
 AddressOption = Annotated[
     str | None, _machine("HOST:PORT|auto", "Ray cluster to run on. Default: this machine.")
 ]
-NiceOption = Annotated[
-    int | None, _machine("N", "Let other programs go first: 0 to 19. Default: 0.", min=0, max=19)
-]
-DashboardOption = Annotated[
-    bool, flag("Show the run in the browser while it runs.", "--dashboard", panel=_MACHINES)
-]
-SuperviseOption = Annotated[
-    bool,
-    flag(
-        "Resume the run when its driver is killed or crashes, or its cluster is lost.",
-        "--supervise",
-        panel=_MACHINES,
-    ),
-]
-ResumesOption = Annotated[
-    int | None, _machine("N", "With --supervise: resumes in a row without progress. Default: 10.", min=1)
-]
 NotifyOption = Annotated[
     list[str] | None,
     _note("KIND:URL", "Notify by webhook, slack, ntfy or mail (docs/notifications.md); repeatable."),
@@ -110,6 +95,48 @@ UpOption = Annotated[
     _making("up|right|down|left", "Two lenses, not stitched: where up is in the first circle. Default: up."),
 ]
 FramesOption = Annotated[int | None, _making("N", "Video: take at most N frames of each.", min=2)]
+
+
+@dataclass(frozen=True)
+class DriverOptions:
+    """How this machine drives a run."""
+
+    address: str | None  # of a Ray cluster
+    nice: int | None
+    dashboard: bool
+    resumes: int | None  # of a supervisor, in a row without progress; None = there is no supervisor
+
+    def words(self) -> list[str]:
+        """Options with these values, without those of a supervisor."""
+        values = {"--address": self.address, "--nice": self.nice}
+        given = [str(word) for name, value in values.items() if value is not None for word in (name, value)]
+        return given + ["--dashboard"] * self.dashboard
+
+
+def driving(
+    address: AddressOption = None,
+    nice: Annotated[
+        int | None, _machine("N", "Let other programs go first: 0 to 19. Default: 0.", min=0, max=19)
+    ] = None,
+    dashboard: Annotated[
+        bool, flag("Show the run in the browser while it runs.", "--dashboard", panel=_MACHINES)
+    ] = False,
+    supervise: Annotated[
+        bool,
+        flag(
+            "Resume the run when its driver is killed or crashes, or its cluster is lost.",
+            "--supervise",
+            panel=_MACHINES,
+        ),
+    ] = False,
+    max_resumes: Annotated[
+        int | None, _machine("N", "With --supervise: resumes in a row without progress. Default: 10.", min=1)
+    ] = None,
+) -> DriverOptions:
+    """The values of these options. Raises ConfigError for a limit of resumes without a supervisor."""
+    if max_resumes is not None and not supervise:
+        raise ConfigError(f"--max-resumes {max_resumes}: only with --supervise, which resumes; add it")
+    return DriverOptions(address, nice, dashboard, (max_resumes or _RESUMES) if supervise else None)
 
 
 def followed(

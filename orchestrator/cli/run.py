@@ -24,14 +24,12 @@ from panolog.orchestrator.cli.options import (
     AddressOption,
     AnyRunArg,
     AtEndOption,
-    DashboardOption,
+    DriverOptions,
     JsonOption,
     LocalOption,
-    NiceOption,
     PricesOption,
-    ResumesOption,
     SourcesArg,
-    SuperviseOption,
+    driving,
     followed,
     grouped,
     preparation,
@@ -47,21 +45,16 @@ if TYPE_CHECKING:
     from panolog.orchestrator.runs.preparation.settings import Options
 
 _POLL = 0.5  # seconds between two reads of a live run
-_RESUMES = 10  # of a supervisor in a row without progress
 
 
-@grouped(config=run_config, options=preparation, targets=followed, budget=wanted)
+@grouped(config=run_config, options=preparation, driver=driving, targets=followed, budget=wanted)
 def run(
     source: SourcesArg,
     output: Annotated[str, option("RUN", "Folder or URL of the new run.", "--output", "-o")],
     *,
     config: "RunConfig",
     options: "Options",
-    address: AddressOption = None,
-    nice: NiceOption = None,
-    dashboard: DashboardOption = False,
-    supervise: SuperviseOption = False,
-    max_resumes: ResumesOption = None,
+    driver: DriverOptions,
     targets: tuple[list[str], list[str]],
     local: LocalOption = None,
     budget: "Wanted",
@@ -72,30 +65,26 @@ def run(
     from panolog.orchestrator.runs.config import as_settings
     from panolog.orchestrator.runs.preparation.settings import as_arguments
 
-    driver = _driver_options(address, nice, dashboard=dashboard)
     code, state = 0, None
     with when_ended(at_end, _complain) as begun:
         with mirrored(output, local) as root, _followed(root, *targets):
             begun(root)
-            if _supervised(max_resumes, supervise=supervise):
+            if driver.resumes is not None:
                 first = ["run", *source, "-o", str(root), *as_settings(config), *as_arguments(options)]
-                code = _supervise(root, first, driver, budget.options(), address, max_resumes)
+                code = _supervise(root, first, driver, driver.resumes, budget.options())
             else:
-                with _session(root, output, dashboard=dashboard) as (session, show):
+                with _session(root, output, dashboard=driver.dashboard) as (session, show):
                     given = source if len(source) > 1 else source[0]
-                    state = session.start(given, root, config, address, show, None, nice, options, budget)
+                    machine = driver.address, show, None, driver.nice
+                    state = session.start(given, root, config, *machine, options, budget)
         _end(root, code, state)
 
 
-@grouped(targets=followed, budget=wanted)
+@grouped(driver=driving, targets=followed, budget=wanted)
 def resume(
     run: AnyRunArg,
     *,
-    address: AddressOption = None,
-    nice: NiceOption = None,
-    dashboard: DashboardOption = False,
-    supervise: SuperviseOption = False,
-    max_resumes: ResumesOption = None,
+    driver: DriverOptions,
     targets: tuple[list[str], list[str]],
     local: LocalOption = None,
     force: Annotated[
@@ -112,20 +101,19 @@ def resume(
     from panolog.orchestrator.runs.folder import RunFolder
     from panolog.orchestrator.runs.info import read_info
 
-    options = _driver_options(address, nice, dashboard=dashboard)
     code, state = 0, None
     with when_ended(at_end, _complain) as begun:
         with mirrored(run, local, resumes=True, force=force, mirror=not has_mirror) as root:
             begun(root)
             read_info(RunFolder(root))  # fails before torch is imported
             with _followed(root, *targets):
-                if _supervised(max_resumes, supervise=supervise):
+                if driver.resumes is not None:
                     first = ["resume", str(root), "--has-mirror"]
                     once = budget.options() + ["--accept-changes"] * accept_changes
-                    code = _supervise(root, first, options, once, address, max_resumes)
+                    code = _supervise(root, first, driver, driver.resumes, once)
                 else:
-                    with _session(root, run, dashboard=dashboard) as (session, show):
-                        given = (root, address, show, None, nice, after, budget)
+                    with _session(root, run, dashboard=driver.dashboard) as (session, show):
+                        given = (root, driver.address, show, None, driver.nice, after, budget)
                         state = session.resume(*given, accept_changes=accept_changes)
         _end(root, code, state)
 
@@ -268,35 +256,12 @@ def _print_events(run: Path, *, follow: bool) -> None:
         time.sleep(_POLL)
 
 
-def _driver_options(address: str | None, nice: int | None, *, dashboard: bool) -> list[str]:
-    """Those of `run` and `resume` that are about this machine and not about the run."""
-    values = {"--address": address, "--nice": nice}
-    given = [str(word) for name, value in values.items() if value is not None for word in (name, value)]
-    return given + ["--dashboard"] * dashboard
-
-
-def _supervised(limit: int | None, *, supervise: bool) -> bool:
-    """Whether a supervisor is wanted. Raises ConfigError for a limit without one."""
-    from panolog.scene.errors import ConfigError
-
-    if limit is not None and not supervise:
-        raise ConfigError(f"--max-resumes {limit}: only with --supervise, which resumes; add it")
-    return supervise
-
-
-def _supervise(
-    root: Path,
-    first: list[str],
-    options: list[str],
-    limits: list[str],
-    address: str | None,
-    limit: int | None,
-) -> int:
+def _supervise(root: Path, first: list[str], driver: DriverOptions, resumes: int, limits: list[str]) -> int:
     """Runs drivers as children of this process. Returns the exit code of the last one."""
     from panolog.orchestrator.cli.session.supervise import Supervised, supervise
 
-    first, options = [*first, *options, *limits], [*options, "--has-mirror"]
-    return supervise(Supervised(root, first, options, limits, address, limit or _RESUMES, _complain))
+    first, later = [*first, *driver.words(), *limits], [*driver.words(), "--has-mirror"]
+    return supervise(Supervised(root, first, later, limits, driver.address, resumes, _complain))
 
 
 def _complain(line: str) -> None:

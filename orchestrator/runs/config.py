@@ -108,13 +108,8 @@ _FORMER: Mapping[str, Any] = {
 }
 # Settings of older versions that no recipe used, as runs have them that did not either.
 _WITHOUT_EFFECT: Mapping[str, Any] = {
-    **{
-        "densify.large": "extent",
-        "densify.scale_decay": 0.0,
-        "depth.max_residual": 0.5,
-        "depth.min_points": 20,
-    },
-    **{"exposure.offset": False, "pyramid.steps": [], "sky.train_scales": False, "stage2.reset": "all"},
+    **{"densify.large": "extent", "densify.scale_decay": 0.0, "exposure.offset": False, "pyramid.steps": []},
+    **{"depth.max_residual": 0.5, "depth.min_points": 20, "sky.train_scales": False, "stage2.reset": "all"},
 }
 _FORMER_EXTERIOR = {"train": "full", "fixed": "frozen"}  # of stage2.exterior
 

@@ -37,7 +37,7 @@ class Statistics:
         return Statistics(gradient, views, config, absolute if config.split_gradient > 0 else None)
 
     def anew(self, count: int) -> "Statistics":
-        """Those of so many Gaussians before the first view, measured in the same way."""
+        """Statistics of so many Gaussians before the first view, measured in the same way."""
         return Statistics.zeros(count, self.gradient.device, self.config)
 
     @staticmethod
