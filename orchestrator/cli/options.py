@@ -207,7 +207,7 @@ def reconstruction(
     ] = False,
 ) -> dict[str, Any]:
     """The options that find poses: fields of `SfmSettings`, as far as they are not the defaults."""
-    values = {"parallax": parallax, "frames": frames, "up": up, "distance": distance}
+    values: dict[str, Any] = {"parallax": parallax, "frames": frames, "up": up, "distance": distance}
     values |= {"trajectory": trajectory, "gps": None if gps else False, "partial": partial or None}
     return {name: value for name, value in values.items() if value is not None}
 
