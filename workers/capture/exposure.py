@@ -61,7 +61,7 @@ class Exposures:
         by_factor = -r / s.clamp(min=_LEAST)
         rate = (2 / (3 + self._visits[at])).clamp(min=_SLOWEST)  # late visits even out each other's noise
         values = self._values.clone()
-        values[at, 0] += (CURVE * by_factor / factor * rate).clamp(-0.5, 0.5)
+        values[at, 0].add_((CURVE * by_factor / factor * rate).clamp(-0.5, 0.5))
         learnt = values[:, 0] - self._start[:, 0]
         learnt = (learnt - learnt.mean(0)).clamp(-_MOST, _MOST)
         values = torch.stack([self._start[:, 0] + learnt, values[:, 1]], dim=1)
