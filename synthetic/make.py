@@ -3,7 +3,7 @@
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -88,11 +88,16 @@ def make_town(
 ) -> Path:
     """Ray-casts a small town, seen on a walk along its street; arguments and errors as `make_place`."""
     _check(panoramas, width)
-    shapes = town(seed)
-    place = Place(Scenery(shapes), Sun.over(shapes, sun()), *camera_path(panoramas, seed), "street")
+    place = Place(*_lit_town(seed), *camera_path(panoramas, seed), "street")
     return make_place(
         folder, place, width=width, points=points, seed=seed, between=between, progress=progress
     )
+
+
+@lru_cache(maxsize=1)  # the shadows take longer than the panoramas of a small trial or test
+def _lit_town(seed: int) -> tuple[Scenery, Sun]:
+    shapes = town(seed)
+    return Scenery(shapes), Sun.over(shapes, sun())
 
 
 def make_flight(

@@ -8,6 +8,7 @@ their bounds between the groups.
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
@@ -102,13 +103,14 @@ def _optimum(weights: Doubles, sums: Doubles, groups: Integers, size: int) -> In
     begin = begin.clip(0)
     own = np.where(inside, mass[:, None] - mass[begin], 1)
     gains = np.where(inside, np.square(moment[:, None] - moment[begin]) / own, -np.inf)
-    best = np.full(count + 1, -np.inf)
-    best[0] = 0
+    best = np.full(_WIDEST + count + 1, -np.inf)  # after as many rows as a cluster may have before the first
+    best[_WIDEST] = 0
+    before = sliding_window_view(best[:-1], _WIDEST)[:, ::-1]  # (count + 1, _WIDEST), as `begin`
     widths = np.empty((size, count + 1), np.uint8)
     for cluster in range(size):
-        reached = best[begin] + gains
+        reached = before + gains
         widths[cluster] = reached.argmax(axis=1)
-        best = reached[np.arange(count + 1), widths[cluster]]
+        best[_WIDEST:] = reached[np.arange(count + 1), widths[cluster]]
     found = [count]
     for cluster in range(size - 1, -1, -1):
         found.append(found[-1] - 1 - int(widths[cluster, found[-1]]))

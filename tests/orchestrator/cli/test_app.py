@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines.nodes import Node
 from panolog.orchestrator.runs.records import Noticed, Progressed, RunBegan, TaskStarted
 from panolog.scene.errors import RunError
@@ -158,6 +159,7 @@ def test_a_plan_that_is_tried_says_what_it_needs_and_where_it_is(
     assert result.exit_code == 0, result.output
     assert re.search(r"^Stage II on this machine: .*GiB of memory, (about|time)", result.stdout, re.MULTILINE)
     assert result.stdout.endswith(f"written to {tmp_path / 'out' / 'partition'}\n")
+    assert RunFolder(tmp_path / "out").plan_picture.read_bytes().startswith(b"\x89PNG")
     end = "not written; give --output FOLDER to keep it\n"
     assert call("partition", root, "--tau", "1").stdout.endswith(end)
     for output in (run, root):

@@ -103,12 +103,12 @@ def test_a_mistake_is_found_where_it_is(tmp_path: Path) -> None:
 
 def test_a_long_list_takes_the_memory_of_its_members(tmp_path: Path) -> None:
     path, last = tmp_path / "x.json", dict[str, str]()
-    path.write_text('{"many": [' + '{"key": 1, "value": [1.5, 2.5]},' * 100_000 + "{}]}")
+    path.write_text('{"many": [' + '{"key": 1, "value": [1.5, 2.5]},' * 30_000 + "{}]}")
     tracemalloc.start()
     load_json_in_pieces(path, "many", lambda node: last.update(field=node.field), 8_000_000)
     assert tracemalloc.get_traced_memory()[1] < 8_000_000
     tracemalloc.stop()
-    assert last == {"field": "many[100000]"}
+    assert last == {"field": "many[30000]"}
 
 
 def test_openmvg_is_refused_only_where_its_observations_do_not_fit(tmp_path: Path) -> None:
