@@ -5,19 +5,22 @@ import sys
 
 import pytest
 
-PROGRAMS = {
-    **{
-        f"{module} loads OpenCV before pycolmap: in the other order it cannot write a PNG": f"""
-import sys, panolog.prepare.{module}, cv2, numpy
+_ORDER = """
+import sys, panolog.prepare.{}, cv2, numpy
 assert list(sys.modules).index("cv2") < list(sys.modules).index("pycolmap")
 cv2.imencode(".png", numpy.zeros((8, 8, 3), numpy.uint8))
 """
-        for module in ("world.gps", "sfm.triangulate")
-    },
-    "pycolmap does not take the signal by which a run is stopped": """
+PROGRAMS = {
+    "world.gps loads OpenCV before pycolmap: in the other order it cannot write a PNG": _ORDER.format(
+        "world.gps"
+    ),
+    "so does sfm.triangulate, and pycolmap does not take the signal by which a run is stopped": """
 import os, signal
 seen = []
 signal.signal(signal.SIGTERM, lambda *_: seen.append("handled"))
+"""
+    + _ORDER.format("sfm.triangulate")
+    + """
 import panolog.prepare.check.bundle
 import panolog.prepare.sfm.pipeline
 os.kill(os.getpid(), signal.SIGTERM)
