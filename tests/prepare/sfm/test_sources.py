@@ -129,16 +129,17 @@ def test_what_is_left_out_is_in_the_refusal(tmp_path: Path) -> None:
         ((64, 64), "512 x 512 pixels are not 2:1: not a panorama; it shows one fisheye circle; stitch it"),
     ],
 )
-def test_fisheye_circles_are_refused_by_name(shape: tuple[int, int], words: str, tmp_path: Path) -> None:
+def test_fisheye_circles_are_refused_by_name(
+    shape: tuple[int, int], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Poses were found for two circles as if they were a panorama; one among six was 79 degrees off."""
     scale, folder = 8, tmp_path / "images"
-    _pictures(folder)
-    for seed, path in enumerate(folder.iterdir()):
-        cv2.imwrite(str(path), np.random.default_rng(seed).integers(60, 255, (64 * scale, 128 * scale, 3)))
+    _pictures(folder, *[(64 * scale, 128 * scale)] * 3)
     height, width = (scale * size for size in shape)
     side = min(height, width)
     y, x = (np.mgrid[:height, :width] + 0.5) % side / side * 2 - 1
     circles = np.where(np.hypot(x, y) < 1, np.random.default_rng(0).integers(60, 255, (height, width)), 0)
     cv2.imwrite(str(folder / "1.png"), circles)
+    monkeypatch.setattr("panolog.prepare.sfm.features.processes_for", lambda *_: 1)
     with pytest.raises(InputError, match=f"1.png: {words}"):
         make_scene(folder, tmp_path / "scene", SfmSettings(), no_progress)
