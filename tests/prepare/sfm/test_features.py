@@ -77,4 +77,4 @@ def test_a_panorama_that_no_process_survives_is_named(
 ) -> None:
     monkeypatch.setattr(features, "features_of", always_killed)
     with pytest.raises(RunError, match=r"pano\.jpg: the process that finds its features was killed"):
-        list(features._in_processes([(tmp_path / "pano.jpg", [])], 2))
+        list(features._in_processes([(tmp_path / "pano.jpg", [])], 1))
