@@ -1,19 +1,18 @@
 """Errors survive a process boundary, and fit on one line; the extras are those of pyproject.toml."""
 
-import ast
 import pickle
 import re
 import sys
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import packages_distributions
-from pathlib import Path
 
+import grimp
 import pytest
 
 from panolog.scene import errors
 from panolog.scene.errors import PACKAGES, MissingPackageError, explained, require
-from tests.structure.rules import ROOMS, ROOT
+from tests.structure.rules import ROOT
 
 
 @pytest.mark.parametrize(
@@ -81,15 +80,11 @@ def test_every_package_that_a_module_imports_is_declared() -> None:
     names = [*PROJECT["dependencies"], *(it for extra in EXTRAS.values() for it in extra), "markupsafe"]
     declared = {re.split(r"[^\w.-]", name)[0].lower() for name in names}
     declared |= {"cuda", "mlflow"}  # namespaces of cuda-core and mlflow-skinny
-    imported: dict[str, Path] = {}
-    for file in (path for room in ROOMS for path in (ROOT / room).rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text())):
-            found = [it.name for it in node.names] if isinstance(node, ast.Import) else []
-            found += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
-            imported |= {name.partition(".")[0]: file for name in found}
-    for module in set(imported) - {"panolog"} - sys.stdlib_module_names:
+    graph = grimp.build_graph("panolog", include_external_packages=True, cache_dir=None)
+    others = {module for module in graph.modules if module.partition(".")[0] != "panolog"}
+    for module in others - sys.stdlib_module_names:
         ours = {distribution(module), module, module.replace("_", "-")}
-        assert not ours.isdisjoint(declared), (module, imported[module])
+        assert not ours.isdisjoint(declared), (module, graph.find_modules_that_directly_import(module))
 
 
 def test_a_missing_package_is_one_line_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
