@@ -156,10 +156,10 @@ def test_a_margin_has_what_is_nearer_to_its_face_than_the_reach_and_to_no_other_
     faces, points = planes_between(cells), places(1)
     regions = Regions(BOX, cells, faces, reach=1.0)
     found, own = regions.of(points), cells.block_of(contract(points, BOX))
-    for point, region, cell in zip(points, found, own, strict=True):
-        offsets = [abs(face.offsets(point[None], BOX)[0]) for face in faces]
-        around = {i: offsets[i] for i, face in enumerate(faces) if cell in (face.below, face.above)}
-        near = {i: offset for i, offset in around.items() if offset < 1.0}
+    offsets = np.abs([face.offsets(points, BOX) for face in faces]).reshape(len(faces), len(points))
+    for away, region, cell in zip(offsets.T, found, own, strict=True):
+        around = [i for i, face in enumerate(faces) if cell in (face.below, face.above)]
+        near = {i: away[i] for i in around if away[i] < 1.0}
         if region >= len(faces):
             assert not near and region == len(faces) + cell
         else:

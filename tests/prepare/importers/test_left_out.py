@@ -148,23 +148,25 @@ def test_nerfstudio_without_what_others_write(tmp_path: Path) -> None:
         import_scene(source, tmp_path / "other")
 
 
-@pytest.mark.parametrize("case", ["spheresfm", "opensfm", "metashape", "openmvg", "nerfstudio", "poses"])
+Split = tuple[dict[str, str], tuple[int, ...], str]  # files with numbers of panoramas; the test split, a note
+SPLITS: list[Split] = [
+    ({"train": "0 1 2 3", "test": "4 5"}, (4, 5), ""),
+    ({"train": "0 1 2", "test": "4"}, (4,), "2 panoramas (pano_03, pano_05): not used"),
+    ({"test": "4 5"}, (4, 5), ""),
+    ({"train": "0 1 2 3"}, (4, 5), ""),
+    ({"test": "4 7 8"}, (4,), "2 names (pano_07, pano_08) of the source's split: left out"),
+    ({"test": "7"}, (0,), "the source's split is left out"),
+    ({"train": "0 1 2", "test": "2 3"}, (0,), "the source's split is left out"),
+]
+FORMATS = ["spheresfm", "opensfm", "metashape", "openmvg", "nerfstudio"]
+
+
 @pytest.mark.parametrize(
-    ("files", "test", "note"),
-    [
-        ({"train": "0 1 2 3", "test": "4 5"}, (4, 5), ""),
-        ({"train": "0 1 2", "test": "4"}, (4,), "2 panoramas (pano_03, pano_05): not used"),
-        ({"test": "4 5"}, (4, 5), ""),
-        ({"train": "0 1 2 3"}, (4, 5), ""),
-        ({"test": "4 7 8"}, (4,), "2 names (pano_07, pano_08) of the source's split: left out"),
-        ({"test": "7"}, (0,), "the source's split is left out"),
-        ({"train": "0 1 2", "test": "2 3"}, (0,), "the source's split is left out"),
-    ],
+    ("case", "split"), [*(("poses", split) for split in SPLITS), *((case, SPLITS[1]) for case in FORMATS)]
 )
-def test_the_split_next_to_any_source(
-    case: str, files: dict[str, str], test: tuple[int, ...], note: str, tmp_path: Path
-) -> None:
+def test_the_split_next_to_any_source(case: str, split: Split, tmp_path: Path) -> None:
     """Most formats dropped a split without a note, and names that no panorama has with it."""
+    files, test, note = split
     _, source = WRITERS[case][1](tmp_path / "source")
     for name, numbers in files.items():
         lines = [f"pano_0{number}.png\n" for number in numbers.split()]
