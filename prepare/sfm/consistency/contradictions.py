@@ -4,7 +4,7 @@ Two panoramas that share as much of the sphere as neighbours do must see the sam
 elsewhere in the other, one of the two poses is wrong: rows of equal windows have matched one window further
 on, and from there everything fits again, one window off. Neither residuals nor weak links show that.
 Nor does a single pair where a walk jumps to a look-alike, and what lies between is missing: all that lead
-across agree. But they put panoramas side by side that do not share what neighbours do, as the ground.
+across agree. But they put panoramas side by side that share a front alone (`closeness.py`).
 
 In the order of capture, neighbours are known. A pair that is farther off than a walk along them can drift
 only looks alike, but for where the order was followed only by a guess on the way from one to the other; and
@@ -30,14 +30,15 @@ from panolog.prepare.sfm.consistency.agreement import (
     has_moved,
     judged,
 )
+from panolog.prepare.sfm.consistency.closeness import Closeness
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
 from panolog.prepare.sfm.consistency.motion import Motion
 from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, components, tree_path, widest_tree
 
-_AS_NEIGHBOURS = 0.9  # of the median coverage, or share, of the pairs that carry the reconstruction
+_AS_NEIGHBOURS = 0.9  # of the median coverage of the pairs that carry the reconstruction
 _MARGIN = 0.85  # of the least coverage on the way between two without an order: with less they look alike
 _SHARED = 0.75  # of the median share of features of the pairs that carry: copies of houses stand apart
-_CLOSE = 0.5  # of the median step: who stands closer shares as much as neighbours do, or is a look-alike
+_CLOSE = 0.5  # of the median step: who stands closer shares more than a front, or is a look-alike
 _DRIFTED = 20.0  # degrees that a walk may be off where it returns
 _RIVALLED = 0.3  # of the edges of the tree that may have a rival
 _MOST = 0.02  # contradictions for each panorama, but for those of the tree, of which there may be none
@@ -77,12 +78,12 @@ def find_contradictions(
                 contradictions.append(Contradiction(pair.between, len(pair.matches), 0))
         elif fits:
             agreeing.append(pair)
-            if pair.share < _AS_NEIGHBOURS * share and apart(found, pair.between) < near:
-                contradictions.append(Contradiction(pair.between, len(pair.telling), len(pair.telling)))
         else:
             off = off[judged(pair, off)]
             fit = Contradiction(pair.between, len(off), int((off <= bound).sum()))
             against.append((pair, fit, float(np.median(off))))
+    close = [pair for pair in agreeing if apart(found, pair.between) < near]
+    contradictions += _fronts(Closeness(evidence, of_tree), skeleton, close) if close else []
     sides = components(skeleton.certain, len(evidence.rays))
     known = [Pair(edge, np.empty((0, 2), np.int64), 1.0) for edge in sorted(skeleton.star)]
     way = widest_tree([*agreeing, *known], len(evidence.rays))
@@ -109,6 +110,20 @@ def find_contradictions(
         likely = [it for it, way_ in zip(likely, ways, strict=True) if not way_ or doubted & set(way_)]
     contradictions += [fit for _, fit in likely]
     return sorted(contradictions, key=lambda it: (it.points - it.matches, it.between))
+
+
+def _fronts(closeness: Closeness, skeleton: Skeleton, close: Sequence[Pair]) -> list[Contradiction]:
+    """The pairs that agree and stand close, but share a front alone, as across a joint of look-alikes.
+
+    Where shadows have moved, single pairs do, too, but others show one place across all of the way between.
+    """
+    verdicts = [(pair, closeness.judge(pair)) for pair in close]
+    alike = [pair for pair, verdict in verdicts if verdict is False]
+    same = [pair for pair, verdict in verdicts if verdict] if alike else []
+    sound = {edge for pair in same for edge in tree_path(skeleton.edges, pair.between)}
+    ways = [(pair, tree_path(skeleton.edges, pair.between)) for pair in alike]
+    doubted = [pair for pair, way in ways if not way or not sound.issuperset(way)]
+    return [Contradiction(pair.between, len(pair.telling), len(pair.telling)) for pair in doubted]
 
 
 def _outvoted(skeleton: Skeleton, agreeing: Sequence[Pair], against: Sequence[Pair]) -> set[Edge]:

@@ -20,7 +20,7 @@ FEWEST = 15  # matches of a pair that counts: COLMAP's own bound
 LIKE_OTHERS = 0.75  # of the median coverage of neighbours: below it, they may only look alike
 _BANDS = np.sin(np.deg2rad([-30.0, -10.0, 10.0, 30.0]))  # of latitude: the border of five rows of cells
 _AROUND = 6  # cells in a row
-_CELLS = _AROUND * (len(_BANDS) + 1)
+CELLS = _AROUND * (len(_BANDS) + 1)
 _FULL = 6  # features of a cell that counts
 _SEVERAL = 3  # rays of a cell
 _FOUND = 0.25  # of the pair's share of matches: a cell with less lacks them
@@ -99,17 +99,14 @@ def best_coverage(pairs: Iterable[Pair]) -> dict[int, float]:
 
 def with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:
     """The pairs with their coverage; what a panorama shares with any of them is what can be found."""
-    cells = [_cell(own) for own in rays]
-    used = [np.zeros(len(own), np.bool_) for own in rays]
-    for pair in pairs:
-        for side, row in enumerate(pair.between):
-            used[row][pair.telling[:, side]] = True
-    known = [np.bincount(own[it], minlength=_CELLS) for own, it in zip(cells, used, strict=True)]
+    cells = [cell(own) for own in rays]
+    used = near_features(rays, pairs)
+    known = [np.bincount(own[it], minlength=CELLS) for own, it in zip(cells, used, strict=True)]
     return [
         replace(
             pair,
             coverage=min(
-                _share(known[row], np.bincount(cells[row][pair.telling[:, side]], minlength=_CELLS))
+                covered(known[row], np.bincount(cells[row][pair.telling[:, side]], minlength=CELLS))
                 for side, row in enumerate(pair.between)
             )
             * (len(pair.telling) >= FEWEST),
@@ -119,7 +116,16 @@ def with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:
     ]
 
 
-def _share(known: NDArray[np.int64], matched: NDArray[np.int64]) -> float:
+def near_features(rays: Sequence[Array], pairs: Iterable[Pair]) -> list[NDArray[np.bool_]]:
+    """Of each panorama (N,) which of its features any of these pairs has found, and not only far away."""
+    near = [np.zeros(len(own), np.bool_) for own in rays]
+    for pair in pairs:
+        for side, row in enumerate(pair.between):
+            near[row][pair.telling[:, side]] = True
+    return near
+
+
+def covered(known: NDArray[np.int64], matched: NDArray[np.int64]) -> float:
     """Of the cells with features that any pair has found, the share in which this pair has."""
     full = known >= _FULL
     if not full.any():
@@ -130,10 +136,10 @@ def _share(known: NDArray[np.int64], matched: NDArray[np.int64]) -> float:
 
 def directions(rays: Array) -> int:
     """In how many parts of the sphere there are several of these rays (N, 3)."""
-    return int((np.bincount(_cell(rays), minlength=_CELLS) >= _SEVERAL).sum())
+    return int((np.bincount(cell(rays), minlength=CELLS) >= _SEVERAL).sum())
 
 
-def _cell(rays: Array) -> NDArray[np.int64]:
+def cell(rays: Array) -> NDArray[np.int64]:
     """(N,) of directions (N, 3): one of five bands of latitude, and of six parts around."""
     around = np.arctan2(rays[:, 0], rays[:, 2]) / (2 * np.pi) + 0.5
     column = np.minimum((around * _AROUND).astype(np.int64), _AROUND - 1)

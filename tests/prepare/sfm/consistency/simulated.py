@@ -19,6 +19,7 @@ _SIDE, _ROUND = 12.0, 8.0  # metres from the middle to the fronts, and to the wa
 _SEEN, _NEAR, _ALIKE = 22.0, 4.5, 1.6  # metres to points, between neighbours, to where a place looks the same
 _NOISE = 0.3  # pixels
 _FRONT, _FLOOR = 130, 450  # points of each front, and of the ground
+_ANY_LIGHT = 0.25  # of the points, those that look the same in another light
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,15 +36,21 @@ def square(
     count: int = 32,
     ground: bool = True,
     order: NDArray[np.int64] | None = None,
+    again: float = 0.0,
+    dusk: int | None = None,
 ) -> Square:
     """Args: count, places on the way; ground, whether there are points that do not repeat; order, (K,) which
-    of these places panoramas have, in the order of their names.
+    of these places panoramas have, in the order of their names; again, metres from a place to where a later
+    panorama of it stands; dusk, the first of the panoramas that are taken in another light.
     """
     random = np.random.default_rng(1)
     points, copy_of = _points(random, _FRONT, _FLOOR * ground)
     centers, rotations = _way(random, count)
     if order is not None:
+        first = np.isin(np.arange(len(order)), np.unique(order, return_index=True)[1])
         centers, rotations = centers[order], rotations[order]
+        centers[~first, :2] += again * np.array([0.6, 0.8])
+    late = np.arange(len(centers)) >= (len(centers) if dusk is None else dusk)
     keypoints, rows = [], []
     for center, rotation in zip(centers, rotations, strict=True):
         seen = np.flatnonzero(np.linalg.norm(points - center, axis=1) < _SEEN)
@@ -55,9 +62,13 @@ def square(
     words = random.integers(0, 90, (len(points), 128)).astype(np.float64)
     words = (512 * words / np.linalg.norm(words, axis=1, keepdims=True)).round().astype(np.uint8)
     look = np.where(copy_of >= 0, copy_of, len(points)).min(axis=0)  # of a point and of what looks like it
+    same = np.random.default_rng(2).random(len(points))[look] < _ANY_LIGHT
     with pycolmap.Database.open(work.database) as database:
-        for number, seen in zip(ids, rows, strict=True):
-            own = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, words[look[seen]])
+        for number, seen, changed in zip(ids, rows, late, strict=True):
+            seen_words = np.where(
+                (same[seen] | ~changed)[:, None], words[look[seen]], 255 - words[look[seen]]
+            )
+            own = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, seen_words)
             database.write_descriptors(number, own)
         for a in range(len(centers)):
             for b in range(a + 1, len(centers)):
@@ -65,6 +76,7 @@ def square(
                     turned = Rotation.from_euler("z", 90 * turn, degrees=True).apply(centers[a])
                     if np.linalg.norm(turned - centers[b]) < (_ALIKE if turn else _NEAR):
                         matches = _matches(rows[a], rows[b], copy_of[turn])
+                        matches = matches[(late[a] == late[b]) | same[rows[a][matches[:, 0]]]]
                         geometry = pycolmap.TwoViewGeometry()
                         geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
                         geometry.inlier_matches = matches.astype(np.uint32)

@@ -71,6 +71,14 @@ def test_a_jump_to_a_look_alike_with_what_lies_between_missing_is_not_trusted(
         assert drift(found, place.centers[rows]) < 0.1
 
 
+@pytest.mark.parametrize("dusk", [None, 10], ids=["one light", "two"])
+def test_a_walk_that_returns_to_where_it_was_is_whole_in_any_light(tmp_path: Path, dusk: int | None) -> None:
+    """What is next to each other shares few matches that show a motion, and in another light few at all."""
+    place = square(tmp_path, count=COUNT, order=np.array([*range(10), 4, 5, 6, 7]), again=0.5, dusk=dusk)
+    found = _solve(place)
+    assert found.trusted and _error(place, found) < 0.1
+
+
 def test_without_order_what_lies_around_tells_sides_apart(tmp_path: Path) -> None:
     place = square(tmp_path, count=COUNT, order=np.random.default_rng(4).permutation(COUNT))
     found = _solve(place)
