@@ -83,7 +83,7 @@ def find_contradictions(
             fit = Contradiction(pair.between, len(off), int((off <= bound).sum()))
             against.append((pair, fit, float(np.median(off))))
     close = [pair for pair in agreeing if apart(found, pair.between) < near]
-    contradictions += _fronts(Closeness(evidence, of_tree), skeleton, close) if close else []
+    contradictions += _fronts(Closeness(evidence, of_tree), skeleton, close, of_tree) if close else []
     sides = components(skeleton.certain, len(evidence.rays))
     known = [Pair(edge, np.empty((0, 2), np.int64), 1.0) for edge in sorted(skeleton.star)]
     way = widest_tree([*agreeing, *known], len(evidence.rays))
@@ -112,14 +112,17 @@ def find_contradictions(
     return sorted(contradictions, key=lambda it: (it.points - it.matches, it.between))
 
 
-def _fronts(closeness: Closeness, skeleton: Skeleton, close: Sequence[Pair]) -> list[Contradiction]:
+def _fronts(
+    closeness: Closeness, skeleton: Skeleton, close: Sequence[Pair], of_tree: Sequence[Pair]
+) -> list[Contradiction]:
     """The pairs that agree and stand close, but share a front alone, as across a joint of look-alikes.
 
-    Where shadows have moved, single pairs do, too, but others show one place across all of the way between.
+    Where shadows have moved, single pairs do, too, but others show one place across all of the way between:
+    close ones, and those of the tree but for guesses.
     """
-    verdicts = [(pair, closeness.judge(pair)) for pair in close]
-    alike = [pair for pair, verdict in verdicts if verdict is False]
-    same = [pair for pair, verdict in verdicts if verdict] if alike else []
+    alike = [pair for pair in close if closeness.judge(pair) is False]
+    firm = [pair for pair in of_tree if pair.between not in skeleton.guessed]
+    same = [pair for pair in (*close, *firm) if closeness.judge(pair)] if alike else []
     sound = {edge for pair in same for edge in tree_path(skeleton.edges, pair.between)}
     ways = [(pair, tree_path(skeleton.edges, pair.between)) for pair in alike]
     doubted = [pair for pair, way in ways if not way or not sound.issuperset(way)]

@@ -79,6 +79,9 @@ def test_without_an_order_copies_count_if_they_share_as_much_as_what_connects(
     assert _contradictions([], [(1, 4)], False, 0.9, (0.16, weak)) == ({(1, 4)} if counts else set())
 
 
+_JUMP: frozenset[Edge] = frozenset({(4, 5)})
+
+
 @pytest.mark.parametrize(
     ("front", "last", "counts"), [(True, 0.13, True), (False, 0.13, False), (True, 0.17, False)]
 )
@@ -86,19 +89,24 @@ def test_without_an_order_copies_count_if_they_share_as_much_as_what_connects(
 def test_what_stands_closer_than_neighbours_shares_more_than_a_front(
     front: bool, last: float, counts: bool, ordered: bool
 ) -> None:
-    """The walk returns to the second panorama, or to where it looks the same."""
-    pairs: list[Edge] = [(1, 5)]
-    found = _contradictions(
-        [] if front else pairs, [], ordered, 0.9, fronts=pairs if front else [], last=last
-    )
+    """The walk returns to the second panorama, or jumps to where it looks the same."""
+    whole, fronts = ([], [(1, 5)]) if front else ([(1, 5)], [])
+    found = _contradictions(whole, [], ordered, 0.9, guessed=_JUMP, fronts=fronts, last=last)
     assert found == ({(1, 5)} if counts else set())
 
 
-@pytest.mark.parametrize("fronts", [[(0, 5), (1, 5)], [(1, 5)]])
-def test_a_front_does_not_count_where_another_pair_shows_one_place_across_the_same_way(
-    fronts: list[Edge],
+@pytest.mark.parametrize(
+    ("one_place", "fronts", "guessed", "counts"),
+    [
+        ([], [(0, 5), (1, 5)], _JUMP, {(0, 5), (1, 5)}),
+        ([(0, 5)], [(1, 5)], _JUMP, set()),
+        ([], [(1, 5)], frozenset(), set()),
+    ],
+    ids=["fronts alone", "a close pair", "the walk"],
+)
+def test_a_front_does_not_count_where_others_show_one_place_across_the_same_way(
+    one_place: list[Edge], fronts: list[Edge], guessed: frozenset[Edge], counts: set[Edge]
 ) -> None:
     """Shadows move: of two sessions, some of the pairs that stand close share what neighbours do in parts."""
-    one_place: list[Edge] = [] if (0, 5) in fronts else [(0, 5)]
-    found = _contradictions(one_place, [], True, 0.9, fronts=fronts, first=0.09, last=0.13)
-    assert found == (set() if one_place else set(fronts))
+    found = _contradictions(one_place, [], True, 0.9, guessed=guessed, fronts=fronts, first=0.09, last=0.13)
+    assert found == counts
