@@ -48,6 +48,7 @@ def environment() -> dict[str, str]:
         "PATH": f"{BIN}:{os.environ['PATH']}",
         "OMP_NUM_THREADS": "1",
         "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_worker_niceness": "0",  # by Ray's default of 15, workers starve under load
     }
 
 
