@@ -17,10 +17,12 @@ Where even neighbours have a second geometry that explains about as much as the 
 either. Single ones are decided by what lies around; where there are many, the whole is not trusted.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from panolog.prepare.sfm.consistency.agreement import (
     Posed,
@@ -44,6 +46,7 @@ _RIVALLED = 0.3  # of the edges of the tree that may have a rival
 _MOST = 0.02  # contradictions for each panorama, but for those of the tree, of which there may be none
 
 MotionOf = Callable[[Pair], Motion | None]
+Matches = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -164,10 +167,31 @@ def is_trusted(contradictions: Sequence[Contradiction], skeleton: Skeleton, rows
     return few and not broken and not is_repetitive(skeleton, rows)
 
 
-def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton) -> set[Edge]:
-    """The guesses that led from one panorama to the other where these contradict each other."""
-    paths = (tree_path(skeleton.edges, it.between) for it in contradictions)
-    return {edge for path in paths for edge in path if edge in skeleton.guessed}
+def refuted_guesses(
+    contradictions: Sequence[Contradiction], skeleton: Skeleton, kept: Mapping[Edge, Matches]
+) -> set[Edge]:
+    """The guesses that contradictions lead across: as few as explain these, where they have more matches.
+
+    Each is the one that most lead across that none explains yet, of several that which fewest of the pairs
+    that agree do. A large walk has many guesses, and few are wrong: where those of a whole way are refuted,
+    what takes their place is wrong. A guess with more matches than what contradicts it is no look-alike.
+
+    Args: kept, the matches (M, 2) of the pairs that agree.
+    """
+
+    def guesses(pairs: Iterable[Edge]) -> dict[Edge, frozenset[Edge]]:
+        return {pair: skeleton.guessed.intersection(tree_path(skeleton.edges, pair)) for pair in pairs}
+
+    agreeing = Counter(edge for way in guesses(kept).values() for edge in way)
+    matches = {it.between: it.matches for it in contradictions}
+    ways, refuted = guesses(matches), set[Edge]()
+    left = ways
+    while left := {pair: way for pair, way in left.items() if way and not way & refuted}:
+        against = Counter(edge for way in left.values() for edge in way)
+        first = min((-count, agreeing[edge]) for edge, count in against.items())
+        refuted |= {edge for edge, count in against.items() if (-count, agreeing[edge]) == first}
+    doubt = {edge: sum(matches[pair] for pair, way in ways.items() if edge in way) for edge in refuted}
+    return {edge for edge in refuted if doubt[edge] > len(kept.get(edge, ()))}
 
 
 def consistent_part(

@@ -138,7 +138,9 @@ class Solver:
         """The reconstruction of these panoramas: a guess that it refutes makes room for the next one."""
         found = self.solve(rows)
         for _ in range(_GUESSES):
-            if found is None or not (against := refuted_guesses(found.contradictions, found.skeleton)):
+            if found is None or not (
+                against := refuted_guesses(found.contradictions, found.skeleton, found.kept)
+            ):
                 break
             self._refuted |= against
             before = self._skeleton

@@ -136,8 +136,8 @@ def test_panoramas_whose_poses_are_known_need_no_pairs_and_one_edge_joins_others
     walk = {(row, row + 1): 0.8 for row in range(4, 7)}
     skeleton = find_skeleton(_evidence(walk | {(0, 5): 0.75, (3, 7): 0.7}, 8), given=range(4))
     assert skeleton.ordered and skeleton.tree == {*walk, (0, 5)}
-    assert skeleton.guessed == refuted_guesses([Contradiction((3, 7), 90, 1)], skeleton) == {(0, 5)}
-    assert refuted_guesses([Contradiction((5, 7), 90, 1)], skeleton) == set()
+    assert skeleton.guessed == refuted_guesses([Contradiction((3, 7), 90, 1)], skeleton, {}) == {(0, 5)}
+    assert refuted_guesses([Contradiction((5, 7), 90, 1)], skeleton, {}) == set()
     other = find_skeleton(_evidence(walk | {(0, 5): 0.75, (3, 7): 0.7}, 8), given=range(4), refuted={(0, 5)})
     assert other.tree == {*walk, (3, 7)}  # the next guess
     part = consistent_part(
@@ -145,3 +145,17 @@ def test_panoramas_whose_poses_are_known_need_no_pairs_and_one_edge_joins_others
     )
     assert part == [0, 1, 2, 3]  # the known side stays, although the other is as large
     assert skeleton.among([1, 2, 5, 6]).edges == {(1, 2), (5, 6)}
+
+
+def test_of_many_guesses_those_are_refuted_that_most_contradictions_lead_across() -> None:
+    walk = [(row, row + 1) for row in range(9)]
+    skeleton = Skeleton(True, frozenset(walk), guessed=frozenset({(1, 2), (4, 5), (7, 8)}))
+    kept = dict.fromkeys([*walk, (1, 3), (7, 9)], np.zeros((100, 2), np.int64))
+    across = [Contradiction(ends, 90, 0) for ends in ((0, 5), (3, 6), (4, 9))]
+    assert refuted_guesses(across, skeleton, kept) == {(4, 5)}
+    assert refuted_guesses(across[:1], skeleton, kept) == set()  # the guess has more matches
+    strong = Contradiction((0, 9), 101, 0)
+    assert refuted_guesses([strong], skeleton, kept) == {(4, 5)}  # fewest pairs agree across it
+    assert refuted_guesses([strong], skeleton, {}) == skeleton.guessed  # any of them
+    both = [*across, Contradiction((6, 9), 101, 0)]
+    assert refuted_guesses(both, skeleton, kept) == {(4, 5), (7, 8)}
