@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.sfm.consistency.evidence import CELLS, Evidence, Pair, cell, covered, near_features
+from panolog.prepare.sfm.consistency.evidence import CELLS, Evidence, Pair, by_cell, covered, near_cells
 
 Counts = NDArray[np.int64]
 _MUCH = 0.75  # of the usual share: two panoramas with as much, in all or in some directions, are in one light
@@ -29,12 +29,8 @@ class Closeness:
 
     def __init__(self, evidence: Evidence, carrying: Sequence[Pair]) -> None:
         """Args: carrying, the pairs that carry the reconstruction."""
-        self._near = near_features(evidence.rays, evidence.pairs)
-        self._cells = [cell(rays) for rays in evidence.rays]
-        self._known = [
-            np.bincount(cells[near], minlength=CELLS)
-            for cells, near in zip(self._cells, self._near, strict=True)
-        ]
+        self._cells = near_cells(evidence.rays, evidence.pairs)
+        self._known = [by_cell(cells) for cells in self._cells]
         found = [self._found(pair) for pair in carrying]
         usual = [[_share(it), _coverage(it), pair.share] for it, pair in zip(found, carrying, strict=True)]
         self._share, self._coverage, self._moved = np.median(usual or [[0.0] * 3], axis=0).tolist()
@@ -57,17 +53,15 @@ class Closeness:
         return False if in_one_light else None
 
     def _found(self, pair: Pair) -> list[tuple[Counts, Counts]]:
-        """Of either panorama the features in each direction, and those that the pair has matched."""
-        found = []
-        for side, row in enumerate(pair.between):
-            matched = pair.matches[:, side]
-            own = self._cells[row][matched[self._near[row][matched]]]
-            found.append((self._known[row], np.bincount(own, minlength=CELLS)))
-        return found
+        """Counts near features in each direction, known and matched by the pair, in each of its panoramas."""
+        return [
+            (self._known[row], by_cell(self._cells[row][pair.matches[:, side]]))
+            for side, row in enumerate(pair.between)
+        ]
 
 
 def _share(found: Sequence[tuple[Counts, Counts]]) -> float:
-    """Of the features of both panoramas, the share that is matched."""
+    """The matched share of the known features, the mean of both panoramas."""
     return float(np.mean([matched.sum() / max(1, known.sum()) for known, matched in found]))
 
 

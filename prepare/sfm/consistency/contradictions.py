@@ -18,7 +18,7 @@ either. Single ones are decided by what lies around; where there are many, the w
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +35,14 @@ from panolog.prepare.sfm.consistency.agreement import (
 from panolog.prepare.sfm.consistency.closeness import Closeness
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
 from panolog.prepare.sfm.consistency.motion import Motion
-from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, components, tree_path, widest_tree
+from panolog.prepare.sfm.consistency.skeleton import (
+    Edge,
+    Skeleton,
+    components,
+    tree_path,
+    tree_paths,
+    widest_tree,
+)
 
 _AS_NEIGHBOURS = 0.9  # of the median coverage of the pairs that carry the reconstruction
 _MARGIN = 0.85  # of the least coverage on the way between two without an order: with less they look alike
@@ -46,7 +53,7 @@ _RIVALLED = 0.3  # of the edges of the tree that may have a rival
 _MOST = 0.02  # contradictions for each panorama, but for those of the tree, of which there may be none
 
 MotionOf = Callable[[Pair], Motion | None]
-Matches = NDArray[np.int64]
+Kept = dict[Edge, NDArray[np.int64]]  # matches (M, 2) of the pairs that are mapped
 
 
 @dataclass(frozen=True)
@@ -109,7 +116,7 @@ def find_contradictions(
             likely.append((pair, fit))
     if likely and skeleton.ordered:
         doubted = _outvoted(skeleton, agreeing, [pair for pair, _ in likely]) | skeleton.guessed
-        ways = [tree_path(skeleton.edges, pair.between) for pair, _ in likely]
+        ways = tree_paths(skeleton.edges, [pair.between for pair, _ in likely])
         likely = [it for it, way_ in zip(likely, ways, strict=True) if not way_ or doubted & set(way_)]
     contradictions += [fit for _, fit in likely]
     return sorted(contradictions, key=lambda it: (it.points - it.matches, it.between))
@@ -123,12 +130,16 @@ def _fronts(
     Where shadows have moved, single pairs do, too, but others show one place across all of the way between:
     close ones, and those of the tree but for guesses.
     """
-    alike = [pair for pair in close if closeness.judge(pair) is False]
+    verdicts = [closeness.judge(pair) for pair in close]
+    alike = [pair for pair, verdict in zip(close, verdicts, strict=True) if verdict is False]
+    if not alike:
+        return []
+    same = [pair.between for pair, verdict in zip(close, verdicts, strict=True) if verdict]
     firm = [pair for pair in of_tree if pair.between not in skeleton.guessed]
-    same = [pair for pair in (*close, *firm) if closeness.judge(pair)] if alike else []
-    sound = {edge for pair in same for edge in tree_path(skeleton.edges, pair.between)}
-    ways = [(pair, tree_path(skeleton.edges, pair.between)) for pair in alike]
-    doubted = [pair for pair, way in ways if not way or not sound.issuperset(way)]
+    same += [pair.between for pair in firm if closeness.judge(pair)]
+    sound = {edge for way in tree_paths(skeleton.edges, same) for edge in way}
+    ways = tree_paths(skeleton.edges, [pair.between for pair in alike])
+    doubted = [it for it, way in zip(alike, ways, strict=True) if not way or not sound.issuperset(way)]
     return [Contradiction(pair.between, len(pair.telling), len(pair.telling)) for pair in doubted]
 
 
@@ -139,8 +150,9 @@ def _outvoted(skeleton: Skeleton, agreeing: Sequence[Pair], against: Sequence[Pa
     """
     votes: dict[Edge, float] = dict.fromkeys(skeleton.edges, 0.0)
     for pairs, sign in ((agreeing, 1.0), (against, -1.0)):
-        for pair in pairs:
-            for edge in tree_path(skeleton.edges, pair.between):
+        ways = tree_paths(skeleton.edges, [pair.between for pair in pairs])
+        for pair, way in zip(pairs, ways, strict=True):
+            for edge in way:
                 votes[edge] += sign * pair.share
     return {edge for edge in skeleton.tree if votes[edge] < 0}
 
@@ -167,30 +179,30 @@ def is_trusted(contradictions: Sequence[Contradiction], skeleton: Skeleton, rows
     return few and not broken and not is_repetitive(skeleton, rows)
 
 
-def refuted_guesses(
-    contradictions: Sequence[Contradiction], skeleton: Skeleton, kept: Mapping[Edge, Matches]
-) -> set[Edge]:
+def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton, kept: Kept) -> set[Edge]:
     """The guesses that contradictions lead across: as few as explain these, where they have more matches.
 
     Each is the one that most lead across that none explains yet, of several that which fewest of the pairs
     that agree do. A large walk has many guesses, and few are wrong: where those of a whole way are refuted,
     what takes their place is wrong. A guess with more matches than what contradicts it is no look-alike.
 
-    Args: kept, the matches (M, 2) of the pairs that agree.
+    Args: kept, the pairs that agree.
     """
 
-    def guesses(pairs: Iterable[Edge]) -> dict[Edge, frozenset[Edge]]:
-        return {pair: skeleton.guessed.intersection(tree_path(skeleton.edges, pair)) for pair in pairs}
+    def guesses(pairs: Sequence[Edge]) -> list[frozenset[Edge]]:
+        return [skeleton.guessed.intersection(way) for way in tree_paths(skeleton.edges, pairs)]
 
-    agreeing = Counter(edge for way in guesses(kept).values() for edge in way)
-    matches = {it.between: it.matches for it in contradictions}
-    ways, refuted = guesses(matches), set[Edge]()
-    left = ways
-    while left := {pair: way for pair, way in left.items() if way and not way & refuted}:
-        against = Counter(edge for way in left.values() for edge in way)
+    ways = guesses([it.between for it in contradictions])
+    if not any(ways):
+        return set()
+    agreeing = Counter(edge for way in guesses(list(kept)) for edge in way)
+    left, refuted, doubt = ways, set[Edge](), Counter[Edge]()
+    while left := [way for way in left if way and not way & refuted]:
+        against = Counter(edge for way in left for edge in way)
         first = min((-count, agreeing[edge]) for edge, count in against.items())
         refuted |= {edge for edge, count in against.items() if (-count, agreeing[edge]) == first}
-    doubt = {edge: sum(matches[pair] for pair, way in ways.items() if edge in way) for edge in refuted}
+    for it, way in zip(contradictions, ways, strict=True):
+        doubt.update(dict.fromkeys(way, it.matches))
     return {edge for edge in refuted if doubt[edge] > len(kept.get(edge, ()))}
 
 

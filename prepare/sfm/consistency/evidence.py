@@ -99,14 +99,13 @@ def best_coverage(pairs: Iterable[Pair]) -> dict[int, float]:
 
 def with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:
     """The pairs with their coverage; what a panorama shares with any of them is what can be found."""
-    cells = [cell(own) for own in rays]
-    used = near_features(rays, pairs)
-    known = [np.bincount(own[it], minlength=CELLS) for own, it in zip(cells, used, strict=True)]
+    cells = near_cells(rays, pairs)
+    known = [by_cell(own) for own in cells]
     return [
         replace(
             pair,
             coverage=min(
-                covered(known[row], np.bincount(cells[row][pair.telling[:, side]], minlength=CELLS))
+                covered(known[row], by_cell(cells[row][pair.telling[:, side]]))
                 for side, row in enumerate(pair.between)
             )
             * (len(pair.telling) >= FEWEST),
@@ -116,13 +115,18 @@ def with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:
     ]
 
 
-def near_features(rays: Sequence[Array], pairs: Iterable[Pair]) -> list[NDArray[np.bool_]]:
-    """Of each panorama (N,) which of its features any of these pairs has found, and not only far away."""
+def near_cells(rays: Sequence[Array], pairs: Iterable[Pair]) -> list[NDArray[np.int64]]:
+    """The cell of each feature (N,) of each panorama; `CELLS` if no pair has found it near the camera."""
     near = [np.zeros(len(own), np.bool_) for own in rays]
     for pair in pairs:
         for side, row in enumerate(pair.between):
             near[row][pair.telling[:, side]] = True
-    return near
+    return [np.where(found, _cell(own), CELLS) for own, found in zip(rays, near, strict=True)]
+
+
+def by_cell(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(CELLS,) how many of these features are in each cell."""
+    return np.bincount(cells, minlength=CELLS + 1)[:CELLS]
 
 
 def covered(known: NDArray[np.int64], matched: NDArray[np.int64]) -> float:
@@ -136,10 +140,10 @@ def covered(known: NDArray[np.int64], matched: NDArray[np.int64]) -> float:
 
 def directions(rays: Array) -> int:
     """In how many parts of the sphere there are several of these rays (N, 3)."""
-    return int((np.bincount(cell(rays), minlength=CELLS) >= _SEVERAL).sum())
+    return int((by_cell(_cell(rays)) >= _SEVERAL).sum())
 
 
-def cell(rays: Array) -> NDArray[np.int64]:
+def _cell(rays: Array) -> NDArray[np.int64]:
     """(N,) of directions (N, 3): one of five bands of latitude, and of six parts around."""
     around = np.arctan2(rays[:, 0], rays[:, 2]) / (2 * np.pi) + 0.5
     column = np.minimum((around * _AROUND).astype(np.int64), _AROUND - 1)

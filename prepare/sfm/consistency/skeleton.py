@@ -166,14 +166,22 @@ def widest_tree(pairs: Iterable[Pair], count: int) -> dict[Edge, float]:
 
 def tree_path(tree: Iterable[Edge], ends: Edge) -> list[Edge]:
     """The edges of a tree between two panoramas, empty if they are not connected."""
+    return tree_paths(tree, [ends])[0]
+
+
+def tree_paths(tree: Iterable[Edge], pairs: Sequence[Edge]) -> list[list[Edge]]:
+    """The edges of a tree between the two panoramas of each pair, empty if they are not connected."""
     edges = list(tree)
-    graph = _graph(edges, 1 + max(map(max, (*edges, ends))))
-    before = breadth_first_order(graph, ends[0], directed=False)[1]  # negative: of the first, or not reached
-    path, row = list[Edge](), ends[1]
-    while (last := int(before[row])) >= 0:
-        path.append((min(row, last), max(row, last)))
-        row = last
-    return path
+    graph = _graph(edges, 1 + max(map(max, (*edges, *pairs)), default=0))
+    paths = []
+    for one, other in pairs:
+        before = breadth_first_order(graph, one, directed=False)[1]  # negative: of the first, or not reached
+        path, row = list[Edge](), other
+        while (last := int(before[row])) >= 0:
+            path.append((min(row, last), max(row, last)))
+            row = last
+        paths.append(path)
+    return paths
 
 
 def _graph(edges: Iterable[Edge], count: int, costs: NDArray[np.float64] | None = None) -> csr_array:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from panolog.prepare.sfm.consistency.agreement import Posed, agrees, deviations, posed
 from panolog.prepare.sfm.consistency.contradictions import (
     Contradiction,
+    Kept,
     consistent_part,
     find_contradictions,
     is_trusted,
@@ -41,8 +42,6 @@ _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose po
 _GUESSES = 4  # of what connects panoramas with a scene that they are added to
 _LOOSE = 100.0  # relative error of the scale across a link: one side is a point for the other
 _RIM = 0.1  # share of the panoramas that may be left out without an order: all others agree
-
-Kept = dict[Edge, NDArray[np.int64]]  # matches (M, 2) of the pairs that are mapped
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ _HALF, _EIGHTH = (np.random.default_rng(1).permutation(FEATURES) < part * FEATUR
 
 
 def _shows_one_place(shared: NDArray[np.bool_], *, moved: float = 1.0, ground: bool = True) -> bool | None:
-    """Of a pair of panoramas; those that carry the reconstruction share half of what is all around.
+    """Judges a pair of panoramas; those that carry the reconstruction share half of what is all around.
 
     Args: shared, (FEATURES,) which features the pair has matched; moved, the part of its matches that show a
         motion; ground, whether any features are below.
