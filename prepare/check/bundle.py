@@ -17,7 +17,7 @@ from panolog.scene.model import Scene
 if TYPE_CHECKING:
     import pycolmap
 
-MENDS = 2.0  # from this gain on poses were off, and not only the observations that they were found by
+POSES_OFF = 2.0  # from this gain on poses were off, and not only the observations that they were found by
 _SEAM = 0.02  # of the width: observations nearer to the edge may be projected to the other one
 _POLE = 0.08  # of the height: about straight up and down, pixels are too narrow to be counted
 _ROUNDS, _TOLERANCE = 50, 1e-6  # of Ceres: most steps, and the relative gain of the last one

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.folder import command_line
 from panolog.prepare.check.blank import find_blank
-from panolog.prepare.check.bundle import MENDS, adjust
+from panolog.prepare.check.bundle import POSES_OFF, adjust
 from panolog.prepare.check.evidence import read_tracks
 from panolog.prepare.check.exposure import describe, differing_exposures, measure_exposures
 from panolog.prepare.check.misplaced import find_misplaced
@@ -67,7 +67,7 @@ def _poses(
     residuals = found.before
     if not np.isfinite(residuals).any():
         return None, None
-    if found.gain >= MENDS:
+    if found.gain >= POSES_OFF:
         rows = np.arange(len(scene.panoramas))
         adjusted = Captured(rows=rows, poses=found.poses, points=found.points, given=scene.poses)
         left = float(np.nanmedian(found.after))
@@ -86,8 +86,8 @@ def _exposures(scene: Scene, settings: ExposureConfig, doing: Say, warn: Say) ->
     if settings.learn is False:
         return None
     doing("measuring exposures")
-    differing = differing_exposures if settings.learn == "auto" else measure_exposures
-    if (found := differing(scene, scene.train)) is None:
+    measure = differing_exposures if settings.learn == "auto" else measure_exposures
+    if (found := measure(scene, scene.train)) is None:
         return None
     warn(f"{describe([scene.panoramas[row].name for row in scene.train], found)}; Stage I learns them")
     return np.stack([found.log_gain, np.zeros_like(found.log_gain)], axis=1)

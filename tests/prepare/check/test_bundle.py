@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from panolog.prepare.check.bundle import MENDS, adjust
+from panolog.prepare.check.bundle import POSES_OFF, adjust
 from panolog.prepare.check.evidence import Tracks, project
 from panolog.prepare.check.residuals import measure_residuals
 from panolog.renderer.motion import moved
@@ -70,7 +70,7 @@ def test_moved_cameras_return_in_the_frame_that_they_had() -> None:
     # What stays is the mean of all errors, which no observation shows.
     assert after[0] < 0.6 * before[0] and after[1] < 0.6 * before[1]
     assert np.nanmedian(found.after) < 0.3 and np.nanmedian(found.before) > 1
-    assert found.gain > MENDS
+    assert found.gain > POSES_OFF
     assert np.array_equal(found.after, measure_residuals(right, tracks), equal_nan=True)
     steps = np.linalg.norm(np.diff(right.centers[: VIEWS - 1], axis=0), axis=1)
     assert steps / steps.mean() == pytest.approx(1, abs=0.01)
@@ -83,7 +83,7 @@ def test_true_poses_stay() -> None:
     found = adjust(truth, tracks)
     shift, turn = apart(found.applied(truth), truth)
     assert turn * WIDTH / (2 * np.pi) < 0.1 and shift < 0.005
-    assert found.gain < MENDS
+    assert found.gain < POSES_OFF
 
 
 def test_a_few_wrong_observations_do_not_bend_it() -> None:

@@ -120,7 +120,7 @@ def test_a_block_keeps_only_its_cell_and_leaves_the_sky_alone(
 
 
 def test_resets_bound_a_block_softly(coarse: TrainSpec, events: list[Event]) -> None:
-    """Those outside of its cell are reset, too (app. D)."""
+    """A reset of a block clamps its Gaussians outside of the cell, too (app. D)."""
     initial = trained(events)
     high = replace(initial, opacities=torch.full_like(initial.opacities, 3.0))
     task = block_of(coarse, high, densify={"until": 30_000, "gradient": 1e3})
