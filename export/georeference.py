@@ -49,12 +49,12 @@ class Georeference:
 
     @property
     def frame(self) -> Frame:
-        """That of exports: y up, the origin among the cameras."""
+        """The frame of exports: y up, the origin among the cameras."""
         return Frame.upright(self.up, np.array(self.middle))
 
     @property
     def upside_down(self) -> Frame:
-        """The same by half a turn around z, which PlayCanvas's viewers undo: of PLY and SOG."""
+        """The frame of PLY and SOG: `frame` by half a turn around z, which PlayCanvas's viewers undo."""
         upright = self.frame
         return Frame(HALF_TURN.rotation @ upright.rotation, upright.origin)
 

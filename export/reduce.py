@@ -50,7 +50,7 @@ class Reduced:
         return self.source.degree
 
     def pieces(self) -> Iterator[Splats]:
-        """All of them, in the pieces of the source."""
+        """The Gaussians that are kept, in the pieces of the source."""
         for rows, piece in with_rows(self.source):
             if self._kept[rows].any():
                 yield piece.select(self._kept[rows])

@@ -44,7 +44,7 @@ class Splats:
 
     @property
     def degree(self) -> int:
-        """Of the spherical harmonics."""
+        """The degree of the spherical harmonics."""
         return REST.index(self.shN.shape[1])
 
     def columns(self) -> dict[str, Floats]:
@@ -73,23 +73,23 @@ class Splats:
         )
 
     def turned(self, frame: Frame) -> "Splats":
-        """The same in a frame."""
+        """These Gaussians in another frame."""
         means, quats, rest = frame.turn(self.means, self.quats, self.shN)
         return replace(self, means=means, quats=quats, shN=rest)
 
     def scaled(self, factor: float) -> "Splats":
-        """The same, so many times as large, around the origin."""
+        """These Gaussians, `factor` times as large, around the origin."""
         if factor == 1:
             return self
         grown = np.float32(np.log(factor))
         return replace(self, means=self.means * np.float32(factor), scales=self.scales + grown)
 
     def reduced(self, degree: int) -> "Splats":
-        """The same with spherical harmonics of at most a degree."""
+        """These Gaussians with spherical harmonics of at most a degree."""
         return replace(self, shN=self.shN[:, : REST[degree]])
 
     def gaussians(self, *, exact: bool = False) -> Gaussians:
-        """The same as a model without sky. Args: exact, `Gaussians.exact`."""
+        """These Gaussians as a model without sky. Args: exact, `Gaussians.exact`."""
         rest = np.zeros((len(self), SH_REST, 3), np.float32)
         rest[:, : self.shN.shape[1]] = self.shN
         columns = self.columns() | {"sh0": self.sh0[:, None], "shN": rest}
@@ -98,7 +98,7 @@ class Splats:
 
     @staticmethod
     def made(count: int, degree: int, part: Callable[[slice], Mapping[str, NDArray[Any]]]) -> "Splats":
-        """So many Gaussians, made `ROWS` at a time, so that little more than they needs memory.
+        """Makes `count` Gaussians, `ROWS` at a time, so that little more than they needs memory.
 
         Args: degree, of the spherical harmonics; part, the columns of some rows, by name.
         """
@@ -114,7 +114,7 @@ class Splats:
 
     @staticmethod
     def joined(parts: "list[Splats]") -> "Splats":
-        """All of some, at least one, in order."""
+        """The Gaussians of all parts, at least one, in order."""
         columns = [part.columns() for part in parts]
         return Splats(**{name: np.concatenate([column[name] for column in columns]) for name in columns[0]})
 
@@ -129,11 +129,11 @@ class SplatSource(Protocol):
 
     @property
     def degree(self) -> int:
-        """Of their spherical harmonics."""
+        """The degree of the spherical harmonics."""
         ...
 
     def pieces(self) -> Iterator[Splats]:
-        """All of them, `ROWS` or fewer at a time."""
+        """The Gaussians, `ROWS` or fewer at a time."""
         ...
 
 
@@ -249,7 +249,7 @@ class ModelSource:
         return self.selection.degree
 
     def part(self, part: Part) -> "ModelSource":
-        """The same model, choice and frame, of another part."""
+        """This source with another part of its model, by the same choice and in the same frame."""
         return replace(self, selection=replace(self.selection, part=part))
 
     def with_near_sky(self) -> "ModelSource":
@@ -272,7 +272,7 @@ class ModelSource:
         return replace(self, sky=Ball((x, y, z), reach / far)) if 0 < reach < far else self
 
     def within(self, reach: float, size: float) -> "ModelSource":
-        """The same, made smaller around the origin of its frame until it fits: from there it looks the same.
+        """This model, made smaller around the origin of its frame until it fits: seen from there it is equal.
 
         Args: reach, the largest coordinate, and size, the largest of a Gaussian, that a file can hold.
         Raises PlyError if the file has changed meanwhile.
@@ -284,7 +284,7 @@ class ModelSource:
         return self if shrink == 1 else replace(self, scale=self.scale * shrink)
 
     def pieces(self) -> Iterator[Splats]:
-        """All of them, `ROWS` or fewer at a time. Raises PlyError if the file has changed meanwhile."""
+        """The Gaussians, `ROWS` or fewer at a time. Raises PlyError if the file has changed meanwhile."""
         for chosen in self._selected():
             yield chosen.reduced(self.degree).turned(self.frame).scaled(self.scale)
 

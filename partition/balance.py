@@ -55,7 +55,7 @@ class _Part:
 
 
 def balance(centers: ArrayLike, points: ArrayLike, box: Aabb, blocks: int, fewest: int = 1) -> Cuts:
-    """So many blocks, or as many as can be, of which each costs about the same and has `fewest` cameras.
+    """Cuts into `blocks`, or as many as can be, of which each costs about the same and has `fewest` cameras.
 
     What a block costs is expected to follow its share of the cameras and its share of the sparse points, half
     each. A part is cut across the axis along which its cameras spread most; the axis of least spread, such as

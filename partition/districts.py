@@ -55,7 +55,7 @@ def make_districts(
     *,
     overlap: float,
 ) -> Districts:
-    """So many districts, or as many as there are cameras for; other arguments and errors as `balance`.
+    """Makes `count` districts, or as many as there are cameras for; other arguments and errors as `balance`.
 
     Args: overlap, their margin in median camera distances.
     """

@@ -84,7 +84,7 @@ def seams_of(plan: Plan) -> tuple[Plane, ...]:
 
 
 def most_seen(plan: Plan, faces: Sequence[Plane], most: int) -> tuple[Plane, ...]:
-    """Of some faces the `most` that are near most cameras, in order."""
+    """The `most` of some faces that are near most cameras, in order."""
     near = [n for part in _parts(faces) for n in np.bincount(_near(plan, part)[0], minlength=len(part))]
     chosen = sorted(range(len(faces)), key=lambda i: (-near[i], i))[:most]
     return tuple(faces[i] for i in sorted(chosen))

@@ -148,7 +148,7 @@ class _Nodes:
         self.sizes = np.where(within, np.exp(gaussians.scales.numpy().max(1, initial=-np.inf)), np.inf)
 
     def merge(self, rows: Ints, step: int) -> Ints:
-        """Those of a level. Args: rows, those of the level below, cube by cube."""
+        """Makes the nodes of a level; returns their rows. Args: rows of the level below, cube by cube."""
         _, starts = _cubes(self.place[rows] >> step)
         cube = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
         side = self.side * 2.0**step
@@ -182,21 +182,21 @@ class Light:
 
     @classmethod
     def of(cls, gaussians: Gaussians) -> "Light":
-        """That of Gaussians that stand for themselves."""
+        """The light that Gaussians stop which stand for themselves."""
         opacity = 1 / (1 + np.exp(-gaussians.opacities.numpy().astype(np.float64)))
         return cls(opacity * _area(np.exp(gaussians.scales.numpy().astype(np.float64))), opacity)
 
     def rows(self, rows: Ints) -> "Light":
-        """That of some."""
+        """The light of some rows."""
         return Light(self.stopped[rows], self.opacity[rows])
 
     def followed(self, other: "Light") -> "Light":
-        """That of these, and then of others."""
+        """The light of these rows, and then of others."""
         both = zip((self.stopped, self.opacity), (other.stopped, other.opacity), strict=True)
         return Light(*map(np.concatenate, both))
 
     def joined(self, begins: Ints) -> "Light":
-        """That of each run of rows."""
+        """The light of each run of rows."""
         return Light(np.add.reduceat(self.stopped, begins), np.add.reduceat(self.opacity, begins))
 
     def seen(self, low_pass: float) -> Floats:

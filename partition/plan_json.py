@@ -45,7 +45,7 @@ class PlanCamera(_Strict):
 
 
 class PlanFile(_Strict):
-    """All of plan.json. Lengths are in world units."""
+    """The content of plan.json. Lengths are in world units."""
 
     version: Literal[1, 2] = 2
     rho_tri: float

@@ -43,11 +43,11 @@ class Camera:
 
     @staticmethod
     def at(panorama: Panorama, width: int) -> "Camera":
-        """That of a panorama of a scene, at `width` pixels, on the CPU."""
+        """The camera of a panorama of a scene, at `width` pixels, on the CPU."""
         return Camera.of(panorama.rotation, panorama.translation, width, width // 2)
 
     def to(self, device: torch.device | str) -> "Camera":
-        """The same camera on another device."""
+        """This camera on another device."""
         return Camera(self.rotation.to(device), self.translation.to(device), self.width, self.height)
 
 

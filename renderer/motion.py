@@ -40,7 +40,7 @@ class Common(NamedTuple):
 
     @staticmethod
     def of(before: Floats, after: Floats, radius: float) -> "Common":
-        """That which explains the poses (V, 3, 4) after by those before best, in a least-squares sense.
+        """The similarity that explains the poses (V, 3, 4) after by those before best, by least squares.
 
         Args: radius, the length whose move is worth a turn by one radian. There is no growth where all
         centres are one.

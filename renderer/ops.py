@@ -57,7 +57,7 @@ def threads() -> int:
 
 
 def _array(tensor: Tensor) -> NDArray[Any]:
-    """As the kernels take it. Not converted to another type: kernels write to some of their arguments."""
+    """A tensor as the kernels take it. Its type stays: kernels write to some of their arguments."""
     if tensor.dtype not in (torch.float32, torch.uint8, torch.int32):
         raise TypeError(f"the kernels work on float32, uint8 and int32, not on {tensor.dtype}")
     return tensor.detach().contiguous().numpy()
@@ -69,7 +69,7 @@ def _arrays(**tensors: Tensor) -> dict[str, NDArray[Any]]:
 
 
 def _exterior(tensors: list[Tensor]) -> Any:
-    """As the kernels take it."""
+    """An exterior as the kernels take it."""
     return tuple(map(_array, tensors)) if tensors else None
 
 
@@ -208,7 +208,7 @@ def bake(
     slack: float,
     faint: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """All but the first `own` of N Gaussians as a camera sees them, before and behind those (csrc/bake.h).
+    """What a camera sees of all but the first `own` of N Gaussians, before and behind those (csrc/bake.h).
 
     Returns color (H, W, 3), alpha (H, W) and inverse depth (H, W) of what is before, then of what is behind;
     spans (T, 2); among (N,) uint8, which splats composite among the own ones; splats (16 N,) and rays

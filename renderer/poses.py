@@ -154,7 +154,7 @@ def _numbers(where: str, fields: list[str]) -> list[float]:
 
 
 def _rotation(where: str, quaternion: list[float]) -> Rotation:
-    """Of a unit quaternion x y z w."""
+    """The rotation of a unit quaternion x y z w."""
     length = math.hypot(*quaternion)
     if abs(length - 1) > _NOT_UNIT:
         raise InputError(f"{where}: the quaternion has the length {length:.4g}, must be 1")

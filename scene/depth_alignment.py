@@ -80,7 +80,7 @@ def fit_affine(prior: Array, inverse: Array, seed: int, share: Array | None = No
 
 
 def _fit_likely(prior: Array, inverse: Array, share: Array, first: NDArray[np.bool_], seed: int) -> Alignment:
-    """As `fit_affine` for points (M,) some of which are hidden in the picture.
+    """Fits as `fit_affine` to points (M,) some of which are hidden in the picture.
 
     Those of `first` (M,) are few and hardly ever hidden, but the nearest of their directions, where a map
     errs more than elsewhere. Their line decides which of all points the map shows; these give the affine.
@@ -145,7 +145,7 @@ def _power(error: Array, inverse: Array, share: Array) -> float:
 
 
 def _least_median(prior: Array, inverse: Array, random: np.random.Generator) -> tuple[float, float]:
-    """Of lines through random pairs the one with the least median absolute residual (Rousseeuw 1984)."""
+    """The line through a random pair with the least median absolute residual (Rousseeuw 1984)."""
     first, second = random.integers(0, len(prior), (2, PAIRS))
     run = prior[second] - prior[first]
     usable = np.abs(run) > 1e-3 * float(np.ptp(prior))

@@ -59,7 +59,7 @@ def here(path: Path) -> Path:
 
 
 def user_folder(variable: str, default: str) -> Path | None:
-    """This program's folder in one of the user's, which a variable of XDG names; by default below the home.
+    """PanoLOG's folder in one of the user's, which a variable of XDG names; by default below the home.
 
     None for a user without variable, HOME and entry in the system's list, as in containers.
     """

@@ -55,7 +55,7 @@ class Gaussians:
         return Gaussians(**tensors, sky=self.sky if sky is None else sky, exact=self.exact)
 
     def to(self, device: torch.device | str) -> "Gaussians":
-        """The same Gaussians on another device."""
+        """These Gaussians on another device."""
         return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     def select(self, keep: Tensor) -> "Gaussians":
@@ -65,7 +65,7 @@ class Gaussians:
 
 
 def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
-    """Both, in order. Only the second may have sky, because sky is always last."""
+    """The Gaussians of both, in order. Only the second may have sky, because sky is always last."""
     if first.sky:
         raise ValueError("the first part has sky Gaussians; sky must be last")
     both = {name: torch.cat([tensor, getattr(second, name)]) for name, tensor in first.tensors().items()}

@@ -140,7 +140,7 @@ def decode_panorama(path: Path, width: int | None = None) -> NDArray[np.uint8]:
 def decode_with_alpha(
     path: Path, width: int | None = None, *, quick: bool = False
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """As `decode_panorama`, and (H, W) True = use, as a mask: False where the picture is fully transparent.
+    """Decodes as `decode_panorama`, with a mask (H, W), True = use: False where fully transparent.
 
     None where all of it is to be used. A resized pixel that mixes in anything transparent is not used, and
     its colour is that of its parts by how opaque they are, whatever the file has below transparent ones.

@@ -64,7 +64,7 @@ class View:
         return View(row, layers["image"], *(layers.get(name) for name in _LAYERS[1:]))
 
     def layers(self) -> dict[str, Tensor]:
-        """Those that it has, by name."""
+        """The layers that the panorama has, by name."""
         return {name: layer for name in _LAYERS if (layer := getattr(self, name)) is not None}
 
 
@@ -231,7 +231,7 @@ def load_view(
 
 
 def load_layers(panorama: Panorama, row: int, width: int) -> View:
-    """As `load_view`, but without the picture: `image` has no pixels."""
+    """Loads as `load_view`, but without the picture: `image` has no pixels."""
     opaque = decode_used(panorama.image) if panorama.transparent else None
     if opaque is not None:
         opaque = resize_used(opaque, (width, width // 2))

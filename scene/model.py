@@ -44,7 +44,7 @@ class Panorama:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Its image and the layers that it has."""
+        """The image, and the layers that there are."""
         layers = (self.mask, self.sky_mask, self.depth)
         return (self.image, *(layer for layer in layers if layer is not None))
 
@@ -94,7 +94,7 @@ class Scene:
         return replace(self, train=tuple(sorted({*self.train, *self.test})), test=())
 
     def without_points(self) -> "Scene":
-        """The same panoramas without the sparse cloud: what all tasks of a scene share."""
+        """This scene without the sparse cloud: what all tasks of a scene share."""
         nothing = np.zeros(0, np.int64)
         panoramas = tuple(replace(panorama, observed=nothing) for panorama in self.panoramas)
         return replace(self, panoramas=panoramas, points=self.points[:0], colors=self.colors[:0])

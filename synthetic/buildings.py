@@ -75,7 +75,7 @@ class Gable:
         return [(sign * direction, middle + sign * self.half[axis] * direction) for sign in (-1.0, 1.0)]
 
     def _side(self, sign: float) -> tuple[Vector, Vector, Vector]:
-        """Of a side of the ridge: the directions out of its wall and its slope, and a point on its eave."""
+        """A side of the ridge: the directions out of its wall and its slope, and a point on its eave."""
         out, span = sign * np.eye(3)[self.across], self.half[self.across]
         slope = (self.ridge - self.eave) * out + np.array([0, 0, span])
         return out, slope, np.array([*self.center, self.eave]) + span * out

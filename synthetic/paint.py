@@ -94,7 +94,7 @@ class Ground:
         return mix(grass * (0.65 + 0.7 * blades), rgb("ead9a0"), flowers)
 
     def asphalt(self, x: Floats, y: Floats, bare: Bools | None = None) -> Floats:
-        """Of a road along x; without markings where `bare` (N,)."""
+        """The colours of a road along x; without markings where `bare` (N,)."""
         wear = fractal(x, y, 9.0) + 0.6 * fractal(y, x, 1.7)
         road = speckle(rgb("6b6662"), 0.55 + 0.5 * wear)
         patch = (cell(x / 7.0, y / 3.2, 5) > 0.8) & (np.abs(x % 7.0 - 3.5) < 2.4)
@@ -118,7 +118,7 @@ class Rectangle:
     edge: float  # metres that streets reach beyond
 
     def __call__(self, x: Floats, y: Floats) -> tuple[tuple[Floats, Floats], tuple[Bools, Bools]]:
-        """As `Network`."""
+        """The streets nearest to each place, as `Network` describes them."""
         from_x, from_y = (
             (value + half + 0.5 * self.pitch) % self.pitch - 0.5 * self.pitch
             for value, half in zip((x, y), self.half, strict=True)

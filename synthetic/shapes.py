@@ -62,11 +62,11 @@ class Ellipsoid:
 
     @property
     def radius(self) -> float:
-        """Of a sphere around it."""
+        """The radius of a sphere around the shape."""
         return float(self.axes.max())
 
     def enter(self, origins: Floats, directions: Floats) -> Floats:
-        """As Convex.enter."""
+        """The distance at which each ray enters, as `Convex.enter` has it."""
         start = (origins - self.center[:, None]) / self.axes[:, None]
         step = directions / self.axes[:, None]
         a, b, c = dot(step, step), dot(start, step), dot(start, start) - 1
@@ -104,7 +104,7 @@ class Moved:
     shift: Floats  # (3,) metres
 
     def __call__(self, points: Floats, normals: Floats) -> Floats:
-        """As `Paint`."""
+        """The colours of points, as `Paint` has them."""
         back = self.turn.T
         return self.paint(back @ (points - self.shift[:, None]), back @ normals)
 

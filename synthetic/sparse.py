@@ -49,7 +49,7 @@ def sample_surfaces(
 
 
 def concatenate_samples(parts: Sequence[SurfaceSample]) -> SurfaceSample:
-    """All of them, in order."""
+    """The samples of all parts, in order."""
     return SurfaceSample(
         np.concatenate([part.points for part in parts]),
         np.concatenate([part.colors for part in parts]),

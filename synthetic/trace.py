@@ -191,17 +191,17 @@ class Scenery:
         self._radii = np.array([shape.radius for shape in shapes])
 
     def within(self, center: NDArray[np.float64], reach: float) -> list[Shape]:
-        """Those with a part within `reach` metres of `center` (3,)."""
+        """The shapes with a part within `reach` metres of `center` (3,)."""
         away = np.linalg.norm(self._centers - center, axis=1) - self._radii
         return [self.shapes[index] for index in np.flatnonzero(away < reach * 1.001 + 1e-3).tolist()]
 
     def on_square(self, square: SunSquare) -> list[Shape]:
-        """Those that rays through a square across the sun may meet."""
+        """The shapes that rays through a square across the sun may meet."""
         off = np.abs(self._centers @ square.basis[:2].T - square.middle).max(axis=1) - self._radii
         return [self.shapes[index] for index in np.flatnonzero(off < square.reach * 1.001 + 1e-2).tolist()]
 
     def cast(self, rays: PanoramaRays, smallest: float = 0.0, among: NDArray[np.int64] | None = None) -> Hits:
-        """As `cast`, but in the order of distance, without shapes that nearer ones hide.
+        """Casts rays as `cast`, but in the order of distance, without shapes that nearer ones hide.
 
         Windows of the nearest distances in a pyramid tell what is hidden: the hierarchical z-buffer of
         Greene, Kass and Miller (SIGGRAPH 1993). Where two shapes are met at the same distance, the first is.

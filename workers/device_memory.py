@@ -77,12 +77,12 @@ def training(gaussians: int, pixels: int) -> int:
 
 
 def scoring(gaussians: int, pixels: int) -> int:
-    """As `training`, of a task that scores cameras."""
+    """The bytes on a GPU of a task that scores cameras."""
     return _peak(_SCORING, gaussians, pixels)
 
 
 def rendering(gaussians: int, pixels: int) -> int:
-    """As `training`, of a task that only renders, such as an evaluation."""
+    """The bytes on a GPU of a task that only renders, such as an evaluation."""
     return _peak(_RENDERING, gaussians, pixels)
 
 

@@ -37,7 +37,7 @@ class EvaluateSpec(TaskSpec):
 
     @property
     def faces(self) -> tuple[Plane, ...]:
-        """Those whose seams are measured."""
+        """The faces whose seams are measured."""
         return () if self.seams is None else self.seams.faces
 
     def run(self) -> Iterator[Event]:

@@ -106,7 +106,7 @@ class _Span:
     seen: tuple[int, int]  # with what its features see
 
     def own(self, stride: int) -> slice:
-        """Its own part of a map with so many pixels to a value."""
+        """The span's own part of a map with `stride` pixels to a value."""
         begin = (self.first - self.seen[0]) // stride
         return slice(begin, None if self.last is None else (self.last - self.seen[0]) // stride)
 
@@ -229,7 +229,7 @@ def sphere_weights(height: int) -> NDArray[np.float64]:
 
 
 def _pair(render: Image, truth: Image, mask: Image | None, crop_bottom: float) -> Pair:
-    """Both images in the state in which they are compared.
+    """The two images in the state in which they are compared.
 
     What is masked becomes black in both: windows and features that reach over its edge find no difference.
     """

@@ -129,7 +129,7 @@ def _document(
 
 
 def _write_head(file: BinaryIO, document: dict[str, Any], size: int) -> None:
-    """All of a GLB before the bytes of its buffer. Raises FormatError if it would be too large."""
+    """Writes a GLB up to the bytes of its buffer. Raises FormatError if it would be too large."""
     text = json.dumps(document | {"buffers": [{"byteLength": size}]}, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     padded = size + -size % 4

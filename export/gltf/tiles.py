@@ -83,7 +83,7 @@ class _Tile:
     children: "tuple[_Tile, ...]"
 
     def json(self) -> dict[str, Any]:
-        """As `tileset.json` has it."""
+        """The tile as `tileset.json` has it."""
         lower, upper = self.corners
         center, half = (lower + upper) / 2, (upper - lower) / 2
         tile: dict[str, Any] = {
@@ -144,7 +144,7 @@ def _write_leaf(folder: Path, leaf: int, levels: tuple[Splats, ...], sides: tupl
 
 
 def _corners(splats: Splats) -> Corners:
-    """Of a box in the tileset's axes that holds Gaussians."""
+    """The corners of a box in the tileset's axes that holds Gaussians."""
     turned = Rotation.from_matrix(Z_UP) * Rotation.from_quat(splats.quats, scalar_first=True)
     axes = turned.as_matrix() * np.exp(splats.scales.astype(np.float64))[:, None]
     reach = _SIGMAS * np.linalg.norm(axes, axis=2)

@@ -45,7 +45,7 @@ class Pose:
         return [round(at + step, _PLACES) for at, step in zip(self.position, ahead, strict=True)]
 
     def as_json(self) -> dict[str, Any]:
-        """As scene.json has it."""
+        """The pose as scene.json has it."""
         return {"position": list(self.position), "yaw": self.yaw, "pitch": self.pitch}
 
 
@@ -60,7 +60,7 @@ class PageCamera:
     photograph: str | None = None  # URL of the equirectangular photograph, relative to the page
 
     def as_json(self) -> dict[str, Any]:
-        """As scene.json has it."""
+        """The camera as scene.json has it."""
         rotation = None if self.rotation is None else list(self.rotation)
         return {"name": self.name, **self.pose.as_json(), "rotation": rotation, "photograph": self.photograph}
 
@@ -128,7 +128,7 @@ class Page:
         }
 
     def with_photographs(self, urls: Sequence[str | None]) -> "Page":
-        """The same with a URL for each camera; those without a rotation keep none."""
+        """This page with a URL for each camera; cameras without a rotation keep none."""
         cameras = zip(self.cameras, urls, strict=True)
         return replace(
             self,

@@ -32,7 +32,7 @@ class Histogram:
 
     @staticmethod
     def of(values: Floats, weights: Floats | None = None) -> "Histogram":
-        """Of finite values, of any shape. Args: weights of the same shape, None = 1."""
+        """The histogram of finite values of any shape. Args: weights of the same shape, None = 1."""
         # The bits of floats are integers in the same order if those of negative ones are turned.
         bits = np.ascontiguousarray(values, np.float32).ravel().view(np.uint32)
         turn = (bits >> np.uint32(31)) * np.uint32(0x7FFFFFFF) | np.uint32(0x80000000)

@@ -208,7 +208,7 @@ class _Reader:
         )
 
     def _tables(self, objects: dict[str, Any]) -> tuple[Floats, Floats, Floats, Floats | None]:
-        """Of version 2: scales, sh0, opacity and rest."""
+        """The tables of version 2: scales, sh0, opacity and rest."""
         books = {
             name: self._codebook(objects[name], name) for name in ("scales", "sh0", "shN") if name in objects
         }
@@ -217,7 +217,7 @@ class _Reader:
         return np.tile(books["scales"], (3, 1)), np.tile(books["sh0"], (3, 1)), logit, books.get("shN")
 
     def _linear(self, objects: dict[str, Any]) -> tuple[Floats, Floats, Floats, Floats | None]:
-        """Of version 1."""
+        """The tables of version 1, whose values are evenly spaced: scales, sh0, opacity and rest."""
 
         def table(name: str, size: int) -> Floats:
             low, high = (self._numbers(objects[name], name, bound, size) for bound in ("mins", "maxs"))

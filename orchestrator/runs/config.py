@@ -70,7 +70,7 @@ class PassesConfig(Group):
 
     @property
     def stages(self) -> tuple[Stage, ...]:
-        """Those that there are, in order."""
+        """The stages of the passes that there are, in order."""
         parts = {Stage.ROUND: self.round, Stage.REPAIR: self.repair}
         return tuple(stage for stage, part in parts.items() if part)
 
@@ -269,7 +269,7 @@ class RunConfig(TrainConfig):
 
 
 def _canonical(given: dict[str, Any]) -> dict[str, Any]:
-    """The same settings by the names that they have today."""
+    """The given settings by the names that they have today."""
     tree = deepcopy(given)
     partition, stage2 = tree.get("partition"), tree.get("stage2")
     if isinstance(partition, dict) and "exterior" in partition:

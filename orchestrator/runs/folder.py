@@ -139,7 +139,7 @@ class RunFolder:
         return self.of(task) / f"checkpoint-{iteration:09d}.safetensors"
 
     def earlier_checkpoints(self, task: TaskId) -> list[Path]:
-        """Those before the last, oldest first."""
+        """The checkpoints before the last, oldest first."""
         return sorted(self.of(task).glob("checkpoint-*.safetensors"))
 
     def model(self, task: TaskId) -> Path:
@@ -181,7 +181,7 @@ class RunFolder:
         return self.shard(task).with_suffix(".ply")
 
     def seen_coarse(self, task: TaskId) -> Path:
-        """The same of the Stage I model, which the seams of a merged model are compared with."""
+        """The Stage I model as a shard renders it, reduced as in `seen`, which seams are compared with."""
         return self.shard(task).with_suffix(".coarse.ply")
 
     def read(self, path: Path, most: int) -> bytes:
@@ -251,7 +251,7 @@ def read_head(folder: RunFolder) -> tuple[str, int]:
 
 
 def head_of(folder: RunFolder, content: dict[str, Any]) -> tuple[str, int]:
-    """The same of the content of run.json."""
+    """The scene and the width of a run, by the content of run.json."""
     try:
         return content["scene"]["path"], content["config"]["width"]
     except (KeyError, TypeError) as error:

@@ -168,7 +168,7 @@ def make_info(scene: SceneRef, config: RunConfig, wanted: RunConfig | None = Non
 
 
 def installed_versions() -> dict[str, str]:
-    """Of Python and of the packages that a result may depend on."""
+    """The versions of Python and of the packages that a result may depend on."""
     versions = {"python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):  # a run in a pool of local processes needs no Ray

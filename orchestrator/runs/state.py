@@ -92,7 +92,7 @@ class TaskState:
 
     @property
     def at_rest(self) -> Status:
-        """Its status when it neither runs nor is over."""
+        """The status of a task that neither runs nor is over."""
         return Status.PAUSED if self.held else Status.WAITING
 
 

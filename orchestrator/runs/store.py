@@ -252,7 +252,7 @@ def read_records(
 
 
 def read_news(path: Path, after: int, limit: int, *, timeout_s: float = TIMEOUT_S) -> list[Stored]:
-    """The same with the latest progress of each task, stored or not. Raises as `read_milestones`."""
+    """The records after one, with each task's latest progress, stored or not. Raises as `read_milestones`."""
     if not has_table(path, "latest", timeout_s=timeout_s):
         return read_records(path, after, limit, timeout_s=timeout_s)
     sql = f"SELECT * FROM ({EVENT} WHERE id > :after ORDER BY id LIMIT :limit) UNION ALL {_PROGRESS}"

@@ -26,7 +26,7 @@ def duration(seconds: float) -> str:
 
 
 def counted(number: int, what: str) -> str:
-    """So many of a thing: "1 block", "2,000 cameras"."""
+    """A number of things for people: "1 block", "2,000 cameras"."""
     return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 

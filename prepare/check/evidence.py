@@ -211,5 +211,5 @@ def color_agreement(evidence: Evidence, view: int, directions: Array, rows: NDAr
 
 
 def median_or_zero(values: Sequence[float]) -> float:
-    """Their median; 0 of none."""
+    """The median of values; 0 of none."""
     return float(np.median(values)) if len(values) else 0.0

@@ -227,7 +227,7 @@ def _mirrored(image: PosedImage) -> PosedImage:
 
 
 def _without_half_pixel(image: PosedImage, width: int) -> PosedImage:
-    """The same with the half pixel in longitude taken out; the centre stays.
+    """The image with the half pixel in longitude taken out; the centre stays.
 
     What openMVG saw at longitude 2π(u - W/2)/W is at 2π(u + 0.5 - W/2)/W: the camera turns by π/W
     about its y.

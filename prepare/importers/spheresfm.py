@@ -32,7 +32,7 @@ def find_model(folder: Path) -> Path | None:
 
 
 def require_model(folder: Path) -> Path:
-    """As `find_model`. Raises SceneError if it is nowhere."""
+    """The folder of the model, by `find_model`. Raises SceneError if it is nowhere."""
     found = find_model(folder)
     if found is None:
         raise SceneError(f"{folder}: there is no COLMAP model (cameras and images, .bin or .txt)")

@@ -28,12 +28,12 @@ class MapAlignment:
     reason: str = ""  # why there is none
 
     def as_json(self) -> dict[str, Any]:
-        """As `panolog scene depth --json` has it."""
+        """The map as `panolog scene depth --json` has it."""
         content = asdict(self.alignment) if self.alignment else {}
         return {"name": self.name, **content, **({"reason": self.reason} if self.reason else {})}
 
     def line(self) -> str:
-        """The same as text."""
+        """The map as a line of text."""
         if self.alignment is None:
             return f"{self.name}: left out: {self.reason}"
         it = self.alignment
@@ -55,7 +55,7 @@ class DepthReport:
     maps: tuple[MapAlignment, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """As `--json` prints it: medians are of the maps that fit, None where none does."""
+        """The report as `--json` prints it: medians are of the maps that fit, None where none does."""
         found = [it.alignment for it in self.maps if it.alignment is not None]
 
         def median(values: list[float]) -> float | None:
@@ -77,7 +77,7 @@ class DepthReport:
         }
 
     def lines(self) -> Iterator[str]:
-        """The same as text."""
+        """The report as lines of text."""
         content = self.as_json()
         yield from (it.line() for it in self.maps)
         yield f"{self.made} maps made, {self.kept} kept, {self.given} given"

@@ -135,7 +135,7 @@ def make_masks(
 def masks_as_json(
     results: Sequence[MaskResult], static: StaticRegion | None, nadir: float | None
 ) -> dict[str, Any]:
-    """As `panolog scene mask --json` prints it. Shares are of the sphere, `nadir` is in degrees."""
+    """The output of `panolog scene mask --json`. Shares are of the sphere, `nadir` is in degrees."""
     return {
         "nadir": nadir,
         "made": sum(mask.fresh for mask in results),

@@ -29,7 +29,7 @@ def black_nadir(panoramas: Iterable[NDArray[np.uint8]]) -> float | None:
 
 
 def _black_angle(panorama: NDArray[np.uint8]) -> float:
-    """As `black_nadir`, of one panorama; 0 where it is not black."""
+    """The angle of `black_nadir` for one panorama; 0 where it is not black."""
     lower = panorama[len(panorama) // 2 :]
     black = (lower.max(axis=2) <= _BLACK).mean(axis=1) >= _ROW
     rows = int(np.argmin(black[::-1])) if not black.all() else 0  # all: a picture of the night

@@ -36,7 +36,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Of one panorama."""
+    """The features of one panorama."""
 
     pixels: NDArray[np.float32]  # (N, 2) with the centre of the first pixel at (0.5, 0.5)
     descriptors: NDArray[np.uint8]  # (N, 128)

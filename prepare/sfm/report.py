@@ -39,7 +39,7 @@ class SfmReport:
     into: Into | None = None  # the scene that the sources were added to
 
     def as_json(self) -> dict[str, Any]:
-        """As `--json` prints it. Errors are in pixels of the panoramas, scale errors relative."""
+        """The report as `--json` prints it. Errors are in pixels of the panoramas, scale errors relative."""
         model = self.found.model
         errors = model.errors(self.found.size[0])
         lengths = np.bincount(np.concatenate([rows for rows, _ in model.sightings]))
@@ -88,7 +88,7 @@ class SfmReport:
         }
 
     def lines(self) -> Iterator[str]:
-        """The same as text."""
+        """The report as lines of text."""
         content = self.as_json()
         posed = f"{content['registered']} of {content['panoramas']} panoramas have a pose"
         if self.into is not None:

@@ -136,7 +136,7 @@ class Video:
             frame = coming.result()
 
     def frames_at(self, times: Sequence[float], keys: Sequence[float]) -> Iterator[float]:
-        """Those of `times`, ascending, at which frames are shown; ends at the first one that is not found.
+        """The `times`, ascending, at which frames are shown; ends at the first one that is not found.
 
         Args: keys, what `keys` was when all of the video had been decoded.
         """

@@ -39,12 +39,12 @@ class Span(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Its rows and columns, how many."""
+        """The numbers of rows and columns."""
         return self.bottom - self.top, self.right - self.left
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Its rows and columns, to index an array with."""
+        """The rows and columns, to index an array with."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
 

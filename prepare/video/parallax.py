@@ -116,7 +116,7 @@ class Anchor:
         return moved
 
     def _follow(self, grey: NDArray[np.uint8], rotation: Array) -> Displacement | None:
-        """The same from an estimate of the rotation (3, 3)."""
+        """The displacement, from an estimate of the rotation (3, 3)."""
         seen = self._seen
         for _ in range(_ROUNDS):
             image = self._sphere.turned(grey, rotation)

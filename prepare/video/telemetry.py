@@ -204,7 +204,7 @@ class _Collected:
         return 0.0 if self._times["gravity"] else _STEPS
 
     def places(self) -> Series:
-        """Those with their quality, or else the others; without what cannot be."""
+        """The places with their quality, or else the others; without what cannot be."""
         found = self._series("places" if self._times["places"] else "simple", 3)
         return _on_earth(found.times, found.values)
 
@@ -227,7 +227,7 @@ class _Collected:
             self._values[name].append(values)
 
     def _series(self, name: str, columns: int) -> Series:
-        """All of that name, in the order of time, each time once."""
+        """The samples of a name, in the order of time, each time once."""
         times = np.concatenate([np.zeros(0), *self._times[name]])
         values = np.concatenate([np.zeros((0, columns)), *self._values[name]])
         times, rows = np.unique(times, return_index=True)

@@ -147,7 +147,7 @@ def fit_upright(fixes: GpsFixes, centers: Array, scale: float | None) -> GpsFit 
 
 
 def fit_free(fixes: GpsFixes, centers: Array, scale: float | None) -> GpsFit | None:
-    """As `fit_upright` with up included; None if there is no similarity, or it may tip.
+    """Fits the scene to fixes, up included; None if there is no similarity, or it may tip.
 
     For scenes without a common up: all fixes need an altitude, and must lie far enough from any straight line
     that the heights cannot turn the scene about it.
@@ -218,7 +218,7 @@ def _pairs(count: int) -> NDArray[np.int64]:
 def _refined(
     source: Complex, target: Complex, turn: complex, shift: complex, limit: float, scale: float | None
 ) -> tuple[complex, complex, NDArray[np.bool_]]:
-    """The same with all fixes, each the less the further it is off; and (F,) which of them are not wrong."""
+    """The similarity by all fixes, each the less the further it is off; and (F,) which are not wrong."""
     for _ in range(_ITERATIONS):
         errors, scatter = _errors(source, target, turn, shift, limit)
         weights = (errors <= limit) / (1 + (errors / (2 * scatter)) ** 2) ** 2

@@ -23,7 +23,7 @@ class Bounded(io.BufferedReader):
     _left = _READ
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """As of any stream; raises OSError above the limit."""
+        """Reads as any stream; raises OSError above the limit."""
         self._left -= _READ + 1 if size is None or size < 0 else size
         if self._left < 0:
             raise OSError("the file holds more than any camera writes")

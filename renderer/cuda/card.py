@@ -51,7 +51,7 @@ class Card:
         return Card(index)
 
     def launch(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
-        """As `parts.Launch`: asynchronous, on torch's current stream.
+        """Launches a kernel as `parts.Launch` says: asynchronous, on torch's current stream.
 
         Raises ValueError if a tensor is elsewhere.
         """
@@ -82,7 +82,7 @@ class Kernels:
         block: int,
         arguments: Mapping[str, Argument],
     ) -> None:
-        """As `parts.Launch`, on a stream of the driver. Raises RunError with the driver's reason."""
+        """Launches a kernel on a stream of the driver. Raises RunError with the driver's reason."""
         prepared = self.prepared.get(kernel)
         if prepared is None:
             prepared = self.prepared[kernel] = self._prepare(kernel, arguments)

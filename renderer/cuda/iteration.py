@@ -239,7 +239,7 @@ def add_statistics(
     angle: bool = False,
     contribution: bool = False,
 ) -> None:
-    """As `workers.training.densify.Statistics.add`: one view on the first S rows; none if status is not 0.
+    """Adds a view to the first S rows as `workers.training.densify.Statistics.add`; none if status is not 0.
 
     Args: gradient, views and absolute (S,) float32, changed in place; how lengths and views are measured.
     """

@@ -83,7 +83,7 @@ def target(arch: str) -> tuple[str, str]:
 
 
 def _number(arch: str) -> int:
-    """Of an architecture: 89 of "sm_89"."""
+    """The number of an architecture: 89 of "sm_89"."""
     return int(arch.removeprefix("sm_"))
 
 

@@ -58,7 +58,7 @@ def without_orientation(data: bytes) -> bytes:
 
 
 def _tiff(file: BinaryIO, head: bytes, size: int) -> ImageInfo | None:
-    """Of the first directory. Raises one of `DAMAGE`."""
+    """The size by a TIFF's first directory. Raises one of `DAMAGE`."""
     tags: Any = Tiff.ImageFileDirectory_v2(head)
     file.seek(tags.next)
     tags.load(file)

@@ -36,7 +36,7 @@ class Stored:
     version: Version
 
     def read(self, patience: float = PATIENCE_S) -> bytes:
-        """Its bytes, from the cache or through it. Args: patience, seconds for which a store may fail.
+        """Reads the bytes, from the cache or through it. Args: patience, seconds for which a store may fail.
 
         Raises StoreError if it is another version by now or gone, StoreLostError if the store fails.
         """
@@ -52,7 +52,7 @@ class Cache:
 
     @classmethod
     def of(cls, environment: Mapping[str, str]) -> "Cache":
-        """As the variables say. Raises ConfigError if the bound is no number."""
+        """The cache that the variables describe. Raises ConfigError if the bound is no number."""
         text = environment.get(BOUND, "") or str(_GIB)
         try:
             bound = int(float(text) * 2**30)
@@ -118,7 +118,7 @@ def cache_folder(environment: Mapping[str, str]) -> Path:
 
 
 def variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Those of the variables that are set, for processes on other machines."""
+    """The variables of the cache that are set, for processes on other machines."""
     return {name: environment[name] for name in (FOLDER, BOUND) if environment.get(name)}
 
 

@@ -31,7 +31,7 @@ class _Packed:
         return _Packed(pixels.shape, wide, zstandard.compress(np.ascontiguousarray(halves).data, _LEVEL))
 
     def pixels(self) -> NDArray[Any]:
-        """As they were given."""
+        """The pixels as they were given."""
         found = np.frombuffer(zstandard.decompress(self.data), np.uint8)
         if not self.wide:
             return found.reshape(self.shape)

@@ -66,7 +66,7 @@ class Mover:
 
     @staticmethod
     def to(device: torch.device) -> "Mover":
-        """As the device requires."""
+        """The mover that a device requires."""
         return CudaMover(device) if device.type == "cuda" else Mover()
 
 
@@ -83,7 +83,7 @@ class CudaMover(Mover):
         self._own = threading.local()
 
     def begin(self, layout: Mapping[str, Tensor], fill: Callable[[Tensor], None]) -> Moving:
-        """As `Mover.begin`: returns while the copy runs."""
+        """Begins to move as `Mover.begin`, and returns while the copy runs."""
         pinned = self._buffer(packed_bytes(layout))
         fill(pinned)
         with torch.cuda.stream(self._stream):  # which the memory then belongs to, see `end`
@@ -94,7 +94,7 @@ class CudaMover(Mover):
         return Moving(unpack(memory, layout), memory, ready)
 
     def end(self, moving: Moving) -> dict[str, Tensor]:
-        """As `Mover.end`: the current stream waits for the copy, the host does not."""
+        """Ends as `Mover.end`: the current stream waits for the copy, the host does not."""
         current = torch.cuda.current_stream(self._device)
         if moving.memory is not None and moving.ready is not None:
             current.wait_event(moving.ready)
@@ -103,7 +103,7 @@ class CudaMover(Mover):
         return moving.tensors
 
     def _buffer(self, size: int) -> Tensor:
-        """So many pinned bytes of this thread, which the copy before has left."""
+        """A buffer of pinned bytes of this thread, which the copy before has left."""
         own = self._own
         if (ready := getattr(own, "ready", None)) is not None:
             ready.synchronize()

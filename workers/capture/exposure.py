@@ -27,7 +27,7 @@ _LEAST = 1e-6  # squared: below it the view is black and says nothing of a gain
 
 
 class Exposures:
-    """Those of the views of one task."""
+    """The exposures of the views of one task."""
 
     def __init__(self, start: Tensor, views: Sequence[int]) -> None:
         """Args: start (V, 2, 3) float64, `Panorama.exposure` of each of the views, on the device."""

@@ -65,7 +65,7 @@ class Views:
 
     @staticmethod
     def of(scene: Scene, views: Sequence[int], device: str) -> "Views":
-        """Of three views or more."""
+        """The neighbours of three views or more."""
         centers = scene.centers[list(views)]
         count = min(_NEIGHBOURS, len(views) - 1)
         distances, found = cKDTree(centers).query(centers, count + 1)
@@ -133,7 +133,7 @@ class Visit:
 
 
 class Movers:
-    """Those of the views of one task."""
+    """The movers in the views of one task."""
 
     def __init__(
         self, views: Views, rows: Sequence[int], config: MoversConfig, grid: Grid, task: int
@@ -303,7 +303,7 @@ def state_bytes(config: MoversConfig, views: int, width: int) -> int:
 
 
 def _columns(config: MoversConfig, views: int, width: int) -> int:
-    """Of the grid; 0 if movers are not looked for, or there are too few views to compare."""
+    """The columns of the grid; 0 if movers are not looked for, or there are too few views to compare."""
     columns = min(CELLS, width // _PIXELS) & ~1
     return columns if config.weigh and views > _LEAST else 0
 

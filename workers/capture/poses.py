@@ -100,7 +100,7 @@ class Schedule:
 
 
 class Poses:
-    """Those of the views of one task."""
+    """The poses of the views of one task."""
 
     def __init__(
         self,
@@ -180,7 +180,7 @@ class Poses:
 
     @property
     def curvature(self) -> float:
-        """Of the loss per radian², as its gradients changed along moves; never less than at the beginning."""
+        """The curvature of the loss per radian², as gradients changed along moves; at least the first one."""
         trusted = _TRUSTED * self._pixel**2
         measured = (trusted * _CURVATURE + self._moves[0]) / (trusted + self._moves[1])
         return float(max(measured, _CURVATURE))

@@ -51,7 +51,7 @@ class _Strategy:
 
     @property
     def extent(self) -> float:
-        """That of 3DGS, world units, which rates of means are multiples of: 1.1 radii of the cameras."""
+        """The extent of 3DGS in world units, a factor of rates of means: 1.1 radii of the cameras."""
         return self._schedule.extent
 
     @torch.no_grad()

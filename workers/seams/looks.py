@@ -29,7 +29,7 @@ class Looks:
 
     @property
     def all(self) -> list[Look]:
-        """Those at planes and then those at faces; a camera at several of them as often."""
+        """The looks at planes and then those at faces; a camera at several of them as often."""
         groups = [*self.planes.values(), self.faces]
         return [look for group in groups for found in group.values() for look in found]
 

@@ -43,7 +43,7 @@ class Picture:
         return Picture(look, truth, merged, strip, turns[best], areas[best])
 
     def files(self) -> dict[str, bytes]:
-        """Its files by name: four pictures, and the face as a line on a transparent ground."""
+        """The files by name: four pictures, and the face as a line on a transparent ground."""
         panoramas = {"truth": self.truth, "merged": self.merged}
         panoramas |= dict(zip(("below", "above"), self.blocks, strict=True))
         files = {

@@ -50,7 +50,7 @@ class Seam(_Part):
 
 
 class SeamsFile(_Part):
-    """All of seams.json."""
+    """The content of seams.json."""
 
     mean: Measured  # of `seam` of the faces that have one
     worst: Measured

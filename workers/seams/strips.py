@@ -46,7 +46,7 @@ class Seen:
     distance: NDArray[np.float32]  # (...) world units from the camera; 0 = nothing
 
     def at(self, pixels: NDArray[np.int64]) -> "Seen":
-        """The same at some pixels (S,) of an image, row by row."""
+        """What is seen at some pixels (S,) of an image, row by row."""
         return Seen(
             self.color.reshape(-1, 3)[pixels], self.alpha.ravel()[pixels], self.distance.ravel()[pixels]
         )

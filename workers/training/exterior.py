@@ -43,7 +43,7 @@ def inside(gaussians: Gaussians, cell: Volume | None) -> NDArray[np.bool_]:
 
 
 def exterior_last(gaussians: Gaussians, cell: Volume | None) -> Gaussians:
-    """Those inside of a block's cell first; the others count as sky: they neither train nor densify.
+    """The Gaussians inside of a block's cell first; the others count as sky: they neither train nor densify.
 
     They are not retained either (eq. 12), so what they are called has no other effect.
     """
@@ -66,7 +66,7 @@ class Rooms:
     def of(
         cache: CacheConfig, device: str, panorama: Panorama, width: int, *, bakes: bool, taken: int = 0
     ) -> "Rooms":
-        """As the settings have it.
+        """The rooms that the settings give.
 
         Args: panorama, any of the task's; width in pixels; taken, `TaskSpec.taken`.
         """

@@ -108,6 +108,6 @@ def loss_rows(config: LossConfig, view: View) -> Tensor | None:
 
 
 def _active_part(mask: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
-    """Of the pixels of a mask those that are active, and () float64 their share of it."""
+    """The active pixels of a mask, and () float64 their share of it."""
     part = active & mask
     return part, part.sum(dtype=torch.float64) / mask.sum(dtype=torch.float64).clamp(min=1)

@@ -94,7 +94,7 @@ class Direct:
         self._finished(loss.value, loss.squared)
 
     def settle(self) -> None:
-        """As `Pipeline.settle`: nothing is in flight."""
+        """Does nothing, as nothing is in flight: see `Pipeline.settle`."""
 
 
 @dataclass(frozen=True, eq=False)

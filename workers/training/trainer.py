@@ -227,7 +227,7 @@ class Trainer:
         self.iteration = checkpoint.iteration
 
     def checkpoint(self, copy: Callable[[Tensors], dict[str, Tensor]] = copied) -> Checkpoint:
-        """All of the state, copied to the CPU: steps change it in place."""
+        """The whole state, copied to the CPU: steps change it in place."""
         self.settle()
         tensors = self.state.tensors() | {
             _START: torch.tensor(self.start),

@@ -43,7 +43,7 @@ class WhatIf:
     written: Path | None
 
     def lines(self) -> Iterator[str]:
-        """All of it for people."""
+        """The lines that people read."""
         for block in self.plan.to_json()["blocks"]:
             has = f"{len(block['cameras'])} cameras, {block['gaussians']:,} Gaussians"
             needs = self.blocks.get(block["block"])

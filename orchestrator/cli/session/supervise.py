@@ -76,7 +76,7 @@ def cause(code: int, state: RunState, *, own: bool) -> str | None:
 
 @dataclass
 class _Supervisor:
-    """One at work."""
+    """A supervisor at work."""
 
     run: Supervised
     signals: set[signal.Signals]  # that are blocked here
@@ -85,7 +85,7 @@ class _Supervisor:
     taken: bool = False  # a driver of this supervisor has taken the run over, and recorded the limits
 
     def supervise(self) -> int:
-        """As the function."""
+        """Runs drivers until the run is over; returns what `supervise` returns."""
         run, arguments, tries, saved = self.run, self.run.first, 0, progress_made(self.run.root)
         while True:
             code, why = self._drive(arguments)

@@ -53,7 +53,7 @@ class _Known:
 
 
 class Agents:
-    """Those of all nodes, for the driver."""
+    """The agents of all nodes, for the driver."""
 
     def __init__(self, home: str) -> None:
         """Args: home, Node.id of the driver's machine."""
@@ -80,7 +80,7 @@ class Agents:
             self._known[id].actor.stop.remote(pid)
 
     def notices(self) -> dict[str, LeaveNotice]:
-        """Those in force, by Node.id."""
+        """The leave notices that are in force, by Node.id."""
         waiting = {known.answer: known for known in self._known.values()}
         if waiting:
             ready, _ = ray.wait(list(waiting), num_returns=len(waiting), timeout=0)

@@ -36,7 +36,7 @@ _RECENT_S = 900.0  # for which a machine that could not be started counts as tro
 
 
 class Autoscaler:
-    """That of the cluster that this process has joined, if there is one."""
+    """The autoscaler of the cluster that this process has joined, if there is one."""
 
     def __init__(self, name: str) -> None:
         """Args: name, of the run's tasks."""

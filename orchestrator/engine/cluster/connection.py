@@ -157,7 +157,7 @@ def _init(folder: str, nice: int) -> None:
 
 
 def _niceness() -> int:
-    """As the variable says, else 0: next to a busy process workers with Ray's own 15 hardly run."""
+    """The niceness of workers: Ray's variable, else 0: with Ray's own 15 they hardly run if others do."""
     given = os.environ.get("RAY_worker_niceness", "0")  # noqa: SIM112  # Ray's name
     try:
         return int(given)

@@ -60,7 +60,7 @@ class Stamp:
 
     @classmethod
     def of(cls, path: Path, *, dated: bool) -> "Stamp":
-        """That of a file that exists. Raises OSError if it does not."""
+        """The stamp of a file. Raises OSError if there is none."""
         stat = path.stat()
         return cls(stat.st_size, stat.st_mtime_ns if dated else None)
 

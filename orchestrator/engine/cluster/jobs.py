@@ -50,7 +50,7 @@ class ClusterJob:
 
     @property
     def label(self) -> str:
-        """Its status by the name that people read, as that of a run."""
+        """The status by the name that people read, as that of a run."""
         return "stopped" if self.status == "interrupted" else self.status
 
     @property

@@ -55,7 +55,7 @@ def leave(seconds: int, node: str = "") -> bool:
 
 
 def raylets() -> list[Raylet]:
-    """Those of this machine, or of this container."""
+    """The raylets of this machine, or of this container."""
     found = []
     for process in psutil.process_iter():
         with suppress(psutil.Error):  # it has just ended, or is another user's

@@ -22,7 +22,7 @@ WorkerSpec = TrainSpec | ScoreSpec | EvaluateSpec
 
 @dataclass
 class Attempt:
-    """One at a task that the pool has."""
+    """An attempt at a task that the pool has."""
 
     spec: WorkerSpec
     number: int  # 1 for the first

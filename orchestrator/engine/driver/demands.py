@@ -42,7 +42,7 @@ class Demands:
         self._model = fit(self._samples)
 
     def of(self, tasks: Iterable[TaskId]) -> list[Demand]:
-        """Those of tasks that wait."""
+        """The demands of tasks that wait."""
         return [self._demand(task) for task in tasks]
 
     def work(self, tasks: Sequence[TaskId]) -> Work:
@@ -101,7 +101,7 @@ class Sizes:
         self._shards: dict[int, int] = {}
 
     def of(self, task: TaskId, state: RunState) -> int:
-        """Those of one task. Args: state of the run, which has the plan when blocks are trained."""
+        """The Gaussians of one task. Args: state of the run, which has the plan when blocks are trained."""
         match task.stage:
             case Stage.BLOCK | Stage.ROUND:
                 return self._of_blocks(state)[task.number]

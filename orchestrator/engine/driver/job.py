@@ -51,7 +51,7 @@ class Job:
 
     @property
     def learnt(self) -> "Job":
-        """The same with what Stage I has learnt about how the panoramas were captured."""
+        """This job with what Stage I has learnt about how the panoramas were captured."""
         return replace(self, scene=learnt_scene(self.folder, self.scene))
 
     @property
@@ -218,7 +218,7 @@ class Specs:
 
     @cached_property
     def faces(self) -> tuple[Plane, ...]:
-        """Those whose seams are measured."""
+        """The faces whose seams are measured."""
         config = self.job.config
         planned = config.refine and self.job.folder.plan.exists()  # a run that has ended early may have none
         return most_seen(self.plan, self._seams, config.eval.seams) if planned else ()
@@ -298,7 +298,7 @@ class Specs:
         return self._sharing.put(block_labels(self.job.scene, self.means, self.job.config))
 
     def _surroundings(self, *models: Path, detail: float | None = None) -> list[Surroundings]:
-        """Those of models of the whole place, as their files are now; kept of the last ones."""
+        """The surroundings by models of the whole place, as their files are now; the last ones are kept."""
         job, wanted = self.job, dict[tuple[Path, int, int, float | None], Path]()
         for path in models:
             now = path.stat()
@@ -310,7 +310,7 @@ class Specs:
         return [self._known[key] for key in wanted]
 
     def _reduced(self, task: TaskId, views: tuple[int, ...]) -> ScoreSpec:
-        """The same with levels of detail of the Stage I model."""
+        """The shard of scores with levels of detail of the Stage I model."""
         job, path = self.job, self.job.folder.seen(task)
         job.folder.make(path.parent)
         (surroundings,) = self._surroundings(job.folder.model(COARSE))

@@ -136,13 +136,13 @@ class Machines:
 
 
 def _named(growth: Growth, counts: Mapping[str, int], of: str) -> str:
-    """So many machines of each group, for people."""
+    """The counts of machines of each group, for people."""
     texts = {group.name: group.text() for group in growth.groups}
     return ", ".join(f"{count} {of} {texts[name]}" for name, count in counts.items())
 
 
 def _paused(blocks: Sequence[int]) -> str:
-    """That a run waits because a user has paused these blocks; "" if there are none."""
+    """The line that says that a run waits for blocks which a user has paused; "" if there are none."""
     if len(blocks) < 2:
         return "".join(f"waiting: block {block} is paused" for block in blocks)
     named = ", ".join(map(str, blocks)) if len(blocks) <= _NAMED else f"{blocks[0]} to {blocks[-1]}"

@@ -98,7 +98,7 @@ def uninterrupted(work: Callable[..., T], *arguments: object) -> T:
 
 
 class Requests:
-    """Those that were taken from the folder and are not yet carried out."""
+    """The requests that were taken from the folder and are not yet carried out."""
 
     def __init__(self, folder: RunFolder, journal: Journal, stop: Stop) -> None:
         self._folder = folder

@@ -79,7 +79,7 @@ class Pace:
     cuda: bool
 
     def iteration(self, gaussians: int, together: int) -> float:
-        """Of an iteration where so many tasks share the machines."""
+        """The seconds of an iteration where `together` tasks share the machines."""
         measured = self.basis.measured
         first, second = measured.initial, measured.grown
         if second.gaussians > first.gaussians:
@@ -103,7 +103,7 @@ class Pace:
         return float((measured.threads / min(threads, measured.threads)) ** gain)
 
     def training(self, periods: Sequence[Period], cameras: int, together: int, sky: int) -> float:
-        """Of a task. Args: periods of scene Gaussians; sky Gaussians besides."""
+        """The seconds of a task. Args: periods of scene Gaussians; sky Gaussians besides."""
         iterations = sum(count for count, _ in periods)
         steps = sum(count * self.iteration(gaussians + sky, together) for count, gaussians in periods)
         decoding = self.decode * (min(cameras, iterations) if self.kept >= cameras else iterations)
@@ -112,7 +112,7 @@ class Pace:
 
     @property
     def decode(self) -> float:
-        """Of a panorama, of which some are decoded at a time."""
+        """The seconds of decoding a panorama, of which some are decoded at a time."""
         most = MOST_THREADS if self.cuda else _DECODERS
         return self.basis.measured.decode / min(most, self.basis.measured.threads)
 

@@ -141,7 +141,7 @@ class Estimator:
         return seen, self.scoring(seen, len(self.parts.scored[0]))
 
     def measured(self, merged: int) -> tuple[int, tuple[int, int]]:
-        """The same of a shard of the evaluation. Args: merged, Gaussians of the merged model."""
+        """What a shard of the evaluation needs, as `scored`. Args: merged, Gaussians of the merged model."""
         views, faces = self.parts.measured_with(merged - self._sky)
         seen, around = views + self._sky, faces + self._sky
         host, device = self.rendering(seen, max(map(len, self.parts.measured), default=0))
@@ -261,7 +261,7 @@ class Estimator:
         return self._fixed(views) + gaussians * (2 * VALUES + calibration.SPLAT), 0
 
     def scoring(self, gaussians: int, views: int) -> tuple[int, int]:
-        """As `rendering`, of a task that scores so many views: it also has gradients."""
+        """The host and GPU bytes of a task that scores so many views: it also has gradients."""
         host, _ = self.rendering(gaussians, views)
         on_gpu = device_memory.scoring(gaussians, self._pixels) + self._beyond if self._cuda else 0
         return host, on_gpu
@@ -333,7 +333,7 @@ class Estimator:
 
     @property
     def width(self) -> int:
-        """Of the training, in pixels."""
+        """The width of the training in pixels."""
         return self.config.width or self.scene.width
 
     @property

@@ -39,7 +39,7 @@ def districts_of(scene: Scene, config: RunConfig) -> Districts:
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Those of one job, whose blocks are decided."""
+    """The parts of one job, whose blocks are decided."""
 
     scene: Scene
     config: RunConfig
@@ -72,7 +72,7 @@ class Parts:
 
     @cached_property
     def share(self) -> float:
-        """Of the sparse points, the largest in one cell."""
+        """The share of the sparse points that the fullest cell has."""
         return float(np.bincount(self._of_points).max()) / len(self._of_points)
 
     @cached_property
@@ -115,7 +115,7 @@ class Parts:
 
     @cached_property
     def measured(self) -> Sequence[Sequence[int]]:
-        """The same of the shards of the evaluation that measure panoramas; none where it is one task."""
+        """The panoramas of each shard of the evaluation that measures some; none where it is one task."""
         return () if self.config.measured_detail is None else shards_of(self.scene.test, reduces=True)
 
     @property
@@ -129,7 +129,7 @@ class Parts:
         return self._seen(gaussians, self.scored, self.config.stage2.detail)
 
     def measured_with(self, gaussians: int) -> tuple[int, int]:
-        """The same of those that measure panoramas, and of those that measure seams; 0 if there are none."""
+        """The most Gaussians of a shard that measures panoramas, and of one for seams; 0 without one."""
         detail = self.config.measured_detail or 0.0
         around = [self.around] if self.seams else []
         return self._seen(gaussians, self.measured, detail), self._seen(gaussians, around, detail)
@@ -152,7 +152,7 @@ class Parts:
     def _distinguished(
         self, gaussians: int, rows: Sequence[int], points: NDArray[np.float64], detail: float
     ) -> int:
-        """Of so many Gaussians where these points are, what cameras need of their levels of detail."""
+        """How many of the Gaussians cameras distinguish by levels of detail, if they are where points are."""
         if not self.config.stage2.reduces or gaussians <= 0 or not len(points):
             return max(gaussians, 0)
         angle, least = detail * 2 * math.pi / self.width, scene_length(self.scene)

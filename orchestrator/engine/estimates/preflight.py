@@ -155,7 +155,7 @@ def require_memory(scene: Scene | None, config: RunConfig) -> None:
 
 
 def _whole(scene: Scene, config: RunConfig, basis: Basis) -> Estimate:
-    """Of a job on one machine, one task after another."""
+    """The estimate of a job on one machine, one task after another."""
     one = config if config.decided else change(config, {"blocks": "1x1x1"})
     return Estimator(scene, one, basis, ()).estimate()
 

@@ -22,7 +22,7 @@ class LeaveNotice:
     seconds: float | None = None  # until it leaves, from now on; None = not known
 
     def after(self, seconds: float) -> "LeaveNotice":
-        """The same so many seconds later."""
+        """This notice `seconds` later."""
         return self if self.seconds is None else replace(self, seconds=max(0.0, self.seconds - seconds))
 
 

@@ -122,7 +122,7 @@ class Amazon:
         return bool(self._token)
 
     def notice(self) -> LeaveNotice | None:
-        """As of `Provider`: a spot interruption, with its time, or a rebalance recommendation."""
+        """Amazon's leave notice: a spot interruption, with its time, or a rebalance recommendation."""
         if (action := self._get("spot/instance-action")) is not None:
             return LeaveNotice(Leaving.PREEMPTION, _until(_fields(action).get("time")))
         recommended = self._get("events/recommendations/rebalance") is not None
@@ -161,7 +161,7 @@ class Google:
         return _OF_GOOGLE.items() <= answer.headers.items()
 
     def notice(self) -> LeaveNotice | None:
-        """As of `Provider`: a pre-emption, or maintenance for which the machine is stopped, not moved."""
+        """Google's leave notice: a pre-emption, or maintenance for which the machine is stopped."""
         if self._get("preempted") == "TRUE":
             return LeaveNotice(Leaving.PREEMPTION, _GOOGLE_S)
         stops = self._get("maintenance-event") == "TERMINATE_ON_HOST_MAINTENANCE"
@@ -193,7 +193,7 @@ class Azure:
         return bool(self._name)
 
     def notice(self) -> LeaveNotice | None:
-        """As of `Provider`: the event that comes first."""
+        """Azure's leave notice: the event that comes first."""
         if not self._name:
             self._find_name()
         text = self.service.text("/metadata/scheduledevents?api-version=2020-07-01", _OF_AZURE)

@@ -55,7 +55,7 @@ class Failed:
 
     @staticmethod
     def of(error: BaseException, detail: str) -> "Failed":
-        """That of a worker that has raised an error. Args: detail, its traceback."""
+        """The failure of a worker that has raised an error. Args: detail, its traceback."""
         text = first_line(str(error))
         if isinstance(error, InputError):
             return Failed(text, Failure.INPUT)

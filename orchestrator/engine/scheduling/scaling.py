@@ -94,7 +94,7 @@ class Work:
     whole: float | None = None  # seconds of all tasks of the stage, also those that run or are done
 
     def largest(self) -> Demand:
-        """That which needs most memory."""
+        """The demand that needs most memory."""
         return max(self.demands, key=lambda demand: demand.memory)
 
 

@@ -102,7 +102,7 @@ def _parse(rows: Rows) -> list[tuple[str, Gpu]]:
 
 
 def _visible(listed: list[tuple[str, Gpu]]) -> list[Gpu]:
-    """Those that CUDA_VISIBLE_DEVICES names, by index or by (the beginning of) their UUID, in its order."""
+    """The GPUs that CUDA_VISIBLE_DEVICES names, by index or by (the beginning of) a UUID, in its order."""
     wanted = os.environ.get("CUDA_VISIBLE_DEVICES")
     if not wanted:  # Ray empties it for tasks that request no GPU, such as this one
         return [gpu for _, gpu in listed]

@@ -51,7 +51,7 @@ class Misfortune:
 
 @dataclass(frozen=True)
 class Leave:
-    """That a node leaves, or has left after it had announced that."""
+    """A node's announced end: it leaves, or has left."""
 
     kind: Leaving
     until: float | None = None  # seconds since the epoch at which it leaves; None = not known
@@ -76,7 +76,7 @@ Nodes = Mapping[str, NodeState]  # by Node.id or Node.card
 
 
 def by_host(nodes: Iterable[NodeState]) -> tuple[NodeState, ...]:
-    """Those nodes in the order of their hosts."""
+    """The given nodes in the order of their hosts."""
     return tuple(sorted(nodes, key=lambda node: (node.host, node.id)))
 
 

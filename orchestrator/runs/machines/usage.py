@@ -59,7 +59,7 @@ def with_usage(events: Iterable[T], first: float = _FIRST_S) -> Iterator[T | Usa
 
 
 def measure() -> Usage:
-    """This machine now; the CPU since the last call. Raises OSError if the kernel does not say."""
+    """Measures this machine now, its CPU since the last call. Raises OSError if the kernel does not say."""
     cores, (used, total) = psutil.cpu_percent(percpu=True), memory_usage()
     mine = [cores[core] for core in os.sched_getaffinity(0) if core < len(cores)]
     disk = shutil.disk_usage(tempfile.gettempdir())

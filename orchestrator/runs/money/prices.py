@@ -142,7 +142,7 @@ def read_prices(path: Path) -> PriceList:
 
 
 def parse_json(text: str) -> PriceList:
-    """The same of a list as JSON. Raises ConfigError."""
+    """Reads a price list from JSON. Raises ConfigError."""
     try:
         tree = json.loads(text[:_MOST_BYTES])
     except (ValueError, RecursionError) as error:

@@ -63,7 +63,7 @@ class PaidMachine:
     shared: float = 0.0  # seconds with tasks, each divided by how many there were
 
     def until(self, time: float) -> "PaidMachine":
-        """The same, counted up to a time. An earlier one than before changes nothing."""
+        """This machine, counted up to a time. An earlier one than before changes nothing."""
         seconds = time - self.at
         if not self.open or seconds <= 0:
             return self
@@ -82,7 +82,7 @@ class PaidMachine:
         return replace(self, used=used, idle=idle, lost=lost)
 
     def priced(self, seconds: float) -> Used:
-        """So many seconds of it."""
+        """What `seconds` of this machine cost."""
         return Used(seconds, seconds * (self.reserved_as.price or 0.0) / _HOUR_S)
 
 
@@ -107,7 +107,7 @@ class Spending:
     reached: BudgetReached | None = None  # the run ends early, or has
 
     def until(self, time: float) -> "Spending":
-        """The same, counted up to a time in seconds since the epoch: what is there costs until then."""
+        """This spending, counted up to a time in seconds since the epoch: what is there costs until then."""
         return replace(self, machines={id: machine.until(time) for id, machine in self.machines.items()})
 
     @property
@@ -141,11 +141,11 @@ class Spending:
 
     @property
     def currency(self) -> str:
-        """Of all costs; "" if there are no prices."""
+        """The currency of all costs; "" if there are no prices."""
         return str(self.budget.prices.get("currency", "")) if self.budget else ""
 
     def with_lost(self, records: Iterable[WorkLost]) -> "Spending":
-        """The same with work that was lost: of its machine, what the task bore on average while it ran."""
+        """This spending with lost work: what its task bore of its machine, on average while it ran."""
         machines = dict(self.machines)
         for record in records:
             share = self.running.get(record.task)

@@ -72,7 +72,7 @@ class Settings(Options):
         return (self.source, *self.others)
 
     def steps(self) -> tuple[Step, ...]:
-        """Those that there are, in order."""
+        """The steps that there are, in order."""
         masks = bool(self.nadir or self.static or self.mask_model)
         wanted = {Step.MASKS: masks, Step.DEPTH: self.depth_model is not None}
         return tuple(step for step in Step if wanted.get(step, True))

@@ -246,7 +246,7 @@ class _Runner:
             self._resume_later(entry)
 
     def _lost(self, entry: Entry, code: int | None) -> None:
-        """Its supervisor was killed: another one resumes it, but not without end."""
+        """Resumes an entry whose supervisor was killed, but not without end."""
         losses = self._written(lambda: self.queue.lose(entry.id))
         how = f"signal {-code}" if code is not None else "a signal"
         if losses >= _LOSSES:

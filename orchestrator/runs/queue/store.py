@@ -146,7 +146,7 @@ class Queue:
         raise QueueError(f"the queue has no entry {id}; `panolog queue list` shows all")
 
     def running(self) -> list[Entry]:
-        """Those that have begun and whose end is not known, in order."""
+        """The entries that have begun and whose end is not known, in order."""
         return self._select("state = 'running'")
 
     def next(self) -> Entry | None:

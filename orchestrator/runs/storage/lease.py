@@ -73,7 +73,7 @@ class Lease:
 
 
 def _machine() -> str:
-    """This machine since its start, or this container: two may have one host name."""
+    """The name of this machine since its start, or of this container: two may have one host name."""
     with suppress(OSError):
         return f"{_BOOT.read_text().strip()}:{_MOUNTS.stat().st_ino}"
     return socket.gethostname()

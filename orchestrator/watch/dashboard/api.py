@@ -143,7 +143,7 @@ async def get_run(request: Request, registry: Registry, run: Run) -> Response:
 
 @router.get("/api/runs/{id}/map")
 async def get_map(request: Request, run: Run) -> Response:
-    """Its plan from above."""
+    """The plan of a run from above."""
     return await respond(request, 404, lambda: json_response(request, encoded_map(run.entry.folder)))
 
 
@@ -155,7 +155,7 @@ async def get_camera(request: Request, run: Run, row: int) -> Response:
 
 @router.get("/api/runs/{id}/camera/{row}/panorama")
 async def get_panorama(request: Request, run: Run, row: int) -> Response:
-    """Its picture."""
+    """The picture of a panorama."""
     return await respond(request, 404, _panorama, run, row)
 
 

@@ -105,7 +105,7 @@ async def respond(request: Request, status: int, work: Callable[..., Response], 
 async def respond_json(
     request: Request, work: Callable[..., Any], *arguments: Any, status: int = 503
 ) -> Response:
-    """The same for work that returns what becomes JSON; None is 404."""
+    """Responds as `respond` with what work returns, as JSON; None is 404."""
 
     def answer() -> Response:
         content = work(*arguments)

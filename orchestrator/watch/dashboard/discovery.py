@@ -38,7 +38,7 @@ class RunEntry:
 
     @property
     def folder(self) -> RunFolder:
-        """Its files."""
+        """The files of the run."""
         return RunFolder(self.root / self.path)
 
 

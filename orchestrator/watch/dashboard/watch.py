@@ -97,7 +97,7 @@ class Watch:
 
     @property
     def database(self) -> Path:
-        """Its history."""
+        """The database of the run."""
         return self.entry.folder.database
 
     @property
@@ -119,7 +119,7 @@ class Watch:
             self.resumed = actions.perform(self.entry, self.history, action, block, node) or self.resumed
 
     def refresh_row(self) -> None:
-        """The same for the list: of a run at rest without clients only the row is kept."""
+        """Reads the run anew for the list: of a run at rest without clients only the row is kept."""
         if not self._lock.acquire(blocking=False):
             return  # another thread is reading it
         try:

@@ -131,7 +131,7 @@ def _left(record: TaskFailed) -> bool:
 
 
 def end_of(state: RunState, last: Stored | None, run: str, name: str) -> Notification | None:
-    """That a run has ended, once no driver is at work on it; None if a user has stopped it.
+    """Notifies that a run has ended, once no driver is at work on it; None if a user has stopped it.
 
     Args: last, the RunEnded or RunBegan that came last; run, `run_id`; name, of the run folder.
     """
@@ -164,12 +164,12 @@ def _measured(state: RunState) -> str:
 
 
 def near_of(near: Stored, record: BudgetNear, run: str, name: str) -> Notification:
-    """That a limit of cost or time is near. Args: near, the stored record; run, name as `end_of`."""
+    """Notifies that a limit of cost or time is near. Args: near, the stored record; run, name as `end_of`."""
     return _made(run, name, Kind.OVER_BUDGET, near.id, near.time, f"soon: {record.what}", limit=record.what)
 
 
 def stall_of(seconds: float, why: str, record: int, time: float, run: str, name: str) -> Notification:
-    """That nothing has happened in a live run. Args: why, if it is known; record, the last."""
+    """Notifies that nothing has happened in a live run. Args: why, if it is known; record, the last."""
     text = f"nothing has happened for {duration(seconds)}" + (f": {why}" if why else "")
     return _made(run, name, Kind.STALLED, record, time, text, seconds=seconds)
 

@@ -142,7 +142,7 @@ def _slowness(state: RunState, now: float) -> float:
 def _expected_left(
     stage: Stage, expected: float | None, tasks: Sequence[TaskState], left: Sequence[TaskState], now: float
 ) -> float | None:
-    """That of a stage none of whose tasks has a rate: the estimate, less what is done and has been waited."""
+    """The time left of a stage without rates: the estimate, less what is done and has been waited."""
     if expected is None:
         trains = stage in (Stage.COARSE, Stage.BLOCK) or (stage is Stage.DISTRICT and tasks)
         return None if trains else 0.0

@@ -130,7 +130,7 @@ def by_cell(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def covered(known: NDArray[np.int64], matched: NDArray[np.int64]) -> float:
-    """Of the cells with features that any pair has found, the share in which this pair has."""
+    """The share of the cells with features that any pair has found in which this pair has some."""
     full = known >= _FULL
     if not full.any():
         return 0.0

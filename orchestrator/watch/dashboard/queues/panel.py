@@ -78,7 +78,7 @@ class QueuePanel:
 
 
 def _shown(entries: Sequence[Entry]) -> list[Entry]:
-    """Those that run, those that wait, and of the others the latest."""
+    """The entries that run, those that wait, and of the others the latest."""
     running = [entry for entry in entries if entry.state == State.RUNNING]
     waiting = [entry for entry in entries if entry.state == State.WAITING]
     ended = [entry for entry in entries if not entry.open]

@@ -71,7 +71,7 @@ def _object(content: bytes) -> dict[str, Any]:
 
 
 def finite(value: float | None) -> float | None:
-    """The same, None for what is not a finite number: JSON has none of these."""
+    """The value, None for what is not a finite number: JSON has none of these."""
     return value if value is not None and math.isfinite(value) else None
 
 
