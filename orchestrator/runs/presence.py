@@ -46,7 +46,7 @@ _IN_TEXT = re.compile(r"\(os error (\d+)\)")  # of safetensors
 
 
 class Presence:
-    """The writer: the driver that has the run's lock."""
+    """What the driver that has the run's lock writes into RUN/driver."""
 
     def __init__(self, path: Path) -> None:
         """Makes the file, with a new token. Without room for it nothing is said, and no worker finds it."""
