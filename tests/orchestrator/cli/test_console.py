@@ -29,6 +29,8 @@ from panolog.orchestrator.watch.views.terminal import page, progress
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.cli.program import call
 
+COMMANDS = Path(__file__).parents[3] / "docs" / "commands.md"
+
 
 @pytest.fixture
 def lines(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[list[str], Event]]:
@@ -91,6 +93,22 @@ def test_usage_shows_no_type_of_a_flag_and_no_braces(monkeypatch: pytest.MonkeyP
     for command, arguments in (("dashboard", "[FOLDER]"), ("pause", "RUN BLOCK")):
         usage = call(command, "--help")
         assert f"Usage: root {command} [OPTIONS] {arguments}\n" in re.sub(r" +\n", "\n", usage.stdout)
+
+
+def test_the_table_of_commands_names_each_command_and_no_option_that_is_none() -> None:
+    program, table = get_command(app.app), COMMANDS.read_text().split("\nSCENE and RUN")[0]
+    assert isinstance(program, TyperGroup)
+    groups = {name: it.commands for name, it in program.commands.items() if isinstance(it, TyperGroup)}
+    named: set[tuple[str, ...]] = set()
+    for text in re.findall(r"^\| `panolog ([^`]+)`", table, re.MULTILINE):
+        words = str(text).split()
+        group = words[:1] if words[0] in groups else []
+        named |= {(*group, name) for name in words[len(group)].split(r"\|")}
+    assert named == {tuple(words) for words in commands() if words[1:] or not {*words} <= {*groups}}
+    every = [*program.commands.values(), *(sub for inner in groups.values() for sub in inner.values())]
+    assert set(re.findall(r"--[a-z][\w-]*", table)) <= {
+        name for it in every for param in it.params for name in param.opts
+    }
 
 
 @pytest.mark.parametrize("terminal", [True, False])
