@@ -141,12 +141,12 @@ def clear(folder: RunFolder, *, keep_info: bool = False) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def discard(folder: RunFolder, made: Sequence[Path]) -> None:
-    """Leaves the folder of a run that has not started as it was. Args: made, folders that were missing."""
+def discard(folder: RunFolder, missing: Sequence[Path]) -> None:
+    """Leaves the folder of a run that has not started as it was. Args: missing, what was not there."""
     clear(folder)
     folder.lock.unlink(missing_ok=True)
     with suppress(OSError):  # something else is there by now
-        for path in made:
+        for path in missing:
             path.rmdir()
 
 

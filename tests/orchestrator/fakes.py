@@ -147,11 +147,11 @@ class FakePool(InProcess):
     def cancel(self, task: TaskId) -> None:
         del self._running[task]
 
-    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+    def ready(self, seconds: float, ignored: Set[TaskId] = NONE) -> list[TaskId]:
         if not self._running and self._when_waiting is not None:
             self._when_waiting()
         self.most = max(self.most, len(self._running))
-        return [task for task in self._running if task not in but]
+        return [task for task in self._running if task not in ignored]
 
     def take(self, task: TaskId) -> Message:
         message = next(self._running[task])

@@ -79,16 +79,16 @@ def found(source: Given, config: RunConfig, options: Options) -> NewRun:
     return NewRun(with_width(scene.width, config), scene, None)
 
 
-def discard(folder: RunFolder, made: Sequence[Path]) -> None:
+def discard(folder: RunFolder, missing: Sequence[Path]) -> None:
     """Leaves the folder of a run as it was, unless something is in it that a next driver would use.
 
-    Args: made, folders that were missing.
+    Args: missing, folders that were not there.
     """
     work = folder.scene.with_name(f"{folder.scene.name}.sfm")
     if any(it.is_dir() and any(it.iterdir()) for it in (folder.scene, work, folder.preparation / MASKS)):
         return
     shutil.rmtree(folder.preparation, ignore_errors=True)
-    run_info.discard(folder, made)
+    run_info.discard(folder, missing)
 
 
 def reference(scene: Scene) -> SceneRef:

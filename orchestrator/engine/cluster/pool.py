@@ -185,14 +185,14 @@ class RayPool:
         self._forget(task)
 
     @reported
-    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+    def ready(self, seconds: float, ignored: Set[TaskId] = NONE) -> list[TaskId]:
         """The tasks that have a message, which is here; waits at most `seconds` for the first.
 
-        Args: but, tasks that do not count: Ray fetches the messages of the others, so theirs stay remote.
+        Args: ignored, tasks that do not count: Ray fetches the messages of the others, so theirs stay remote.
         """
         if self._sharing is not None:
             self._sharing.review()
-        others = {task: running for task, running in self._running.items() if task not in but}
+        others = {task: running for task, running in self._running.items() if task not in ignored}
         if not others:
             time.sleep(seconds)  # until a machine joins, which Ray does not report
             return []

@@ -98,8 +98,8 @@ class LocalPool(InProcess):
         running.process.kill()
         running.process.join(_EXIT_S)  # one that the kernel holds for a dead disk stays
 
-    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
-        others = {task: running.messages for task, running in self._running.items() if task not in but}
+    def ready(self, seconds: float, ignored: Set[TaskId] = NONE) -> list[TaskId]:
+        others = {task: running.messages for task, running in self._running.items() if task not in ignored}
         if not others:
             sleep(seconds)
             return []

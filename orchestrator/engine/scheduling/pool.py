@@ -106,10 +106,10 @@ class Pool(Sharing, Protocol):
     def cancel(self, task: TaskId) -> None:
         """Ends a task by force; nothing of it arrives any more."""
 
-    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+    def ready(self, seconds: float, ignored: Set[TaskId] = NONE) -> list[TaskId]:
         """The running tasks that have a message; returns after so many seconds if there are none.
 
-        Args: but, tasks that do not count: their messages stay where they are.
+        Args: ignored, tasks that do not count: their messages stay where they are.
         """
 
     def take(self, task: TaskId) -> Message:

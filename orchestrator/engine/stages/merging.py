@@ -54,19 +54,19 @@ class Early:
 
 
 def merge_run(
-    folder: RunFolder, state: RunState, plan: Plan, near: Regions, early: Early | None = None
+    folder: RunFolder, state: RunState, plan: Plan, margins: Regions, early: Early | None = None
 ) -> Merged:
     """Writes the merged model: every block as trained or else as Stage I left it, then the sky (eq. 13).
 
-    Args: near, what is near faces: where that was repaired, it is taken from there; early, of a run that a
+    Args: margins, what is near faces: where that was repaired, it is taken from there; early, of a run that a
     limit has ended: which blocks are taken from their checkpoints.
     Raises OSError, InputError or RunError if that fails.
     """
     started = time.monotonic()
-    parts, faces = _block_plys(folder, state, plan, early), range(len(near.faces))
+    parts, faces = _block_plys(folder, state, plan, early), range(len(margins.faces))
     repaired = [face for face in faces if state.status(TaskId.repair(face)) == Status.DONE]
     if repaired:
-        _merge_repaired(folder, parts, near, repaired)
+        _merge_repaired(folder, parts, margins, repaired)
     else:
         merge(parts, folder.model(COARSE), folder.point_cloud)
     return _merged(folder, started)
@@ -85,7 +85,7 @@ def unite_blocks(folder: RunFolder, state: RunState, plan: Plan, task: TaskId) -
 
 
 def _merge_repaired(
-    folder: RunFolder, blocks: Sequence[Path], near: Regions, repaired: Sequence[int]
+    folder: RunFolder, blocks: Sequence[Path], margins: Regions, repaired: Sequence[int]
 ) -> None:
     """Writes what no repair has trained of each block, what the repairs have, and the sky."""
     coarse = folder.model(COARSE)
@@ -94,7 +94,7 @@ def _merge_repaired(
     def parts() -> Iterator[Gaussians]:
         for path in blocks:
             for piece in read_ply_chunks(path):
-                yield piece.select(torch.from_numpy(~np.isin(near.of(piece.means.numpy()), repaired)))
+                yield piece.select(torch.from_numpy(~np.isin(margins.of(piece.means.numpy()), repaired)))
         for face in repaired:
             yield from read_ply_chunks(folder.model(TaskId.repair(face)))
         yield sky
@@ -239,14 +239,14 @@ def _labels(piece: Gaussians, plan: Plan) -> NDArray[np.int64]:
     return labels
 
 
-def _write(path: Path, parts: Callable[[], Iterator[Gaussians]], sky: int, like: Path) -> int:
-    """Writes Gaussians as one model, with the offset and the projection of another; returns how many.
+def _write(path: Path, parts: Callable[[], Iterator[Gaussians]], sky: int, model: Path) -> int:
+    """Writes Gaussians as one file, with the offset and the projection of a model; returns how many.
 
     Args: parts is called twice, since the header, which comes first, has their number; sky, how many of them
     at the end are sky.
     """
     count = sum(map(len, parts()))
-    write_ply_parts(path, parts(), count=count, sky=sky, offset=ply_offset(like), exact=ply_exact(like))
+    write_ply_parts(path, parts(), count=count, sky=sky, offset=ply_offset(model), exact=ply_exact(model))
     return count
 
 

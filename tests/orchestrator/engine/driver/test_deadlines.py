@@ -56,7 +56,7 @@ class TimedPool(SetClock, FakePool):
         self._next.pop(task, None)
         self.cancelled.append(task)
 
-    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+    def ready(self, seconds: float, ignored: Set[TaskId] = NONE) -> list[TaskId]:
         for task, messages in self._running.items():
             if task not in self._next:
                 due, message = self.now, next(messages)
@@ -64,7 +64,7 @@ class TimedPool(SetClock, FakePool):
                     due += message.seconds
                     message = Ended() if due == math.inf else next(messages)
                 self._next[task] = due, message
-        ready = [task for task, (due, _) in self._next.items() if due <= self.now and task not in but]
+        ready = [task for task, (due, _) in self._next.items() if due <= self.now and task not in ignored]
         if not self._running and self._when_waiting is not None:
             self._when_waiting()
         if not ready and seconds:

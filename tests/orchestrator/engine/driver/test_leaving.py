@@ -116,9 +116,9 @@ class SlowPool(FakePool):
         if spec.task.stage is Stage.BLOCK and not self.leaving:
             self.leaving[placement.node] = SOON
 
-    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+    def ready(self, seconds: float, ignored: Set[TaskId] = NONE) -> list[TaskId]:
         silent = {task for task in self.running if self.placement(task).node in self.leaving}
-        return super().ready(seconds, but | silent)
+        return super().ready(seconds, ignored | silent)
 
 
 def test_a_task_that_has_not_begun_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -279,7 +279,7 @@ class SilentPool(FakePool):
         super().__init__(says, [node(PLENTY)])
         self.left, self.clock = messages, clock
 
-    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+    def ready(self, seconds: float, ignored: Set[TaskId] = NONE) -> list[TaskId]:
         self.left -= 1
         if self.left >= 0:
             return super().ready(seconds)
