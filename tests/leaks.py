@@ -9,6 +9,7 @@ fixture of the whole session calls `accept` when it has started something.
 import os
 import shutil
 import signal
+import stat
 import tempfile
 import threading
 import time
@@ -214,10 +215,12 @@ def _parent(pid: int) -> int:
 def _sockets() -> set[str]:
     """Inodes of the sockets of this process."""
     found = set()
-    for name in _names(_PROC / "self" / "fd"):
+    for number in _numbers(_PROC / "self" / "fd"):
         with suppress(OSError):
-            found.add(str(Path(_PROC / "self" / "fd" / name).readlink()))
-    return {link[8:-1] for link in found if link.startswith("socket:")}
+            status = os.fstat(number)  # in a hundredth of the time that links of /proc take
+            if stat.S_ISSOCK(status.st_mode):
+                found.add(str(status.st_ino))
+    return found
 
 
 def _listening() -> Iterator[tuple[str, str]]:
