@@ -1,9 +1,13 @@
 """The program, called in this process, for tests."""
 
 import json
+import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pytest
+from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from panolog.orchestrator.cli import app
@@ -23,9 +27,22 @@ STEPS = (  # of a preflight
 )
 
 
+@cache
+def _program() -> Any:
+    """All commands with their options: to make them takes longer than most calls."""
+    return get_command(app.app)
+
+
 def call(*arguments: object) -> Result:
     """What `panolog` with these words prints, and its exit code."""
-    return CliRunner().invoke(app.app, [str(argument) for argument in arguments])
+    runner = CliRunner()
+    with runner.isolation() as streams:
+        with pytest.raises(SystemExit) as end:
+            _program().main([str(argument) for argument in arguments], prog_name="root")
+        sys.stdout.flush()
+        sys.stderr.flush()
+        stdout, stderr, output = (stream.getvalue() for stream in streams)
+    return Result(runner, stdout, stderr, output, None, int(end.value.code or 0), None)
 
 
 def one_line(result: Any) -> str:
