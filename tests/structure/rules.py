@@ -89,12 +89,26 @@ def long_files() -> Iterator[str]:
 def long_functions() -> Iterator[str]:
     """Python functions longer than `MAX_FUNCTION` lines."""
     for file in tracked():
-        if file.suffix == ".py" and len(text(file).splitlines()) > MAX_FUNCTION:
+        if file.suffix == ".py" and _may_have_long_functions(text(file)):
             for node in _statements(file):
                 if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
                     lines = (node.end_lineno or node.lineno) - node.lineno + 1
                     if lines > MAX_FUNCTION:
                         yield f"{file}:{node.name}: {lines} lines"
+
+
+def _may_have_long_functions(code: str) -> bool:
+    """Whether, from a `def` on, the next one or decorator or class that is no deeper is far away."""
+    open_: list[tuple[int, int]] = []  # indent and line of what has not ended
+    for number, line in enumerate([*code.splitlines(), "class"]):
+        bare = line.lstrip()
+        if bare.startswith(("def ", "async def ", "class", "@")):
+            indent = len(line) - len(bare)
+            while open_ and open_[-1][0] >= indent:
+                if number - open_.pop()[1] > MAX_FUNCTION:
+                    return True
+            open_.append((indent, number))
+    return False
 
 
 def long_functions_of_others() -> Iterator[str]:
