@@ -42,6 +42,16 @@ def pytest_configure(config: pytest.Config) -> None:
     leaks.configure(config)
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Files all of whose tests `-m "not system and not nightly"` leaves out: they would be imported."""
+    terms = str(config.getoption("markexpr")).split(" and ")
+    if all(term.startswith("not ") for term in terms) and collection_path.match("test_*.py"):
+        marks = [f"\npytestmark = pytest.mark.{term.removeprefix('not ')}\n" for term in terms]
+        if any(mark in collection_path.read_text() for mark in marks):
+            return True
+    return None
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
     """Keeps what is imported out of all searches for garbage, which took a quarter of the collection."""
