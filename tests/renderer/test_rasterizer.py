@@ -263,6 +263,7 @@ def test_parameters_of_different_lengths_do_not_reach_the_kernels() -> None:
         torch.ops.panolog.rasterize(*wrong, torch.zeros(5, 2), *pose, 64, 32, 3, 0.0, False, [])
 
 
+@pytest.mark.system  # loads much of torch's own tests
 @on_all_devices
 def test_the_custom_ops_keep_torchs_rules(device: str) -> None:
     scene, at = as_leaves(cloud(20).to(device), torch.float32), camera().to(device)
