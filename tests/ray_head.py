@@ -137,7 +137,7 @@ def wait_until(holds: Callable[[], object], what: str, seconds: float = 120) -> 
 def read(url: str) -> str:
     """What a server says; nothing while there is none."""
     try:
-        with urllib.request.urlopen(url, timeout=5) as reply:
+        with urllib.request.urlopen(url, timeout=60) as reply:
             text: str = reply.read().decode()
     except OSError:
         return ""

@@ -253,7 +253,7 @@ def mlflow_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     wait_until(lambda: read(f"{url}/health"), "the server of MLflow", 300)
     yield url
     os.killpg(server.pid, 15)
-    server.wait(30)
+    server.wait(300)
 
 
 @pytest.mark.nightly

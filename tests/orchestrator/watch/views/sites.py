@@ -46,7 +46,7 @@ def serving(page: Path | Site) -> Iterator[str]:
     finally:
         server.shutdown()
         server.server_close()
-        thread.join(10)
+        thread.join()
 
 
 def viewpoints_of(folder: RunFolder, camera: str | None = None) -> Viewpoints:

@@ -152,13 +152,14 @@ LEAVES = NodeLeaving("3f2a81c4d5e6", "gpu-07", Leaving.PREEMPTION, 120.0)
 
 
 @pytest.mark.parametrize("width", [80, 160])
-def test_machines_that_leave_are_shown_with_the_time_left_until_they_have_left(width: int) -> None:
+def test_machines_that_leave_are_shown_with_the_time_left_until_they_have_left(
+    width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now)
     recent: list[Timed] = [*LARGE, (now, LEAVES), (now + 1, TaskYielded(ONE, "gpu-07"))]
     text = " ".join(shown(recent, width, running=True).split())
-    assert re.search(
-        r"gpu-07 \(3f2a81c4\): leaves in (2:00|1:5\d): its provider takes it away; tasks there", text
-    )
+    assert "gpu-07 (3f2a81c4): leaves in 1:58: its provider takes it away; tasks there" in text
     assert "1 moved from machines that left" in text
     later = shown([*recent, (now + 2, NodeLeft("3f2a81c4d5e6", "gpu-07"))], width, running=True)
     assert "gpu-07" not in later
