@@ -94,26 +94,15 @@ def test_its_pictures_are_sent(folder: RunFolder, served: Served) -> None:
     assert served.client.get(f"{path}/preparation/sfm").status_code == 404
 
 
-def pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
 def link(path: Path) -> None:
     secret = path.parents[3] / "secret.json"
     path.rename(secret)
     path.symlink_to(secret)
 
 
-def huge(path: Path) -> None:
-    path.unlink()
-    with path.open("wb") as file:
-        file.truncate(2**40)
-
-
 def test_files_made_to_do_harm_show_nothing(tmp_path: Path) -> None:
-    spoils: dict[str, Callable[[Path], object]] = {"pipe": pipe, "link": link, "huge": huge}
-    spoils["damaged"] = lambda path: path.write_bytes(b"{")
+    """All that is no plain file of a run: tests/orchestrator/runs/test_folder.py."""
+    spoils: dict[str, Callable[[Path], object]] = {"link": link, "damaged": lambda it: it.write_bytes(b"{")}
     for name, spoil in spoils.items():
         spoil(write_preparing(tmp_path / "runs" / name).preparation_settings)
         spoil(write_preparing(tmp_path / "runs" / f"{name} progress").preparation_progress)
