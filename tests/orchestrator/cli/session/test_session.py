@@ -248,17 +248,6 @@ def test_an_odd_scene_and_a_gpu_that_torch_cannot_use_are_noticed(
     assert "RTX 4090 is not used: its driver; the CPU is used" in messages
 
 
-def test_two_drivers_of_one_folder(scene: Path, tmp_path: Path) -> None:
-    root = tmp_path / "run"
-
-    def second() -> None:
-        with pytest.raises(InputError, match="another driver is at work on it"):
-            start(scene, root)
-
-    start(scene, root, second)
-    assert status(root)["status"] == "done"
-
-
 @pytest.mark.parametrize(
     ("error", "line"),
     [
