@@ -13,6 +13,7 @@ from tests.structure.rules import ROOT
 
 PAGE = ROOT / "docs/api.md"
 WIDTH = 100  # of a signature in one line
+# Versions are semantic in these names: none goes without a new major version.
 _NAMES = {
     "Rendering": "rasterize Raster render Render Camera smooth_path",
     "Losses": "photometric_loss PhotometricLoss inverse_depth_loss sphere_rows ssim_map",
