@@ -12,6 +12,7 @@ from panolog.scene.write import StageProgress
 Mapper = Literal["incremental", "global"]
 
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
+_GROWTH = 1.2  # of what is adjusted as a whole: COLMAP's 1.1 takes a third longer and ends in the same poses
 _LEAST = (
     12  # points that a pose is found by: the pairs are known to agree, and COLMAP's 30 break a thin chain
 )
@@ -52,6 +53,7 @@ def _incremental(
     options.mapper.init_max_forward_motion = 1.0
     options.mapper.init_min_tri_angle = _FIRST_ANGLE
     options.mapper.abs_pose_min_num_inliers = _LEAST
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
     models, done = pycolmap.ReconstructionManager(), 2
     if known is not None:
         known.write(work.models)

@@ -8,8 +8,8 @@ across agree. But they put panoramas side by side that share a front alone (`clo
 
 In the order of capture, neighbours are known. A pair that is farther off than a walk along them can drift
 only looks alike, but for where the order was followed only by a guess on the way from one to the other; and
-so does one if more is shared by pairs that agree across each step of that way, but for a guess: what agrees
-across one may be misled as the guess is.
+so does one if more is shared by pairs that agree across each step of that way. What agrees across a guess may
+be misled as the guess is, so only a guess with far more matches outweighs what contradicts it.
 Without an order, a pair only looks alike if it covers clearly less than each pair on the best way from one
 to the other along pairs that agree.
 
@@ -50,6 +50,7 @@ _SHARED = 0.75  # of the median share of features of the pairs that carry: copie
 _CLOSE = 0.5  # of the median step: who stands closer shares more than a front, or is a look-alike
 _DRIFTED = 20.0  # degrees that a walk may be off where it returns
 _RIVALLED = 0.3  # of the edges of the tree that may have a rival
+_FEW = 0.25  # of the matches of a guess: what has fewer looks alike, whatever the guess does
 _MOST = 0.02  # contradictions for each panorama, but for those of the tree, of which there may be none
 
 MotionOf = Callable[[Pair], Motion | None]
@@ -115,11 +116,28 @@ def find_contradictions(
         elif counts and pair.share >= _SHARED * usual_share * np.sqrt(nearer):
             likely.append((pair, fit))
     if likely and skeleton.ordered:
-        doubted = _outvoted(skeleton, agreeing, [pair for pair, _ in likely]) | skeleton.guessed
-        ways = tree_paths(skeleton.edges, [pair.between for pair, _ in likely])
-        likely = [it for it, way_ in zip(likely, ways, strict=True) if not way_ or doubted & set(way_)]
+        likely = _leading_across_doubt(likely, skeleton, agreeing, of_tree)
     contradictions += [fit for _, fit in likely]
     return sorted(contradictions, key=lambda it: (it.points - it.matches, it.between))
+
+
+def _leading_across_doubt(
+    likely: Sequence[tuple[Pair, Contradiction]],
+    skeleton: Skeleton,
+    agreeing: Sequence[Pair],
+    of_tree: Sequence[Pair],
+) -> list[tuple[Pair, Contradiction]]:
+    """The pairs of a walk in order that do not only look alike."""
+    outvoted = _outvoted(skeleton, agreeing, [pair for pair, _ in likely])
+    telling = {it.between: len(it.telling) for it in of_tree if it.between in skeleton.guessed}
+    ways = tree_paths(skeleton.edges, [pair.between for pair, _ in likely])
+    return [
+        (pair, fit)
+        for (pair, fit), way in zip(likely, ways, strict=True)
+        if not way
+        or outvoted.intersection(way)
+        or fit.matches >= _FEW * min((telling[edge] for edge in way if edge in telling), default=np.inf)
+    ]
 
 
 def _fronts(
@@ -179,6 +197,11 @@ def is_trusted(contradictions: Sequence[Contradiction], skeleton: Skeleton, rows
     return few and not broken and not is_repetitive(skeleton, rows)
 
 
+def doubted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton) -> set[Edge]:
+    """The guesses that contradictions lead across."""
+    return {edge for it in _guesses([it.between for it in contradictions], skeleton) for edge in it}
+
+
 def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton, kept: Kept) -> set[Edge]:
     """The guesses that contradictions lead across: as few as explain these, where they have more matches.
 
@@ -188,14 +211,10 @@ def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton,
 
     Args: kept, the pairs that agree.
     """
-
-    def guesses(pairs: Sequence[Edge]) -> list[frozenset[Edge]]:
-        return [skeleton.guessed.intersection(way) for way in tree_paths(skeleton.edges, pairs)]
-
-    ways = guesses([it.between for it in contradictions])
+    ways = _guesses([it.between for it in contradictions], skeleton)
     if not any(ways):
         return set()
-    agreeing = Counter(edge for way in guesses(list(kept)) for edge in way)
+    agreeing = Counter(edge for way in _guesses(list(kept), skeleton) for edge in way)
     left, refuted, doubt = ways, set[Edge](), Counter[Edge]()
     while left := [way for way in left if way and not way & refuted]:
         against = Counter(edge for way in left for edge in way)
@@ -204,6 +223,11 @@ def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton,
     for it, way in zip(contradictions, ways, strict=True):
         doubt.update(dict.fromkeys(way, it.matches))
     return {edge for edge in refuted if doubt[edge] > len(kept.get(edge, ()))}
+
+
+def _guesses(pairs: Sequence[Edge], skeleton: Skeleton) -> list[frozenset[Edge]]:
+    """The guesses on the way between the panoramas of each pair."""
+    return [skeleton.guessed.intersection(way) for way in tree_paths(skeleton.edges, pairs)]
 
 
 def consistent_part(

@@ -19,6 +19,7 @@ from panolog.prepare.sfm.consistency.contradictions import (
     Contradiction,
     Kept,
     consistent_part,
+    doubted_guesses,
     find_contradictions,
     is_trusted,
     refuted_guesses,
@@ -36,6 +37,7 @@ from panolog.scene.write import StageProgress
 _CLOSE = 2.0  # degrees between where points are and where they are seen, for a pair that fits
 _DRIFT = 0.05  # degrees more for each panorama on the way between the two
 _FARTHEST = 6.0  # degrees at most: a window further on is farther off
+_SETTLED = 0.03  # of the pairs that are mapped: if no more change, another time changes no pose by much
 _PURE = 0.8  # share of the matches of a pair that fit, for those to count that cannot be judged
 _ROUNDS = 4  # of mapping with the pairs that fit
 _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
@@ -95,6 +97,7 @@ class Solver:
         self._geometries = Geometries(work, size, max_error, evidence)
         evidence = look_again(self._geometries.marked(evidence), self._geometries)
         self._known, self._given, self._refuted, self._places = known, set[int](), set[Edge](), places
+        self._doubted = set[Edge]()  # guesses that contradictions have led across
         if known is not None:
             self._given = set(posed(known, self._ids).poses)
             judged = [pair for pair in evidence.pairs if not self._given.issuperset(pair.between)]
@@ -158,6 +161,7 @@ class Solver:
         while (found := self._guessed(rows)) is not None and not found.trusted:
             before = sorted(found.found.poses)
             first = first or len(before)
+            self._doubted |= doubted_guesses(found.contradictions, found.skeleton)
             agreed = consistent_part(before, found.contradictions, found.skeleton, found.evidence)
             sides = [(side >= self._given, len(side), side) for side in self._sides(agreed)]
             *_, rows = max(sides, key=lambda it: it[:2], default=(False, 0, set[int]()))
@@ -188,12 +192,12 @@ class Solver:
         return replace(evidence, pairs=tuple(map(thicker, evidence.pairs)))
 
     def _sides(self, rows: Collection[int]) -> list[set[int]]:
-        """The parts of these panoramas that the skeleton connects, but for guesses: nothing judges across.
+        """The parts of these panoramas that the skeleton connects, but for guesses that are doubted.
 
-        Poses that are known judge also what a guess connects with them.
+        Poses that are known judge also what such a guess connects with them.
         """
         skeleton = self._skeleton.among(rows)
-        of = components(skeleton.edges if skeleton.given else skeleton.certain, len(self._ids))
+        of = components(skeleton.edges - (set() if skeleton.given else self._doubted), len(self._ids))
         return [{row for row in rows if of[row] == side} for side in sorted({int(of[row]) for row in rows})]
 
     def solve(self, rows: Collection[int]) -> Solution | None:
@@ -214,7 +218,8 @@ class Solver:
             if turn <= 1 or better:  # the tree alone is not judged by all that its poses decide
                 best = new
             again = _agreeing(new, drift=_DRIFT if turn == 0 else 0.0)
-            if again.keys() == kept.keys():
+            refuted = turn > 0 and refuted_guesses(against, skeleton, kept)
+            if refuted or len(again.keys() ^ kept.keys()) <= _SETTLED * len(kept):
                 break
             kept = again
         return best

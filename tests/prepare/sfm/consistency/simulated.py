@@ -38,13 +38,15 @@ def square(
     order: NDArray[np.int64] | None = None,
     again: float = 0.0,
     dusk: int | None = None,
+    points: float = 1.0,
 ) -> Square:
     """Args: count, places on the way; ground, whether there are points that do not repeat; order, (K,) which
     of these places panoramas have, in the order of their names; again, metres from a place to where a later
-    panorama of it stands; dusk, the first of the panoramas that are taken in another light.
+    panorama of it stands; dusk, the first of the panoramas that are taken in another light; points, how many,
+    in parts of the usual number.
     """
     random = np.random.default_rng(1)
-    points, copy_of = _points(random, _FRONT, _FLOOR * ground)
+    where, copy_of = _points(random, round(_FRONT * points), round(_FLOOR * points) * ground)
     centers, rotations = _way(random, count)
     if order is not None:
         first = np.isin(np.arange(len(order)), np.unique(order, return_index=True)[1])
@@ -53,16 +55,16 @@ def square(
     late = np.arange(len(centers)) >= (len(centers) if dusk is None else dusk)
     keypoints, rows = [], []
     for center, rotation in zip(centers, rotations, strict=True):
-        seen = np.flatnonzero(np.linalg.norm(points - center, axis=1) < _SEEN)
-        pixels = project_to_fractions((points[seen] - center) @ rotation.T) * SIZE
+        seen = np.flatnonzero(np.linalg.norm(where - center, axis=1) < _SEEN)
+        pixels = project_to_fractions((where[seen] - center) @ rotation.T) * SIZE
         keypoints.append(pixels + random.normal(0, _NOISE, pixels.shape))
         rows.append(seen)
     work = database_of(folder, keypoints)
     ids = work.ids()
-    words = random.integers(0, 90, (len(points), 128)).astype(np.float64)
+    words = random.integers(0, 90, (len(where), 128)).astype(np.float64)
     words = (512 * words / np.linalg.norm(words, axis=1, keepdims=True)).round().astype(np.uint8)
-    look = np.where(copy_of >= 0, copy_of, len(points)).min(axis=0)  # of a point and of what looks like it
-    same = np.random.default_rng(2).random(len(points))[look] < _ANY_LIGHT
+    look = np.where(copy_of >= 0, copy_of, len(where)).min(axis=0)  # of a point and of what looks like it
+    same = np.random.default_rng(2).random(len(where))[look] < _ANY_LIGHT
     with pycolmap.Database.open(work.database) as database:
         for number, seen, changed in zip(ids, rows, late, strict=True):
             seen_words = np.where(

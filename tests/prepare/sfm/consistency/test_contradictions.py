@@ -23,13 +23,14 @@ def _contradictions(
     fronts: Sequence[Edge] = (),
     first: float = 0.0,
     last: float = 0.5,
+    copied: int = AROUND,
 ) -> set[Edge]:
     """Of a walk within a ring of houses, each of which looks as that ten degrees further on.
 
     Args: pairs that agree besides the neighbours, and pairs with copies; covers, the coverage of the latter;
         shared, of the features by these, and by the neighbours 2 and 3; guessed, of the walk; fronts,
         pairs that agree on one side alone; first, last, metres along the walk of these two panoramas, while
-        the others are 0.1 apart.
+        the others are 0.1 apart; copied, matches of a pair with copies.
     """
     random = np.random.default_rng(0)
     turn = np.deg2rad(np.arange(AROUND))
@@ -43,7 +44,7 @@ def _contradictions(
     pairs = [Pair(edge, same, 0.9, share=shared[1] if edge == (2, 3) else 0.3) for edge in walk]
     pairs += [Pair(edge, same, 0.9, share=0.3) for edge in agreeing]
     pairs += [Pair(edge, same[: AROUND // 2], 0.9, share=0.3) for edge in fronts]
-    pairs += [Pair(edge, copies, covers, share=shared[0]) for edge in against]
+    pairs += [Pair(edge, copies[:copied], covers, share=shared[0]) for edge in against]
     unit = tuple(ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
     poses = {row: (np.eye(3), shift) for row, shift in enumerate(shifts)}
     found = Posed(poses, dict.fromkeys(range(COUNT), points))
@@ -65,6 +66,14 @@ def test_across_a_guess_a_single_one_counts_whatever_agrees(guess: Edge, counts:
     """What agrees across a guess may be misled as the guess is."""
     agreeing: list[Edge] = [(0, 2), (1, 3), (2, 4), (3, 5)]
     assert _contradictions(agreeing, [(1, 4), (2, 5)], True, 0.9, guessed=frozenset({guess})) == counts
+
+
+@pytest.mark.parametrize("copied", [AROUND // 5, AROUND // 3])
+def test_across_a_guess_with_far_more_matches_none_counts(copied: int) -> None:
+    guessed: frozenset[Edge] = frozenset({(2, 3)})
+    agreeing: list[Edge] = [(0, 2), (1, 3), (2, 4), (3, 5)]
+    found = _contradictions(agreeing, [(1, 4)], True, 0.9, guessed=guessed, copied=copied)
+    assert found == ({(1, 4)} if copied > AROUND // 4 else set())
 
 
 @pytest.mark.parametrize(("covers", "counts"), [(0.9, True), (0.7, False)])

@@ -71,6 +71,15 @@ def test_a_jump_to_a_look_alike_with_what_lies_between_missing_is_not_trusted(
         assert drift(found, place.centers[rows]) < 0.1
 
 
+def test_where_it_is_cut_a_guess_that_nothing_contradicts_stays(tmp_path: Path) -> None:
+    """The walk jumps to a look-alike, and in the end next to where it began."""
+    place = square(tmp_path, count=24, order=np.array([*range(8), *range(19, 9, -1), 22, 23]))
+    with silence_colmap():
+        parts = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    rows = [part.found.poses.keys() for part in parts]
+    assert rows[0] == {*range(8, 18)} and rows[1] > {0, 1, 2, 18, 19}
+
+
 @pytest.mark.parametrize("dusk", [None, 10], ids=["one light", "two"])
 def test_a_walk_that_returns_to_where_it_was_is_whole_in_any_light(tmp_path: Path, dusk: int | None) -> None:
     """What is next to each other shares few matches that show a motion, and in another light few at all."""

@@ -1,0 +1,96 @@
+"""Walks around a square whose sides look alike: `python -m tests.prepare.sfm.consistency.sweep`.
+
+A rule of `consistency` that helps one walk may ruin another: a change of one is judged by how many walks are
+whole, in parts, refused and wrong.
+"""
+
+import argparse
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.prepare.sfm.consistency.solve import Solution, Solver
+from panolog.prepare.sfm.workspace import silence_colmap
+from panolog.scene.write import no_progress
+from tests.prepare.sfm.accuracy import drift
+from tests.prepare.sfm.consistency.simulated import SIZE, square
+
+_RIGHT = 0.1  # metres rms, where the next side of the square is 12 off
+_SHORTEST = 3  # panoramas of a walk between two jumps
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A way around the square: places in the order in which they are photographed."""
+
+    count: int  # places around the square
+    jumps: int = 0  # where the next place is another one, often one that looks alike
+    gap: int = 0  # places that are missing on both sides of a jump
+    points: float = 1.0  # of as many as usual
+    shuffled: bool = False
+    seed: int = 0
+
+    @property
+    def order(self) -> NDArray[np.int64]:
+        """(K,) the places, by a jump across the square, then by others at random."""
+        random, half = np.random.default_rng(self.seed), self.count // 2
+        walk = np.arange(self.count)
+        if self.jumps:
+            end = int(random.integers(_SHORTEST, half - _SHORTEST + 1))
+            back = np.arange(min(end + half, self.count) - 1, end - 1 + self.gap, -1)
+            walk = np.concatenate([walk[:end], back, walk[end + half + self.gap :]])
+        for _ in range(self.jumps - 1):
+            cut = int(random.integers(_SHORTEST, len(walk) - _SHORTEST))
+            walk = np.concatenate([walk[:cut], walk[cut:][::-1]])
+        return random.permutation(walk) if self.shuffled else walk
+
+    def outcome(self, folder: Path) -> str:
+        """One of "whole", "parts", "refused" and "WRONG"."""
+        place = square(folder, count=self.count, order=self.order, points=self.points)
+        with silence_colmap():
+            parts = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+        if not parts:
+            return "refused"
+        if any(_off(part, place.centers) > _RIGHT for part in parts):
+            return "WRONG"
+        return "whole" if len(parts[0].found.poses) == len(place.centers) else "parts"
+
+
+def walks() -> Iterator[Walk]:
+    """All of them, those with one jump first."""
+    for seed in range(4):
+        for points in (1.0, 0.5):
+            for count in (16, 24):
+                for jumps in (1, 2, 3):
+                    yield Walk(count, jumps, points=points, seed=seed)
+                yield Walk(count, points=points, shuffled=True, seed=seed)
+                yield Walk(count, 1, gap=2, points=points, seed=seed)
+        yield Walk(16, 1, gap=2, shuffled=True, seed=seed)
+
+
+def _off(part: Solution, centers: NDArray[np.float64]) -> float:
+    rows = sorted(part.found.poses)
+    found = np.stack([-turn.T @ shift for turn, shift in (part.found.poses[row] for row in rows)])
+    return drift(found, centers[rows])
+
+
+def main() -> None:
+    """Prints the outcome of each walk, and how many have each."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--every", type=int, default=1, help="of so many walks one")
+    outcomes = Counter[str]()
+    for walk in list(walks())[:: parser.parse_args().every]:
+        with tempfile.TemporaryDirectory() as folder:
+            outcome = walk.outcome(Path(folder))
+        outcomes[outcome] += 1
+        print(outcome, walk, flush=True)
+    print(*(f"{count} {outcome}" for outcome, count in sorted(outcomes.items())), sep=", ")
+
+
+if __name__ == "__main__":
+    main()
