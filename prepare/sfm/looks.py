@@ -23,7 +23,7 @@ def look_alikes(work: Workspace, most: int, progress: StageProgress) -> list[tup
     with pycolmap.Database.open(work.database) as database:
         # (N, 128) of each. Products of descriptors are whole and below 2^24: exact in any order.
         words = [np.asarray(database.read_descriptors(it).data[:_LARGEST], np.float32) for it in ids]
-    shared = np.zeros((len(ids), len(ids)), np.int64)
+    shared = np.zeros((len(ids), len(ids)), np.int16)
     for row, own in enumerate(words):
         progress("look-alikes", row, len(ids))
         for start in range(0, row, _AT_ONCE):
@@ -35,12 +35,11 @@ def look_alikes(work: Workspace, most: int, progress: StageProgress) -> list[tup
             for other, part in enumerate(parts, start=start):
                 shared[row, other] = shared[other, row] = _matches(part)
     progress("look-alikes", len(ids), len(ids))
-    order = np.argsort(-shared, axis=1, kind="stable")[:, :most]
     pairs = {
         (min(row, other), max(row, other))
-        for row in range(len(ids))
-        for other in order[row].tolist()
-        if shared[row, other] > 0
+        for row, counts in enumerate(shared)
+        for other in np.argsort(-counts, kind="stable")[:most].tolist()
+        if counts[other] > 0
     }
     return sorted(pairs)
 

@@ -3,28 +3,22 @@
 import tempfile
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import pycolmap
 
 from panolog.prepare.sfm.looks import look_alikes
 from panolog.prepare.sfm.workspace import Workspace
-from panolog.scene.files import atomic
 from panolog.scene.write import StageProgress
 
 Pairing = Literal["auto", "exhaustive", "sequential"]
 FEW = 16  # panoramas up to which each is matched with each: 120 pairs
-_SOME = 400  # up to which look-alikes are found by their largest features: beyond, by visual words
-_NEXT = 3  # neighbours in the order of names, of up to _SOME panoramas
-_LIKELY = 12  # look-alikes of each of them
-_OVERLAP = 10  # neighbours in the order of names; then 16, 32, ... further
-_ALIKE = 8  # panoramas with similar visual words, anywhere in the order
+_NEXT = 3  # neighbours in the order of names
+_MANY = 10  # neighbours in an order that is known; then 16, 32, ... further
+_LIKELY = 12  # look-alikes of each, anywhere in the order
 _NEAR = 24  # neighbours by GPS
 _AT_ONCE = 32  # pairs between two reports of progress, doubled while they take less than _REPORT_S
 _REPORT_S = 5.0  # COLMAP indexes the features of a panorama again in each call
-_WORDS, _WORD_SAMPLES = 4096, 200_000  # visual words, and the descriptors that they are learned from
 
 Pairs = list[tuple[int, int]]  # ids of COLMAP's database, the smaller first
 
@@ -37,27 +31,23 @@ def choose_pairs(
     `auto` takes all pairs up to FEW panoramas. GPS is that of EXIF, where at least half of them have it.
     Args: near, rows of panoramas that a trajectory says are near each other.
     """
-    some = pairing == "auto" and FEW < len(work.numbers) <= _SOME
-    likely = look_alikes(work, _LIKELY, progress) if some else []
+    few = pairing == "exhaustive" or (pairing == "auto" and len(work.numbers) <= FEW)
+    likely = [] if few else look_alikes(work, _LIKELY, progress)
     ids = work.ids()
     with pycolmap.Database.open(work.database) as database:
-        if pairing == "exhaustive" or (pairing == "auto" and len(work.numbers) <= FEW):
-            chosen = pycolmap.ExhaustivePairGenerator(
-                pycolmap.ExhaustivePairingOptions(), database
-            ).all_pairs()
-            return _sorted(chosen)
+        if few:
+            every = pycolmap.ExhaustivePairGenerator(pycolmap.ExhaustivePairingOptions(), database)
+            return _sorted(every.all_pairs())
         sequential = pycolmap.SequentialPairingOptions()
-        sequential.overlap = _NEXT if some else _OVERLAP
-        sequential.quadratic_overlap = not some
+        sequential.overlap = _NEXT if pairing == "auto" else _MANY
+        sequential.quadratic_overlap = pairing == "sequential"
         chosen = pycolmap.SequentialPairGenerator(sequential, database).all_pairs()
-        chosen += [(ids[a], ids[b]) for a, b in near]
+        chosen += [(ids[a], ids[b]) for a, b in [*near, *likely]]
         if database.num_pose_priors() * 2 >= len(work.numbers):
             spatial = pycolmap.SpatialPairingOptions()
             spatial.max_num_neighbors = _NEAR
             chosen += pycolmap.SpatialPairGenerator(spatial, database).all_pairs()
-        if some:
-            return _sorted(chosen + [(ids[a], ids[b]) for a, b in likely])
-        return _sorted(chosen + _alike(work, database, progress))
+        return _sorted(chosen)
 
 
 def match_pairs(work: Workspace, pairs: Pairs, max_error: float, progress: StageProgress) -> None:
@@ -97,42 +87,6 @@ def best_matches(work: Workspace) -> list[tuple[int, int]]:
         for one, other in ((a, b), (b, a)):
             best[one] = max(best[one], (other, int(count)), key=lambda entry: entry[1])
     return best
-
-
-def _alike(work: Workspace, database: pycolmap.Database, progress: StageProgress) -> Pairs:
-    """Pairs that share visual words, of a vocabulary learned from these panoramas: none is downloaded."""
-    images = database.read_all_images()
-    if not work.words.is_file():
-        _learn_words(database, [image.image_id for image in images], work.words, progress)
-    options = pycolmap.VocabTreePairingOptions()
-    options.vocab_tree_path = work.words
-    options.num_images = _ALIKE
-    generator = pycolmap.VocabTreePairGenerator(options, database)
-    found: Pairs = []
-    while not generator.has_finished():
-        found += generator.next()
-        progress("look-alikes", min(len(found) // _ALIKE, len(images)), len(images))
-    return found
-
-
-def _learn_words(
-    database: pycolmap.Database, ids: Sequence[int], path: Path, progress: StageProgress
-) -> None:
-    """Clusters an even sample of all descriptors."""
-    random, parts = np.random.default_rng(0), []
-    share = max(1, _WORD_SAMPLES // len(ids))
-    for done, number in enumerate(ids, start=1):
-        progress("visual words", done, len(ids))
-        data = np.asarray(database.read_descriptors(number).data)
-        parts.append(data[random.permutation(len(data))[:share]])
-    sample = np.concatenate(parts)
-    index = pycolmap.VisualIndex.create(128, 64)
-    build = pycolmap.VisualIndex.BuildOptions()
-    build.num_visual_words = min(_WORDS, max(1, len(sample) // 2))
-    descriptors = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, sample)
-    index.build(build, descriptors.to_float())
-    with atomic(path) as temporary:
-        index.write(temporary)
 
 
 def _sorted(pairs: Sequence[tuple[int, int]]) -> Pairs:

@@ -58,11 +58,6 @@ class Workspace:
         return self.folder / self.name
 
     @property
-    def words(self) -> Path:
-        """The vocabulary of visual words of these panoramas."""
-        return self.folder / "words.bin"
-
-    @property
     def images(self) -> Path:
         """The panoramas by number: links, or empty pictures of their size."""
         return self.folder / "images"
@@ -103,8 +98,7 @@ class Workspace:
             return
         for leftover in (self.images, self.models):
             shutil.rmtree(leftover, ignore_errors=True)
-        for file in (self.database, self.words):
-            file.unlink(missing_ok=True)
+        self.database.unlink(missing_ok=True)
         self.images.mkdir(parents=True)
         for number, panorama in zip(self.numbers, self.panoramas, strict=True):
             if panorama.path.suffix.lower() == _WEBP:

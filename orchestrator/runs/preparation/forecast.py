@@ -14,18 +14,16 @@ from panolog.orchestrator.runs.preparation.settings import Settings, Step
 BEFORE_MASKS = ("frames", "stitching", "metadata", "sizes")  # parts of finding poses, in order
 PARTS: dict[Step, tuple[str, ...]] = {  # of steps, in order, as they name them in their progress
     Step.MASKS: ("static regions", "masks"),
-    Step.SFM: (
-        *BEFORE_MASKS,
-        *("features", "visual words", "look-alikes", "matches", "poses", "scene"),
-    ),
+    Step.SFM: (*BEFORE_MASKS, "features", "look-alikes", "matches", "poses", "scene"),
     Step.DEPTH: ("depth",),
     Step.CHECK: ("check",),
 }
 _FRAME, _FRAME_MEGAPIXEL = 0.06, 0.005  # of a video
 _KEPT = 30  # frames, of which one becomes a panorama
-_OF_PANORAMA = {"visual words": 0.1, "poses": 0.6, "scene": 0.03, "check": 0.15}
+_OF_PANORAMA = {"poses": 0.7, "scene": 0.03, "check": 0.15}
 _OF_MEGAPIXEL = {"static regions": 0.05, "masks": 0.05, "features": 1.4}
 _NETWORK = 5.0  # for a panorama
+_LOOK = 0.0004  # to see whether two panoramas look alike: all are compared
 _PAIR, _PAIRS = 0.065, 7  # to match two panoramas; so many pairs for each
 _SERIAL = ("poses", "scene")  # parts of one process
 REPEATED = {"poses": 0.25}  # parts that begin again, an unknown number of times: what is taken for done
@@ -48,7 +46,9 @@ def parts_of(settings: Settings, chosen: int | None = None) -> dict[tuple[Step, 
         for part in PARTS[step]
     }
     found[Step.SFM, "frames"] = frames * (_FRAME + size * _FRAME_MEGAPIXEL)
-    found[Step.SFM, "matches"] = _PAIR * min(_PAIRS * count, count * (count - 1) // 2)
+    every = count * (count - 1) // 2
+    found[Step.SFM, "look-alikes"] = _LOOK * every
+    found[Step.SFM, "matches"] = _PAIR * min(_PAIRS * count, every)
     if settings.mask_model:
         found[Step.MASKS, "masks"] += count * _NETWORK
     if settings.depth_model:
