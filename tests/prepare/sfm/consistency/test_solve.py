@@ -1,6 +1,7 @@
 """A square with four equal sides: in order, in any order, and where the sides cannot be distinguished."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -8,8 +9,9 @@ import pytest
 
 from panolog.prepare.sfm.consistency.solve import Solution, Solver
 from panolog.prepare.sfm.links import Link
+from panolog.prepare.sfm.mapping import map_pairs
 from panolog.prepare.sfm.sparse_model import SparseModel
-from panolog.prepare.sfm.workspace import silence_colmap
+from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.write import no_progress
 from tests.prepare.sfm.accuracy import drift, length
 from tests.prepare.sfm.consistency.simulated import SIZE, Square, square
@@ -41,13 +43,27 @@ def test_neighbours_in_order_outweigh_sides_that_look_the_same(tmp_path: Path) -
     assert found.trusted
 
 
-def test_a_guess_where_the_walk_jumps_is_refuted_and_another_pair_joins_the_parts(tmp_path: Path) -> None:
-    """The walk jumps to where the opposite side looks the same, and returns from there."""
+def test_a_guess_where_the_walk_jumps_is_refuted_and_another_pair_joins_the_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The walk jumps to where the opposite side looks the same, and returns from there.
+
+    What a wrong guess misleads is mapped no further than it takes to see that.
+    """
+    mapped = list[int]()
+
+    def counted(work: Workspace, *others: Any) -> pycolmap.Reconstruction | None:
+        with pycolmap.Database.open(work.database) as database:
+            mapped.append(len(database.read_two_view_geometries()[0]))
+        return map_pairs(work, *others)
+
+    monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.map_pairs", counted)
     order = np.array([0, 1, 2, 3, 4, 5, 13, 12, 11, 10, 9, 8, 7, 6, 14, 15])
     place = square(tmp_path, count=COUNT, order=order)
     found = _solve(place)
     assert found.skeleton.ordered and found.trusted
     assert _error(place, found) < 0.1
+    assert len(mapped) == 4  # twice with the wrong guess, and twice with the right one
 
 
 @pytest.mark.parametrize("ordered", [True, False])
