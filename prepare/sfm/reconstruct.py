@@ -136,13 +136,10 @@ def _refusal(
     if not found and cuts:
         worst = max(cuts, key=lambda it: it.matches - it.points)
         first, second = (names[row] for row in worst.between)
-        fit = "they stand side by side, but share less than neighbours"
-        if worst.points < worst.matches:
-            fit = f"{worst.points} of {worst.matches} points fit"
         return (
             f"{work.panoramas[0].path.parent}: the poses contradict the matches of {len(cuts)} pairs, most "
-            f"of all {first} and {second} ({fit}), as where windows repeat; name the panoramas in the "
-            "order of the walk, take more between these, or accept parts with --partial"
+            f"of all {first} and {second}, which {worst.reason}, as where windows repeat; name the "
+            "panoramas in the order of the walk, take more between these, or accept parts with --partial"
         )
     if not found:
         return (

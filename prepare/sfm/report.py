@@ -77,6 +77,7 @@ class SfmReport:
                     "between": [self._name(row) for row in pair.between],
                     "matches": pair.matches,
                     "points": pair.points,
+                    "reason": pair.reason,
                 }
                 for pair in self.found.contradictions
             ],
@@ -124,13 +125,9 @@ class SfmReport:
             )
         for pair in content["contradictions"]:
             one, other = pair["between"]
-            but = f"{pair['points']} fit their poses"
-            if pair["points"] == pair["matches"]:
-                but = "stand so close that they should share more"
             yield (
-                f"contradiction: {one} and {other} share {pair['matches']} features, but {but}: one of them "
-                "stands elsewhere, as happens where windows repeat. Take more panoramas around them, or "
-                "leave some out"
+                f"contradiction: {one} and {other} {pair['reason']}: one of them stands elsewhere, as where "
+                "windows repeat. Take more panoramas around them, or leave some out"
             )
         if self.into is None:
             yield self._frame()

@@ -63,7 +63,14 @@ class Contradiction:
 
     between: Edge  # rows of the panoramas
     matches: int  # verified ones, of which a point is known
-    points: int  # of these, whose points are where they are seen; all of them: too few for two so close
+    points: int  # of these, whose points are where they are seen; all of them, if they share a front alone
+
+    @property
+    def reason(self) -> str:
+        """What the two share that contradicts their poses, as the end of a sentence."""
+        if self.points < self.matches:
+            return f"share {self.matches} features, but {self.points} fit their poses"
+        return f"share {self.matches} features on one side alone, though they would stand close together"
 
 
 def find_contradictions(
