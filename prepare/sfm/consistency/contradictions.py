@@ -206,7 +206,7 @@ def is_trusted(contradictions: Sequence[Contradiction], skeleton: Skeleton, rows
 
 def doubted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton) -> set[Edge]:
     """The guesses that contradictions lead across."""
-    return {edge for it in _guesses([it.between for it in contradictions], skeleton) for edge in it}
+    return set[Edge]().union(*_guesses([it.between for it in contradictions], skeleton))
 
 
 def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton, kept: Kept) -> set[Edge]:

@@ -65,6 +65,11 @@ class Solution:
         return is_trusted(self.contradictions, self.skeleton, self.found.poses)
 
     @cached_property
+    def refuted(self) -> set[Edge]:
+        """The guesses that its contradictions refute."""
+        return refuted_guesses(self.contradictions, self.skeleton, self.kept)
+
+    @cached_property
     def sparse(self) -> SparseModel:
         """The poses and points in our convention."""
         return from_colmap(self.model, self.numbers, self.size)
@@ -140,11 +145,9 @@ class Solver:
         """The reconstruction of these panoramas: a guess that it refutes makes room for the next one."""
         found = self.solve(rows)
         for _ in range(_GUESSES):
-            if found is None or not (
-                against := refuted_guesses(found.contradictions, found.skeleton, found.kept)
-            ):
+            if found is None or not found.refuted:
                 break
-            self._refuted |= against
+            self._refuted |= found.refuted
             before = self._skeleton
             self._skeleton = find_skeleton(self._evidence, self._places, self._given, self._refuted)
             self._evidence = self._thicker(self._evidence, self._skeleton.tree - before.tree)
@@ -218,8 +221,7 @@ class Solver:
             if turn <= 1 or better:  # the tree alone is not judged by all that its poses decide
                 best = new
             again = _agreeing(new, drift=_DRIFT if turn == 0 else 0.0)
-            refuted = turn > 0 and refuted_guesses(against, skeleton, kept)
-            if refuted or len(again.keys() ^ kept.keys()) <= _SETTLED * len(kept):
+            if (turn and new.refuted) or len(again.keys() ^ kept.keys()) <= _SETTLED * len(kept):
                 break
             kept = again
         return best
