@@ -56,13 +56,13 @@ class Walk:
             parts = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
         if not parts:
             return "refused"
-        if any(_off(part, place.centers) > _RIGHT for part in parts):
+        if any(off(part, place.centers) > _RIGHT for part in parts):
             return "WRONG"
         return "whole" if len(parts[0].found.poses) == len(place.centers) else "parts"
 
 
 def walks() -> Iterator[Walk]:
-    """All of them, those with one jump first."""
+    """The walks of the sweep, for each seed."""
     for seed in range(4):
         for points in (1.0, 0.5):
             for count in (16, 24):
@@ -73,10 +73,9 @@ def walks() -> Iterator[Walk]:
         yield Walk(16, 1, gap=2, shuffled=True, seed=seed)
 
 
-def _off(part: Solution, centers: NDArray[np.float64]) -> float:
-    rows = sorted(part.found.poses)
-    found = np.stack([-turn.T @ shift for turn, shift in (part.found.poses[row] for row in rows)])
-    return drift(found, centers[rows])
+def off(part: Solution, centers: NDArray[np.float64]) -> float:
+    """Metres rms between the places of a part and the true ones, centers (K, 3) of all panoramas."""
+    return drift(part.sparse.centers, centers[list(part.sparse.rows)])
 
 
 def main() -> None:

@@ -13,8 +13,9 @@ from panolog.prepare.sfm.mapping import map_pairs
 from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.write import no_progress
-from tests.prepare.sfm.accuracy import drift, length
+from tests.prepare.sfm.accuracy import length
 from tests.prepare.sfm.consistency.simulated import SIZE, Square, square
+from tests.prepare.sfm.consistency.sweep import off
 
 pytestmark = pytest.mark.system
 
@@ -30,9 +31,7 @@ def _solve(place: Square) -> Solution:
 def _error(place: Square, found: Solution) -> float:
     """Metres, of all panoramas."""
     assert len(found.found.poses) == len(place.centers)
-    return drift(
-        np.stack([-turn.T @ shift for _, (turn, shift) in sorted(found.found.poses.items())]), place.centers
-    )
+    return off(found, place.centers)
 
 
 def test_neighbours_in_order_outweigh_sides_that_look_the_same(tmp_path: Path) -> None:
@@ -82,9 +81,7 @@ def test_a_jump_to_a_look_alike_with_what_lies_between_missing_is_not_trusted(
     assert not ordered or [{*part.found.poses} for part in parts] == [{*range(6)}, {*range(6, 10)}]
     assert parts and all(part.trusted for part in parts)
     for part in parts:
-        rows = sorted(part.found.poses)
-        found = np.stack([-turn.T @ shift for turn, shift in (part.found.poses[row] for row in rows)])
-        assert drift(found, place.centers[rows]) < 0.1
+        assert off(part, place.centers) < 0.1
 
 
 def test_where_it_is_cut_a_guess_that_nothing_contradicts_stays(tmp_path: Path) -> None:
