@@ -164,7 +164,7 @@ def _packed(source: SplatSource, order: NDArray[np.int64]) -> dict[str, Bytes]:
 
 
 def _fractional_bits(extent: float, scales: Bytes) -> int:
-    """As few bits as the smallest Gaussians need: what is below is noise, which does not compress."""
+    """The fewest bits that the smallest Gaussians need: lower bits are noise, which does not compress."""
     middle = np.partition(scales, 1, axis=1)[:, 1]
     small = np.sort(middle)[int(len(middle) * _SMALL)]
     size = float(np.exp(unpack_scales(np.array([small], np.uint8)))[0])
