@@ -16,7 +16,7 @@ PACKAGES = {  # a module: its name for people, and the extra of pyproject.toml
     "ray": ("Ray", "cluster"),
     "requests": ("requests", "cluster"),
     "fastapi": ("FastAPI", "dashboard"),
-    "matplotlib": ("matplotlib", "dashboard"),  # which `prepare` brings as well
+    "matplotlib": ("matplotlib", "prepare"),
     "starlette": ("Starlette", "dashboard"),
     "uvicorn": ("uvicorn", "dashboard"),
     "OpenEXR": ("OpenEXR", "export"),

@@ -33,10 +33,11 @@ from panolog.orchestrator.runs.info import RunInfo
 from panolog.orchestrator.runs.money.prices import PriceList, prices_of
 from panolog.orchestrator.runs.records import Noticed, Part, PreflightSaved, Preparing
 from panolog.orchestrator.runs.state import ignore
+from panolog.orchestrator.watch.views.plan_picture import write_plan_picture
 from panolog.partition.plan import Plan
 from panolog.prepare.check.layers import look_at_layers
 from panolog.renderer.process import choose_device
-from panolog.scene.errors import ClusterError, InputError, MissingPackageError, installed
+from panolog.scene.errors import ClusterError, InputError
 from panolog.scene.files import here
 from panolog.scene.model import Scene
 from panolog.workers.tasks import NOTHING_HELD_OUT
@@ -134,11 +135,6 @@ class Driving:
         self._does("starting workers")
 
         def draw(plan: Plan, means: NDArray[np.float32]) -> None:
-            if not installed("matplotlib"):
-                self._warn(f"plan.png is not drawn: {MissingPackageError.of('matplotlib')}")
-                return
-            from panolog.orchestrator.watch.views.plan_picture import write_plan_picture
-
             folder.make(folder.plan_picture.parent)
             write_plan_picture(folder.plan_picture, plan, means)
 

@@ -7,7 +7,7 @@ named by an id of 16 hex digits: no path ever comes from a client. An error is {
 GET /, /runs/{id}, /compare, /static/…, /vendor/… pages, scripts and styles
 GET /api/runs                         RunList
 GET /api/runs/{id}                    RunPage
-GET /api/runs/{id}/map                a plotly figure: see `figures.map_figure`; all its blocks are waiting
+GET /api/runs/{id}/map                see `plan_map.map_figure`; all its blocks are waiting
 GET /api/runs/{id}/camera/{row}       CameraView
 GET /api/runs/{id}/camera/{row}/panorama
                                       JPEG, the panorama of the scene at a width of at most 1,024 pixels

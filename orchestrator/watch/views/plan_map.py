@@ -1,19 +1,22 @@
-"""A plan from above as rasters: which block each pixel belongs to, how far it is, and where points are.
+"""The map of a run as data, which the page and plan.png draw: rasters, lines, marks and words.
 
 A thousand cells cost as much to draw as two: they are one raster.
 """
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.watch.views.palette import block_color
+from panolog.orchestrator.watch.views.palette import SEAM_GRADES, block_color, seam_grade
 from panolog.partition.cells import Face, Grid
 from panolog.partition.contraction import contract, expand
-from panolog.partition.faces import Plane
+from panolog.partition.faces import Plane, planes_between
 from panolog.partition.plan import Plan
 from panolog.scene.ply_table import read_table, sky_of
 
@@ -21,10 +24,20 @@ _CELLS = 360  # samples of the cells along the longer side
 _POINTS = 640  # the same of the points
 _REACH = (1.15, 1.6)  # half extents of the AABB that are shown at least and at most
 _SHAPE = (1.4, 1.7)  # width by height of a window: outer cells have no end, so any window can be filled
-LABELS = 80  # blocks in the window up to which each has a number
-RINGS = (9, 14, 18)  # pixels: a camera, and the rings around it for the second and the third block it trains
+_LABELS = 80  # blocks in the window up to which each has a number
+_RINGS = (9, 14, 18)  # pixels: a camera, and the rings around it for the second and the third block it trains
+_RINGED = 1_500  # cameras up to which rings are drawn: each is a shape of its own
 _LABEL_GRID = 24  # rows and columns of candidates for the position of a label
 _ALONG = 120  # samples of a face between cells
+_LEGEND = {  # what a part of the map is; the page and plan.png have a sign for each
+    "cameras": "camera",
+    "rings": "rings: other blocks that it trains",
+    "points": "points",
+    "fixes": "GPS",
+    "box": "box, beyond which cells bend",
+}
+
+Figure = dict[str, Any]  # {"data": parts, "layout": axes, "blocks": numbers, colours and words}
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,11 +146,6 @@ class MapWindow:
         return ids, best
 
 
-def served(plan: Plan, k: int) -> list[int]:
-    """The blocks that the k-th camera trains, its own first."""
-    return sorted(plan.assignment.blocks_of(k).tolist(), key=lambda b: b != plan.camera_blocks[k])
-
-
 def window_on(plan: Plan, points: NDArray[np.floating]) -> MapWindow:
     """The window that shows the AABB and most of the points (P, 3), but not much more than the AABB."""
     depth = int(np.argmin(np.ptp(plan.centers, axis=0)))
@@ -152,6 +160,134 @@ def window_on(plan: Plan, points: NDArray[np.floating]) -> MapWindow:
     size[0] = max(size[0], _SHAPE[0] * size[1])
     size[1] = max(size[1], size[0] / _SHAPE[1])
     return MapWindow(plan, (across, up, depth), center - size, center + size)
+
+
+def map_figure(
+    plan: Plan,
+    points: NDArray[np.floating],
+    seams: Mapping[tuple[int, int], float] | None = None,
+    *,
+    planned: bool = True,
+    fixes: NDArray[np.floating] = np.empty((0, 3)),  # noqa: B008  # never changed
+) -> Figure:
+    """A plan from above in world space: cells, points, faces, AABB, fixes of GPS and cameras.
+
+    "blocks" has `planned`; `count` and `colors` of all blocks; `names` of cameras; parts and words of the
+    `legend`, `grades` for that of seams; and for blocks on top of each other `layers`, the `layer` shown and
+    the `stride` of ids between layers. The part "blocks" has the ids of the lowest layer as `z`.
+
+    Args: points (P, 3) of the scene, such as those of `read_points`; seams of faces by their blocks; planned,
+    False of an outline: its only block is none, and cameras without a name are fixes; fixes (F, 3).
+    """
+    view, seams = window_on(plan, points), seams or {}
+    parts: list[Figure] = [
+        _raster("blocks", view, view.cells.astype("<i2" if plan.grid.count < 2**15 else "<i4")),
+        _raster("points", view, view.density(points)),
+        _line("faces", view.faces()),
+        *_seams(view, seams),
+        _line("box", view.outline()[: None if planned else 0]),
+        {"name": "fixes"} | _places(view, fixes.astype(float).round(3)),
+        *_cameras(view, planned=planned),
+        _labels(view, planned=planned),
+    ]
+    present = {"points", *(part["name"] for part in parts if part.get("x")), *(["rings"] if planned else [])}
+    ranges = zip(view.axes, view.lower.tolist(), view.upper.tolist(), strict=False)
+    axes = [{"title": {"text": f"{'xyz'[axis]} (world units)"}, "range": [*ends]} for axis, *ends in ranges]
+    return {
+        "data": parts,
+        "layout": {"xaxis": axes[0], "yaxis": axes[1]},
+        "blocks": {
+            "planned": planned,
+            "count": plan.grid.count,
+            "colors": view.colors,
+            "names": list(filter(None, plan.names)),
+            "legend": [item for item in _LEGEND.items() if item[0] in present],
+            "grades": _grades(seams.values()),
+            "layers": view.layers,
+            "layer": view.layer,
+            "stride": view.stride,
+        },
+    }
+
+
+def _raster(name: str, view: MapWindow, values: NDArray[Any]) -> Figure:
+    """A raster of the window: its values, lowest row first, the first centre, and the step to the next."""
+    step = (view.upper - view.lower) / values.shape[::-1]
+    (x0, y0), (dx, dy) = (view.lower + step / 2).tolist(), step.tolist()
+    return {"name": name, "z": values, "x0": x0, "dx": dx, "y0": y0, "dy": dy}
+
+
+def _places(view: MapWindow, places: NDArray[np.floating]) -> dict[str, list[float]]:
+    """Where points (P, 3) are on the map."""
+    return {"x": places[:, view.axes[0]].tolist(), "y": places[:, view.axes[1]].tolist()}
+
+
+def _line(name: str, points: NDArray[np.float64]) -> Figure:
+    """A line through the points (L, 2), with a gap at each NaN."""
+    x, y = ([None if np.isnan(v) else float(f"{v:.6g}") for v in column] for column in points.T)
+    return {"name": name, "x": x, "y": y}
+
+
+def _grades(seams: Iterable[float]) -> list[list[str]]:
+    """Text and colour of each grade of seams that there is."""
+    present, limits = {seam_grade(seam) for seam in seams}, [least for least, _ in SEAM_GRADES.values()]
+    spans = [f"{low:g} to {high:g}" if low else f"below {high:g}" for low, high in pairwise(limits)]
+    return [
+        [f"seam {span}", color]
+        for (name, (_, color)), span in zip(
+            SEAM_GRADES.items(), [*spans, f"{limits[-1]:g} and more"], strict=True
+        )
+        if name in present
+    ]
+
+
+def _seams(view: MapWindow, seams: Mapping[tuple[int, int], float]) -> list[Figure]:
+    """A thick line for each face whose seam was measured, the worst above all others."""
+    planes = {(plane.below, plane.above): plane for plane in planes_between(view.plan.grid)} if seams else {}
+    traces = []
+    for blocks, seam in sorted(seams.items(), key=lambda item: item[1]):
+        if (plane := planes.get(blocks)) is not None and plane.axis != view.axes[2]:
+            text = f"seam between blocks {blocks[0]} and {blocks[1]}: {seam:.2f}"
+            color = {"line": {"color": SEAM_GRADES[seam_grade(seam)][1]}}
+            traces.append(_line("seams", view.line(plane)) | color | {"text": text})
+    return traces
+
+
+def _cameras(view: MapWindow, *, planned: bool) -> list[Figure]:
+    """A disc for each camera in the colour of its own block, and rings for other blocks that it trains."""
+    plan = view.plan
+    blocks = [  # of each camera, its own first
+        sorted(plan.assignment.blocks_of(k).tolist(), key=int(own).__ne__)
+        for k, own in enumerate(plan.camera_blocks)
+    ]
+    size = float(np.clip(60 / max(len(blocks), 1) ** 0.5, 0.45, 1.0))
+    traces = []
+    for ring in reversed(range(len(_RINGS) if len(blocks) <= _RINGED else 1)):
+        here = [k for k, its in enumerate(blocks) if len(its) > ring and plan.names[k]]
+        marker = {
+            "size": _RINGS[ring] * size,
+            "color": [block_color(blocks[k][ring]) for k in here],
+            "line": {"width": 1.2 * size},
+        }
+        trace = {"name": f"cameras, ring {ring}" if ring else "cameras", "marker": marker}
+        texts = {"text": [planned * f"trains {_listed(blocks[k])}" for k in here]}
+        traces.append(
+            trace | texts | {"customdata": [plan.rows[k] for k in here]} | _places(view, plan.centers[here])
+        )
+    return traces
+
+
+def _listed(blocks: Sequence[int]) -> str:
+    head = ", ".join(map(str, sorted(blocks)[:8]))
+    return f"block{'s' * (len(blocks) > 1)} {head}{', …' * (len(blocks) > 8)}"
+
+
+def _labels(view: MapWindow, *, planned: bool) -> Figure:
+    """Blocks, and where their numbers are, if there are not too many."""
+    few = planned and len(np.unique(view.cells)) <= _LABELS
+    ids, places = view.labels() if few else (np.empty(0, np.int64), np.empty((0, 2)))
+    x, y = places.T.tolist()
+    return {"name": "labels", "x": x, "y": y, "customdata": (ids + view.layer * view.stride).tolist()}
 
 
 def read_points(ply: Path, most: int = 200_000) -> NDArray[np.float32]:

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.runs.folder import RunFolder, by_handle, opened
 from panolog.orchestrator.watch.views.comparison.measured import read_seams
-from panolog.orchestrator.watch.views.figures import Figure, map_figure
-from panolog.orchestrator.watch.views.plan_map import read_points
+from panolog.orchestrator.watch.views.plan_map import Figure, map_figure, read_points
 from panolog.orchestrator.watch.views.summary import Text, ViewModel
 from panolog.partition.plan import Plan
 from panolog.partition.plan_json import Reason

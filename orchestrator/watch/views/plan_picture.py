@@ -1,112 +1,156 @@
-"""plan.png: the map of a partition as a picture, for who has no page: see `figures.map_figure`."""
+"""plan.png: the map of a partition as a picture, for who has no page. It draws what `map_figure` says."""
 
+import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from panolog.orchestrator.runs.units import counted
-from panolog.orchestrator.watch.views.palette import block_color
-from panolog.orchestrator.watch.views.plan_map import LABELS, RINGS, MapWindow, served, window_on
+from panolog.orchestrator.watch.views.plan_map import Figure, map_figure
 from panolog.partition.plan import Plan
 from panolog.scene.files import atomic
 
-_WIDTH = 10.0  # of the picture, inches
+WIDTH, SIDE, BELOW = 1500, 80, 120  # pixels of the picture, left and right of the map, and below it
+_FINE = 2  # by so many pixels each of these is drawn
+_MARK = 5 / 3  # pixels for one of a figure
+LABEL = 19  # pixels from the middle of a number to the rim of its disc
 _COUNTED = 4  # blocks up to which the numbers of each are above the map
-_INK, _GREY = "#22272e", "#59616d"
+_TICKS = 12  # numbers of an axis, about
+_INK, _GREY, _WHITE = "#22272e", "#59616d", "#ffffff"
 
 
 def write_plan_picture(path: Path, plan: Plan, points: NDArray[np.floating]) -> None:
-    """Writes a picture of a plan, atomically: see `plan_figure`. Raises OSError if it cannot be written."""
-    figure = plan_figure(plan, points)
+    """Writes a picture of a plan, atomically: see `plan_picture`. Raises OSError if it cannot be written."""
+    picture = plan_picture(plan, points)
     with atomic(path) as temporary:
-        figure.savefig(temporary, format="png")
+        picture.save(temporary, "png")
 
 
-def plan_figure(plan: Plan, points: NDArray[np.floating]) -> Figure:
+def plan_picture(plan: Plan, points: NDArray[np.floating]) -> Image.Image:
     """A plan from above: cells in the colours of their blocks, AABB, points, cameras with rings, numbers.
 
     Args: points (P, 3) of the scene, such as means, in world units.
     """
-    view = window_on(plan, points)
-    low, high = view.lower, view.upper
-    aspect = (high[1] - low[1]) / (high[0] - low[0])
-    figure = Figure(figsize=(_WIDTH, _WIDTH * aspect + 1.2), dpi=150, layout="constrained")
-    axes = figure.add_subplot()
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    axes.set_xlabel(f"{'xyz'[view.axes[0]]} (world units)", color=_GREY)
-    axes.set_ylabel(f"{'xyz'[view.axes[1]]} (world units)", color=_GREY)
-    axes.tick_params(colors=_GREY, labelsize=8)
-    axes.spines[:].set_color("#d1d5db")
-    _draw_rasters(axes, view, points)
-    for line, style in ((view.faces(), "-"), (view.outline(), (0, (6, 4)))):
-        axes.plot(line[:, 0], line[:, 1], color=_INK, lw=1.2, ls=style, zorder=3)
-    _draw_cameras(axes, view)
-    _draw_labels(axes, view)
-    _draw_texts(figure, axes, view)
-    return figure
+    figure = map_figure(plan, points)
+    axes = figure["layout"]["xaxis"], figure["layout"]["yaxis"]
+    (left, right), (bottom, top) = (axis["range"] for axis in axes)
+    scale = (WIDTH - 2 * SIDE) / (right - left)
+    title, *lines = _lines(plan, figure["blocks"])
+    above, height = 75 + 28 * len(lines), round((top - bottom) * scale)
+    picture = Image.new("RGB", (_FINE * WIDTH, _FINE * (above + height + BELOW)), _WHITE)
+    inside = _map(figure, (_FINE * (WIDTH - 2 * SIDE), _FINE * height))
+    picture.paste(inside, (_FINE * SIDE, _FINE * above))
+    draw = ImageDraw.Draw(picture)
+    _text(draw, (SIDE, 35), title, 32, "lm", _INK)
+    for row, line in enumerate(lines):
+        _text(draw, (SIDE, 78 + 28 * row), line, 19, "lm")
+    for value in _ticks(left, right):
+        _text(draw, (SIDE + (value - left) * scale, above + height + 16), f"{value:g}", 17, "mm")
+    for value in _ticks(bottom, top):
+        _text(draw, (SIDE - 10, above + (top - value) * scale), f"{value:g}", 17, "rm")
+    names = " across, ".join(axis["title"]["text"] for axis in axes) + " up"
+    _text(draw, (WIDTH / 2, above + height + 46), names, 19, "mm")
+    _legend(draw, figure["blocks"]["legend"], above + height + 88)
+    return picture.reduce(_FINE)
 
 
-def _draw_rasters(axes: Axes, view: MapWindow, points: NDArray[np.floating]) -> None:
-    """The cells, tinted in the colours of their blocks, and the points."""
-    tints = np.array([[1 - 0.2 * (1 - part) for part in to_rgb(color)] for color in view.colors])
-    density = np.zeros((*(shares := view.density(points) / 255).shape, 4))
-    density[..., :3], density[..., 3] = to_rgb(_INK), 0.7 * shares
-    extent = (view.lower[0], view.upper[0], view.lower[1], view.upper[1])
-    for raster in (tints[view.cells + view.layer * view.stride], density):
-        axes.imshow(raster, extent=extent, origin="lower", interpolation="nearest")
+def _map(figure: Figure, size: tuple[int, int]) -> Image.Image:
+    """The parts of a figure as a picture of a size, those above others last."""
+    parts, blocks = {part["name"]: part for part in figure["data"]}, figure["blocks"]
+    (left, right), (_, top) = (figure["layout"][axis]["range"] for axis in ("xaxis", "yaxis"))
+    colors = np.array([ImageColor.getrgb(color) for color in blocks["colors"]])
+    shown = parts["blocks"]["z"] + blocks["layer"] * blocks["stride"]
+    tints = (255 - 0.2 * (255 - colors)).astype(np.uint8)[shown]
+    shades = (0.7 * parts["points"]["z"]).astype(np.uint8)
+    cells, points = (Image.fromarray(raster[::-1]).resize(size, 0) for raster in (tints, shades))
+    cells.paste(_INK, mask=points)
+    draw, scale, unit = ImageDraw.Draw(cells), size[0] / (right - left), _FINE * _MARK
+
+    def places(part: Figure) -> NDArray[np.float64]:
+        """(P, 2) pixels; a gap is NaN."""
+        x, y = np.array(part["x"], float), np.array(part["y"], float)
+        return np.column_stack([(x - left) * scale, (top - y) * scale])
+
+    for ends in pairwise(places(parts["faces"])):
+        if np.isfinite(ends).all():
+            draw.line(np.ravel(ends).tolist(), _INK, 2 * _FINE)
+    for ends in pairwise(places(parts["box"])):
+        _dashes(draw, *ends)
+    for part in figure["data"]:
+        if part["name"].startswith("cameras"):
+            radius, edge = part["marker"]["size"] / 2 * unit, round(part["marker"]["line"]["width"] * unit)
+            for place, color in zip(places(part).tolist(), part["marker"]["color"], strict=True):
+                draw.circle(place, radius, color, _WHITE, edge)
+    for (x, y), block in zip(places(parts["labels"]).tolist(), parts["labels"]["customdata"], strict=True):
+        draw.circle((x, y), LABEL * _FINE, _WHITE, blocks["colors"][block], 3 * _FINE)
+        _text(draw, (x / _FINE, y / _FINE), str(block), 19, "mm", _INK)
+    return cells
 
 
-def _draw_cameras(axes: Axes, view: MapWindow) -> None:
-    """A disc for each camera in the colour of its own block, and rings for other blocks that it trains."""
-    plan = view.plan
-    blocks = [served(plan, k) for k in range(len(plan.rows))]
-    size = float(np.clip(60 / max(len(blocks), 1) ** 0.5, 0.3, 1.0))
-    for ring, diameter in reversed(list(enumerate(RINGS))):
-        here = [k for k, its in enumerate(blocks) if len(its) > ring]
-        x, y = plan.centers[here][:, list(view.axes[:2])].T
-        colors = [block_color(blocks[k][ring]) for k in here]
-        axes.scatter(x, y, s=(0.8 * diameter * size) ** 2, c=colors, ec="white", lw=size, zorder=5)
+def _dashes(draw: ImageDraw.ImageDraw, begin: NDArray[np.float64], end: NDArray[np.float64]) -> None:
+    """A dashed line between two pixels."""
+    count = max(round(float(np.linalg.norm(end - begin)) / (20 * _FINE)), 1)
+    for dash in np.arange(count):
+        ends = [begin + (end - begin) * (dash + part) / count for part in (0.2, 0.8)]
+        draw.line(np.ravel(ends).tolist(), _INK, 2 * _FINE)
 
 
-def _draw_labels(axes: Axes, view: MapWindow) -> None:
-    """The number of each cell, if there are not too many."""
-    ids, places = view.labels()
-    for block, place in zip(ids + view.layer * view.stride, places, strict=True):
-        if len(ids) <= LABELS:
-            box = {"boxstyle": "round,pad=0.4", "fc": "white", "ec": block_color(int(block)), "lw": 1.5}
-            axes.text(
-                place[0], place[1], str(block), ha="center", va="center", fontsize=9, bbox=box, zorder=6
-            )
-
-
-def _draw_texts(figure: Figure, axes: Axes, view: MapWindow) -> None:
-    """Title, parameters and the legend, each in a place of its own."""
-    plan, third = view.plan, "xyz"[view.axes[2]]
-    config = plan.config
+def _lines(plan: Plan, blocks: Figure) -> list[str]:
+    """Title and parameters, and the numbers of each block where there are few."""
+    margin, gap, config = plan.baseline * plan.config.rho_tri, "   ·   ", plan.config
     title = f"{counted(plan.grid.count, 'block')} ({plan.grid}), {counted(len(plan.rows), 'camera')}"
-    figure.suptitle(title, x=0.01, ha="left", fontsize=15, color=_INK)
-    text = f"seen along {third}   ·   {plan.assignment.overlap:.2f} blocks per camera"
-    if view.layers > 1:
-        text += f"   ·   layer {view.layer + 1} of {view.layers} along {third}"
-    text += (
-        f"\nbaseline {plan.baseline:.3g}, margin {plan.baseline * config.rho_tri:.3g}"
-        f"   ·   ρ_tri {config.rho_tri:g}, τ_grad {config.tau_grad:g}"
-    )
-    if plan.grid.count <= _COUNTED:
-        text += "\n" + "   ·   ".join(
-            f"{block}: {counted(len(plan.cameras(block)), 'camera')}, {counted(int(own), 'Gaussian')}"
-            for block, own in enumerate(plan.gaussians)
-        )
-    axes.set_title(text, loc="left", fontsize=9, color=_GREY, linespacing=1.5)
-    handles = [
-        Line2D([], [], ls="", marker="o", color=_GREY, label="camera; a ring for each other block it trains"),
-        Line2D([], [], color=_INK, ls=(0, (6, 4)), lw=1.2, label="AABB (eq. 9)"),
-        Line2D([], [], color=_INK, lw=1.2, label="face between blocks"),
-        Line2D([], [], ls="", marker=".", ms=3, color=_INK, label="points of the scene"),
+    text = [
+        f"{plan.assignment.overlap:.2f} blocks per camera",
+        f"baseline {plan.baseline:.3g}, margin {margin:.3g}",
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5)
+    text += [f"rho_tri {config.rho_tri:g}, tau_grad {config.tau_grad:g}"]
+    if blocks["layers"] > 1:
+        text.append(f"layer {blocks['layer'] + 1} of {blocks['layers']}")
+    numbers = [
+        f"{block}: {counted(len(plan.cameras(block)), 'camera')}, {counted(int(own), 'Gaussian')}"
+        for block, own in enumerate(plan.gaussians)
+    ]
+    return [title, gap.join(text), *([gap.join(numbers)] if len(numbers) <= _COUNTED else [])]
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """The round numbers between two, about `_TICKS`."""
+    least = (high - low) / _TICKS
+    power = 10.0 ** math.floor(math.log10(least))
+    step = next(n * power for n in (1, 2, 5, 10) if n * power >= least)
+    return [n * step for n in range(math.ceil(low / step), math.floor(high / step) + 1)]
+
+
+def _legend(draw: ImageDraw.ImageDraw, parts: list[tuple[str, str]], y: float) -> None:
+    """Sign and meaning of each part, side by side in the middle."""
+    font = ImageFont.load_default(19 * _FINE)
+    x = (WIDTH - sum(font.getlength(text) / _FINE + 80 for _, text in parts) + 40) / 2
+    for part, text in parts:
+        place = np.array([x, y]) * _FINE
+        if part == "box":
+            _dashes(draw, *(place + np.array([[-18 * _FINE, 0], [18 * _FINE, 0]])))
+        elif part == "points":
+            for dot in ((-6, 5), (6, 5), (0, -5)):
+                draw.circle((place + np.multiply(dot, _FINE)).tolist(), 2 * _FINE, _GREY)
+        else:
+            if part == "rings":
+                draw.circle(place.tolist(), 12 * _FINE, _WHITE, _GREY, 2 * _FINE)
+            draw.circle(place.tolist(), 7 * _FINE, _GREY)
+        _text(draw, (x + 28, y), text, 19, "lm")
+        x += font.getlength(text) / _FINE + 80
+
+
+def _text(
+    draw: ImageDraw.ImageDraw,
+    place: tuple[float, float],
+    text: str,
+    size: int,
+    anchor: str,
+    color: str = _GREY,
+) -> None:
+    """A text at a place of the picture. Args: size of its letters, pixels; anchor of Pillow."""
+    at = (place[0] * _FINE, place[1] * _FINE)
+    draw.text(at, text, color, ImageFont.load_default(size * _FINE), anchor)

@@ -104,7 +104,7 @@ def test_the_map_and_the_cameras_are_there_before_there_is_a_plan(tmp_path: Path
         names = [scene.panoramas[row].name for row in scene.train]
         assert (figure["blocks"]["planned"], figure["blocks"]["names"]) == (False, names)
         (cameras,) = (trace for trace in figure["data"] if trace["name"] == "cameras")
-        assert (cameras["customdata"], cameras["text"]) == (list(scene.train), names)
+        assert (cameras["customdata"], cameras["text"]) == (list(scene.train), [""] * len(names))
         row = scene.train[1]
         camera = served.get(f"{path}/camera/{row}")
         assert (camera["name"], camera["scores"], camera["assigned"]) == (names[1], [], {})

@@ -1,6 +1,6 @@
 // The figure of a plan as SVG, at the size that it has on the page, so that marks and letters keep theirs in any zoom.
 
-/** @import { MapFigure, Packed, Trace } from "../shared/plotly.js" */
+/** @import { MapFigure, Packed, Trace } from "./figure.js" */
 import { svg } from "panolog/shared/dom.js";
 
 /** A part of the place in world units, and where it is on the page in pixels. @typedef {ReturnType<typeof frameOf>} Frame */

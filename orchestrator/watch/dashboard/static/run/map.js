@@ -2,7 +2,7 @@
 
 import { axes, frameOf, painted, pixel, placesOf, polyline, raster, unpack } from "panolog/run/drawing.js";
 import { BLOCK_STATUSES, STATES } from "panolog/run/rows.js";
-/** @import { MapFigure, Trace } from "../shared/plotly.js" */
+/** @import { MapFigure, Trace } from "./figure.js" */
 /** @import { RunPage } from "../shared/messages.js" */
 /** @import { Frame, Window } from "./drawing.js" */
 /** @import { Choose } from "./run.js" */
@@ -20,14 +20,8 @@ const FULL = 0.42; // and of what is done
 const MARK = 60; // of 255, added to the opacity of the selected block
 /** A mark for each state, next to the number of a block: its colour alone says nothing to many. @type {Record<string, string>} */
 const MARKS = { done: "✓", failed: "✕", paused: "‖", running: "▸" };
-/** Sign and meaning of what else the map has, and which part of it that is; null: what only a plan has. @type {[string, string, string | null][]} */
-const MARKED = [
-  ["●", "camera", "cameras"],
-  ["◎", "rings: other blocks that it trains", null],
-  ["∴", "points", "points"],
-  ["+", "GPS", "fixes"],
-  ["╌", "box, beyond which cells bend", null],
-];
+/** The sign of each part that the legend of the server has. @type {Record<string, string>} */
+const SIGNS = { cameras: "●", rings: "◎", points: "∴", fixes: "+", box: "╌" };
 const coarse = matchMedia("(pointer: coarse)"); // a finger on the map scrolls the page
 
 /** A colour of the style sheet as bytes. @param {string} name */
@@ -123,11 +117,12 @@ export function planMap(path, choose) {
   }
 
   /** @param {MapFigure} figure */
-  function legend({ blocks: { planned, grades } }) {
-    const shown = MARKED.filter(([, , part]) => (part === null ? planned : part === "points" || trace(part).x?.length));
+  function legend({ blocks: { planned, legend, grades } }) {
     byId("legend").hidden = false;
     byId("legend").replaceChildren(
-      ...shown.map(([mark, text]) => el("li", { class: "mark" }, el("span", { "aria-hidden": "true" }, mark), text)),
+      ...legend.map(([part, text]) =>
+        el("li", { class: "mark" }, el("span", { "aria-hidden": "true" }, SIGNS[part]), text),
+      ),
       ...(planned ? BLOCK_STATUSES : []).map((status) =>
         el("li", { "data-block-status": status }, `${MARKS[status] ?? ""} ${STATES[status] ?? status}`),
       ),
@@ -258,7 +253,7 @@ export function planMap(path, choose) {
     setText(byId("pointed"), block === undefined ? text : describe(block));
     tip.hidden = camera === undefined;
     if (camera === undefined) return;
-    const [, trains] = trace("cameras").text[camera].split("<br>");
+    const trains = trace("cameras").text[camera];
     tip.replaceChildren(figure?.blocks.names[camera] ?? "", ...(trains ? [el("br"), trains] : []));
     const before = at[0] > plot.clientWidth / 2;
     tip.style.cssText = `top: ${at[1]}px; ${before ? `right: ${plot.clientWidth - at[0] + 12}px` : `left: ${at[0] + 12}px`}`;
