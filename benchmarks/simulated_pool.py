@@ -18,10 +18,10 @@ from panolog.partition.cells import Cell
 from panolog.partition.contraction import expand
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import Checkpoint, Evaluated, Progress, Scored, Trained
+from panolog.workers.events import Checkpoint, Evaluated, Scored, Trained
 from panolog.workers.scoring import ScoreSpec
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import Stage, TaskId
+from panolog.workers.tasks import Progress, Stage, TaskId
 from panolog.workers.training.initialise import isotropic
 from panolog.workers.training.trainer import TrainSpec
 

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 import panolog
-from panolog.workers.events import Checkpoint, Progress, Trained
+from panolog.workers.events import Checkpoint, Trained
+from panolog.workers.tasks import Progress
 from panolog.workers.training.initialise import scene_gaussians
 from tests.scenes import HEIGHT, WIDTH, write_scene
 

@@ -19,13 +19,13 @@ from panolog.scene.images import View, load_view, view_bytes
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
 from panolog.workers.evaluation import evaluate_view
-from panolog.workers.events import Calibration, IterationCost, Progress
+from panolog.workers.events import Calibration, IterationCost
 from panolog.workers.growth import additions, population
 from panolog.workers.meter import host_peak, memory_in_use, reset_peaks
 from panolog.workers.metrics import load_lpips
 from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import CALIBRATE, TaskId
+from panolog.workers.tasks import CALIBRATE, Progress, TaskId
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import densify
 from panolog.workers.training.trainer import Trainer, TrainSpec

@@ -9,13 +9,13 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import View
 from panolog.scene.model import Panorama, Scene
 from panolog.workers.capture.pose_fit import PoseFit, fit_steps
-from panolog.workers.events import Evaluated, Event, LpipsMissing, Progress
+from panolog.workers.events import Evaluated, Event, LpipsMissing
 from panolog.workers.meter import Meter
 from panolog.workers.metrics import Lpips, load_lpips, measure
 from panolog.workers.seams.measurement import SeamMeasurement, Seams
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
-from panolog.workers.tasks import EVAL, TaskId
+from panolog.workers.tasks import EVAL, Progress, TaskId
 from panolog.workers.training.task_config import ImagesConfig
 
 FACES = 2  # of a shard: what is around more of them would be much of the place

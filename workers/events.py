@@ -3,30 +3,14 @@
 Every event is a frozen dataclass of plain values and CPU tensors, so that it pickles across machines.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from torch import Tensor
 
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.capture.captured import Captured
 from panolog.workers.seams.schema import Seam
-from panolog.workers.tasks import TaskId
-
-
-@dataclass(frozen=True)
-class Progress:
-    """The progress of a task, about once a second."""
-
-    task: TaskId
-    iteration: int  # done so far
-    iterations: int  # in all
-    rate: float  # iterations per second, recent
-    loss: float | None = None  # mean since the last one
-    psnr: float | None = None  # dB, mean over the training views since the last one
-    gaussians: int | None = None
-    memory: int | None = None  # bytes: of the device on CUDA, resident of the process on the CPU
-    host_peak: int | None = None  # bytes: the peak resident size of the process since the task began
-    rates: dict[str, float] = field(default_factory=dict)  # learning rates by parameter
+from panolog.workers.tasks import Progress, TaskId, Transfer
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,15 +103,6 @@ class SeamMeasured:
     task: TaskId
     seam: Seam
     pictures: dict[str, bytes]  # files by name
-
-
-@dataclass(frozen=True)
-class Transfer:
-    """What a task has moved between machines since the last one of these."""
-
-    task: TaskId
-    received: int  # bytes: panoramas, models, checkpoints
-    sent: int  # bytes: models, checkpoints, pictures
 
 
 @dataclass(frozen=True)

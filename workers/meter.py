@@ -10,8 +10,7 @@ from pathlib import Path
 import psutil
 import torch
 
-from panolog.workers.events import Progress
-from panolog.workers.tasks import TaskId
+from panolog.workers.tasks import Progress, TaskId
 
 INTERVAL = 1.0  # seconds between two reports
 _CLEAR_REFS, _RESET_PEAK = Path("/proc/self/clear_refs"), "5"  # proc(5): sets the peak to the current size

@@ -1,7 +1,10 @@
-"""The tasks of a run and their names. Imports no torch: a run folder is read without it."""
+"""The tasks of a run, their names, and what they report in plain values.
+
+Imports no torch: a run folder is read without it.
+"""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import lru_cache
 
@@ -145,3 +148,28 @@ PLAN = TaskId(Stage.PLAN)
 MERGE = TaskId(Stage.MERGE)
 EVAL = TaskId(Stage.EVAL)
 DELIVER = TaskId(Stage.DELIVER)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The progress of a task, about once a second."""
+
+    task: TaskId
+    iteration: int  # done so far
+    iterations: int  # in all
+    rate: float  # iterations per second, recent
+    loss: float | None = None  # mean since the last one
+    psnr: float | None = None  # dB, mean over the training views since the last one
+    gaussians: int | None = None
+    memory: int | None = None  # bytes: of the device on CUDA, resident of the process on the CPU
+    host_peak: int | None = None  # bytes: the peak resident size of the process since the task began
+    rates: dict[str, float] = field(default_factory=dict)  # learning rates by parameter
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """What a task has moved between machines since the last one of these."""
+
+    task: TaskId
+    received: int  # bytes: panoramas, models, checkpoints
+    sent: int  # bytes: models, checkpoints, pictures

@@ -14,7 +14,7 @@ from benchmarks.first_hour.outcome import ROOT, Context, Outcome
 from benchmarks.report import markdown
 from panolog.orchestrator.runs.config import load_config
 from panolog.synthetic.make import make_town
-from panolog.workers.events import Progress
+from panolog.workers.tasks import Progress
 
 _ITERATIONS = 4_000  # some seconds; those of densification are among them
 _REHEARSED = 400

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from panolog.orchestrator.runs.money.records import OfMoney, OfRun
-from panolog.workers.tasks import CALIBRATE, DELIVER, EVAL, MERGE, PLAN, StrEnum, TaskId
+from panolog.workers.tasks import CALIBRATE, DELIVER, EVAL, MERGE, PLAN, Progress, StrEnum, TaskId, Transfer
 
 
 class Failure(StrEnum):
@@ -90,19 +90,8 @@ class TaskStarted:
 
 
 @dataclass(frozen=True)
-class Progressed:
-    """Where a task stands; the fields are those of `workers.events.Progress`."""
-
-    task: TaskId
-    iteration: int
-    iterations: int
-    rate: float  # iterations per second
-    loss: float | None = None
-    psnr: float | None = None  # dB over training views
-    gaussians: int | None = None
-    memory: int | None = None  # bytes
-    host_peak: int | None = None  # bytes
-    rates: dict[str, float] = field(default_factory=dict)  # learning rates by parameter
+class Progressed(Progress):
+    """Where a task stands, as its worker has said."""
 
 
 @dataclass(frozen=True)
@@ -254,12 +243,8 @@ class Delivered:
 
 
 @dataclass(frozen=True)
-class Transferred:
-    """What a task on another machine than the driver's has moved since the last one of these."""
-
-    task: TaskId
-    received: int  # bytes
-    sent: int  # bytes
+class Transferred(Transfer):
+    """What a task on another machine than the driver's has moved, as its worker has said."""
 
 
 @dataclass(frozen=True)

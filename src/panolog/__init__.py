@@ -40,9 +40,10 @@ if TYPE_CHECKING:
     from panolog.scene.ply import read_ply, write_ply
     from panolog.scene.read import read_scene
     from panolog.scene.write import PosedImage
-    from panolog.workers.events import Checkpoint, LeftOut, Notice, Preview, Progress, Trained
+    from panolog.workers.events import Checkpoint, LeftOut, Notice, Preview, Trained
     from panolog.workers.loop.growth import Clone3DGS, Relocate
     from panolog.workers.loop.views import TrainingView, initial_gaussians, load_views
+    from panolog.workers.tasks import Progress
 
     __version__: str
 
@@ -123,9 +124,10 @@ _MODULES = {
     "panolog.scene.ply": ("read_ply", "write_ply"),
     "panolog.scene.read": ("read_scene",),
     "panolog.scene.write": ("PosedImage",),
-    "panolog.workers.events": ("Checkpoint", "LeftOut", "Notice", "Preview", "Progress", "Trained"),
+    "panolog.workers.events": ("Checkpoint", "LeftOut", "Notice", "Preview", "Trained"),
     "panolog.workers.loop.growth": ("Clone3DGS", "Relocate"),
     "panolog.workers.loop.views": ("TrainingView", "initial_gaussians", "load_views"),
+    "panolog.workers.tasks": ("Progress",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -29,20 +29,11 @@ from panolog.orchestrator.runs.store import Database, read_milestones, read_reco
 from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import (
-    Calibration,
-    Checkpoint,
-    Evaluated,
-    Event,
-    Progress,
-    Scored,
-    SeamMeasured,
-    Trained,
-)
+from panolog.workers.events import Calibration, Checkpoint, Evaluated, Event, Scored, SeamMeasured, Trained
 from panolog.workers.merge import retained
 from panolog.workers.scoring import ScoreSpec
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import TaskId
+from panolog.workers.tasks import Progress, TaskId
 from panolog.workers.training.initialise import scene_gaussians
 from panolog.workers.training.trainer import TrainSpec
 from tests.workers.seams.test_schema import FACES

@@ -10,8 +10,8 @@ from panolog.renderer.motion import moved
 from panolog.renderer.render import render_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
-from panolog.workers.events import Evaluated, LpipsMissing, Progress
-from panolog.workers.tasks import EVAL
+from panolog.workers.events import Evaluated, LpipsMissing
+from panolog.workers.tasks import EVAL, Progress
 from panolog.workers.training.initialise import scene_gaussians
 from tests.workers.small import HEIGHT, WIDTH, small_scene
 from tests.workers.trainings import evaluation_of

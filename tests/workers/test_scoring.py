@@ -14,9 +14,10 @@ from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
-from panolog.workers.events import Progress, Scored
+from panolog.workers.events import Scored
 from panolog.workers.scoring import ScoreSpec, _gradient, in_shards
 from panolog.workers.specs import Value
+from panolog.workers.tasks import Progress
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
 from tests.renderer.cuda.stubbed import stubbed, without_pairs

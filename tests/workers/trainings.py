@@ -14,11 +14,11 @@ from panolog.renderer import ops
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Scored, Trained
+from panolog.workers.events import Checkpoint, Event, Notice, Preview, Scored, Trained
 from panolog.workers.scoring import ScoreSpec
 from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
-from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.tasks import COARSE, Progress, TaskId
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.workers.small import WIDTH

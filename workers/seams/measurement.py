@@ -23,7 +23,7 @@ from panolog.partition.faces import Plane
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.comparison import with_block
-from panolog.workers.events import Event, Progress, SeamMeasured
+from panolog.workers.events import Event, SeamMeasured
 from panolog.workers.merge import retained
 from panolog.workers.seams import schema
 from panolog.workers.seams.looks import Looks
@@ -32,6 +32,7 @@ from panolog.workers.seams.schema import Seam
 from panolog.workers.seams.strips import Colors, Difference, Errors, Look, Seen, Strip, see, strip_of
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
+from panolog.workers.tasks import Progress
 
 _IMAGE_MEMORY = 2**29  # bytes of decoded panoramas
 

@@ -26,13 +26,13 @@ from panolog.scene.model import Scene
 from panolog.workers import stopping
 from panolog.workers.capture.learning import Learning
 from panolog.workers.comparison import better_block, with_block
-from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Trained
+from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
 from panolog.workers.merge import retained
 from panolog.workers.meter import Meter
 from panolog.workers.showing.previews import HeldOut, PreviewClock, picture, snapshot
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
-from panolog.workers.tasks import COARSE
+from panolog.workers.tasks import COARSE, Progress
 from panolog.workers.training.checkpoint import loaded
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, rate_units

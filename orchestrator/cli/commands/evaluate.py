@@ -18,8 +18,7 @@ from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_exact, ply_header
 from panolog.scene.write import StageProgress
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import Progress
-from panolog.workers.tasks import NOTHING_HELD_OUT
+from panolog.workers.tasks import NOTHING_HELD_OUT, Progress
 
 Report = dict[str, Any]
 _SAID = {"views", "mean", "bytes", "lpips_reason"}  # of metrics.json

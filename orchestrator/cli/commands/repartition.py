@@ -28,8 +28,8 @@ from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_header, read_scene_means
 from panolog.scene.write import StageProgress
-from panolog.workers.events import Progress, Scored
-from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.events import Scored
+from panolog.workers.tasks import COARSE, Progress, TaskId
 
 
 @dataclass(frozen=True, eq=False)

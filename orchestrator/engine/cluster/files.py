@@ -34,8 +34,9 @@ from panolog.scene.errors import RunError
 from panolog.scene.files import atomic, write_bytes
 from panolog.scene.stores.cache import Stored
 from panolog.scene.stores.outline import remember, stored_of
-from panolog.workers.events import Calibration, Event, Progress, Transfer
+from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import Progress, Transfer
 
 T = TypeVar("T")
 

@@ -40,13 +40,11 @@ from panolog.workers.events import (
     Event,
     Notice,
     Preview,
-    Progress,
     Scored,
     SeamMeasured,
     Trained,
-    Transfer,
 )
-from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.tasks import COARSE, Progress, TaskId, Transfer
 from panolog.workers.training import checkpoint
 from panolog.workers.training.saving import Outbox
 
@@ -71,7 +69,7 @@ def save(folder: RunFolder, event: Event, scene: Scene, keep: int = 1) -> Record
         case SeamMeasured():
             return SeamEvaluated(event.task, "|".join(map(str, event.seam.blocks)), event.seam.seam)
         case Transfer():
-            return Transferred(event.task, event.received, event.sent)
+            return Transferred(**vars(event))
         case Preview():
             return _save_preview(folder, event)
         case Checkpoint():

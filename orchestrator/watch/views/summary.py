@@ -20,7 +20,7 @@ from panolog.orchestrator.watch.views.timing import (
     share_of,
     tasks_of,
 )
-from panolog.workers.tasks import COARSE, Stage, TaskId
+from panolog.workers.tasks import COARSE, Progress, Stage, TaskId
 
 STAGES: dict[str, str] = {
     Stage.PREPARE: "preparation",
@@ -48,7 +48,6 @@ _TASKS = STAGES | {
 }
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws_psnr": "WS-PSNR", "ws_ssim": "WS-SSIM"}
 LABELS = {"interrupted": "stopped", "stopped": "driver lost", "limited": "ended early"}  # for people
-_PROGRESS = ("iteration", "iterations", "rate", "loss", "psnr", "gaussians", "memory", "host_peak")
 Text = Annotated[str, SkipValidation]  # of users and file systems: also what UTF-8 cannot represent
 
 
@@ -81,6 +80,9 @@ class TaskView(ViewModel):
     retries: int
     moves: int = 0  # attempts that have ended with a checkpoint because their machine left
     reasons: tuple[Text, ...]
+
+
+_REPORTED = TaskView.model_fields.keys() & Progress.__dataclass_fields__
 
 
 class ModelView(ViewModel):
@@ -261,7 +263,7 @@ def _task_view(task: TaskState, now: float) -> TaskView:
         retries=task.retries,
         moves=task.moves,
         reasons=task.reasons,
-        **{name: getattr(task.progress, name, None) for name in _PROGRESS},
+        **{name: getattr(task.progress, name, None) for name in _REPORTED},
     )
 
 

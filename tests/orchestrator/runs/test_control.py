@@ -33,9 +33,9 @@ from panolog.orchestrator.runs.records import (
 from panolog.orchestrator.runs.state import RunState, Status
 from panolog.orchestrator.watch.views.summary import summarize
 from panolog.scene.errors import InputError
-from panolog.workers.events import Checkpoint, Event, Progress
+from panolog.workers.events import Checkpoint, Event
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
+from panolog.workers.tasks import COARSE, EVAL, Progress, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
 from tests.orchestrator.fakes import DIED, CrashError, Harness, begins, well
 from tests.orchestrator.history import AGAIN, after, model, started

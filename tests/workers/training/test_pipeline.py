@@ -14,8 +14,9 @@ from torch import Tensor
 
 from panolog.renderer.cuda.parts import Argument, Launch
 from panolog.scene.errors import RunError
-from panolog.workers.events import Checkpoint, Event, Progress
+from panolog.workers.events import Checkpoint, Event
 from panolog.workers.specs import Value
+from panolog.workers.tasks import Progress
 from panolog.workers.training import pipeline
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.recipes import RECIPES, Recipe

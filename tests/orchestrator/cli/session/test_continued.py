@@ -30,9 +30,8 @@ from panolog.orchestrator.runs.storage.lease import holder
 from panolog.orchestrator.runs.store import read_records
 from panolog.scene.stores.store import open_store
 from panolog.workers.calibration import CalibrateSpec
-from panolog.workers.events import Progress
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, Stage, TaskId
+from panolog.workers.tasks import COARSE, Progress, Stage, TaskId
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.calibrated import says
 from tests.orchestrator.cli.program import call

@@ -22,8 +22,8 @@ from panolog.scene.errors import RunError
 from panolog.scene.stores.cache import Stored
 from panolog.scene.stores.outline import stored_of
 from panolog.scene.stores.store import Version
-from panolog.workers.events import Checkpoint, Event, Preview, Progress, Transfer
-from panolog.workers.tasks import COARSE
+from panolog.workers.events import Checkpoint, Event, Preview
+from panolog.workers.tasks import COARSE, Progress, Transfer
 from tests.orchestrator.scripted import Scripted
 from tests.ray_head import wait_until
 

@@ -30,9 +30,9 @@ from panolog.orchestrator.runs.store import Database
 from panolog.scene.errors import ConfigError, RunError
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
-from panolog.workers.events import Checkpoint, Event, Preview, Progress
+from panolog.workers.events import Checkpoint, Event, Preview
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, DELIVER, EVAL, MERGE, TaskId
+from panolog.workers.tasks import COARSE, DELIVER, EVAL, MERGE, Progress, TaskId
 from panolog.workers.training.optimizer import ModelState
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.fakes import (

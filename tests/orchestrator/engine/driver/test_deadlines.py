@@ -13,9 +13,9 @@ from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs.folder import write_json
 from panolog.orchestrator.runs.records import EvaluationSaved, Failure, ModelSaved, TaskFailed, TaskYielded
 from panolog.orchestrator.runs.state import RunState, Status
-from panolog.workers.events import Checkpoint, Event, Progress
+from panolog.workers.events import Checkpoint, Event
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, EVAL, TaskId
+from panolog.workers.tasks import COARSE, EVAL, Progress, TaskId
 from tests.orchestrator.calibrated import calibrated
 from tests.orchestrator.fakes import MACHINE, FakePool, Harness, SetClock, begins, well
 

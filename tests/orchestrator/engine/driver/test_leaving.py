@@ -33,9 +33,9 @@ from panolog.orchestrator.runs.records import (
 )
 from panolog.orchestrator.runs.state import RunState, apply
 from panolog.scene.errors import RunError
-from panolog.workers.events import Calibration, Checkpoint, Event, Progress
+from panolog.workers.events import Calibration, Checkpoint, Event
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, Stage, TaskId
+from panolog.workers.tasks import COARSE, Progress, Stage, TaskId
 from tests.orchestrator import fakes
 from tests.orchestrator.fakes import LOST_NODE, CrashError, FakePool, Harness, Script, SetClock, begins, well
 from tests.orchestrator.history import AGAIN, after

@@ -30,9 +30,9 @@ from panolog.orchestrator.runs.records import (
 )
 from panolog.orchestrator.runs.state import RunState, Status, apply, replay
 from panolog.scene.errors import RunError
-from panolog.workers.events import Calibration, Event, Progress
+from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, Stage, TaskId
+from panolog.workers.tasks import COARSE, Progress, Stage, TaskId
 from tests.orchestrator.fakes import CrashError, FakePool, Harness, Script, SetClock, well
 from tests.orchestrator.history import AGAIN, after, started
 from tests.orchestrator.scripted import Works

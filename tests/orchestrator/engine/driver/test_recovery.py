@@ -27,9 +27,9 @@ from panolog.orchestrator.runs.records import (
 )
 from panolog.orchestrator.runs.store import Database, read_records
 from panolog.scene.errors import ClusterLostError, InputError, RunError, RunLockedError
-from panolog.workers.events import Calibration, Checkpoint, Event, Progress, Trained
+from panolog.workers.events import Calibration, Checkpoint, Event, Trained
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, EVAL, TaskId
+from panolog.workers.tasks import COARSE, EVAL, Progress, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
 from panolog.workers.training.task_config import CacheConfig
 from tests.orchestrator.fakes import LOST_NODE, CrashError, Harness, Script, SetClock, begins, well

@@ -37,9 +37,9 @@ from panolog.orchestrator.runs.records import (
 )
 from panolog.orchestrator.runs.state import RunState, Status, TaskState
 from panolog.orchestrator.runs.store import Database, read_records
-from panolog.workers.events import Checkpoint, CheckpointWritten, Event, Notice, Progress, Trained
+from panolog.workers.events import Checkpoint, CheckpointWritten, Event, Notice, Trained
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, Stage, TaskId
+from panolog.workers.tasks import COARSE, Progress, Stage, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.saving import Outbox, Saver
 from panolog.workers.training.task_config import CheckpointConfig
