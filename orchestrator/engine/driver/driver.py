@@ -108,10 +108,10 @@ class Driver:
         self._evaluations: dict[TaskId, Evaluation] = {}  # that are measured now
         self._sizes = Sizes(job)
         self._presence = Presence(job.folder.presence)
-        retry = job.config.disk.retry
         self._requests = Requests(job.folder, journal, self._stop)
-        journal.patience = Patience(job.folder.root, retry, self._presence, self._while_it_waits)
-        self._writers = Writers(self._save, journal, retry, clock)
+        root, retry = job.folder.root, job.config.disk.retry
+        journal.patience = Patience(root, retry, self._presence, self._while_it_waits)
+        self._writers = Writers(self._save, journal, clock)
         self._machines = Machines(pool, journal, job, clock)
         self._purse = Purse(journal, clock)
         self._nodes: tuple[Node, ...] = ()

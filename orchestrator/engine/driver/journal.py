@@ -5,7 +5,6 @@ the run then waits, shows why, and tries again.
 """
 
 import logging
-import math
 import sqlite3
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -127,6 +126,7 @@ class Journal:
         self.why = ""  # nothing can run, see `explain`
         self._idle = 0.0  # Clock.monotonic() of that
         self._since: float | None = None  # Clock.monotonic() from which on the disk has taken nothing
+        self.again = 0.0  # Clock.monotonic() at which to try again what it has refused
 
     def record(self, records: Sequence[Record]) -> None:
         """Stores records in one transaction, see `Backlog`, and shows them.
@@ -179,7 +179,9 @@ class Journal:
         """Shows that the run waits, if an error has a reason that may pass; else returns False."""
         if self.patience is None or not (reason := why_waiting(error, self.patience.root, size)):
             return False
-        self._since = self.clock.monotonic() if self._since is None else self._since
+        now = self.clock.monotonic()
+        self._since = now if self._since is None else self._since
+        self.again = now + self.patience.seconds
         if reason != self.state.waiting:
             _LOG.info("%s", reason)
             self.patience.presence.say(reason)
@@ -200,7 +202,7 @@ class Journal:
         self.record([RunContinued(seconds)])
 
     def _pause(self, patience: Patience) -> None:
-        for _ in range(math.ceil(patience.seconds / _STEP_S)):
+        while (left := self.again - self.clock.monotonic()) > 0:
             patience.poll()
             self.on_change(self.state, ())
-            self.clock.sleep(min(_STEP_S, patience.seconds))
+            self.clock.sleep(min(_STEP_S, left))

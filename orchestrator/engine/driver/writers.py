@@ -28,19 +28,16 @@ class _Job:
     event: Checkpoint | Trained
     size: int  # bytes, 0 = unknown
     future: Future[tuple[Record, float]]
-    again: float | None = None  # Clock.monotonic() of the next try, after one that the disk has refused
+    refused: bool = False  # by the disk: tried again when the journal is
 
 
 class Writers:
     """The large messages that a driver holds."""
 
-    def __init__(
-        self, save: Callable[[Event], Record], journal: Journal, retry: float, clock: Clock = CLOCK
-    ) -> None:
-        """Args: save, writes what an event carries, in a thread; retry, seconds between two tries."""
+    def __init__(self, save: Callable[[Event], Record], journal: Journal, clock: Clock = CLOCK) -> None:
+        """Args: save, writes what an event carries, in a thread."""
         self._save = save
         self._journal = journal
-        self._retry = retry
         self._clock = clock
         self._threads = ThreadPoolExecutor(LARGE, "writer")
         self._jobs: dict[TaskId, _Job] = {}
@@ -78,15 +75,15 @@ class Writers:
         """
         failure: BaseException | None = None
         for task, job in list(self._jobs.items()):
-            if job.again is not None:
-                if self._clock.monotonic() >= job.again:
-                    job.again, job.future = None, self._threads.submit(self._write, job.event)
+            if job.refused:
+                if self._clock.monotonic() >= self._journal.again:
+                    job.refused, job.future = False, self._threads.submit(self._write, job.event)
                 continue
             if not job.future.done():
                 continue
             error = job.future.exception()
-            if error is not None and self._journal.refused(error, job.size):
-                job.again = self._clock.monotonic() + self._retry
+            job.refused = error is not None and self._journal.refused(error, job.size)
+            if job.refused:
                 continue
             del self._jobs[task]
             if error is not None:
@@ -101,7 +98,7 @@ class Writers:
             raise failure
 
     def wait(self, seconds: float) -> None:
-        if futures := [job.future for job in self._jobs.values() if job.again is None]:
+        if futures := [job.future for job in self._jobs.values() if not job.refused]:
             wait_for(futures, seconds, FIRST_COMPLETED)
         else:
             self._clock.sleep(seconds)

@@ -119,7 +119,7 @@ def test_messages_without_announcement_make_no_room_for_others() -> None:
         done.wait()
         return TaskYielded(event.task)
 
-    some = writers.Writers(save, None, 1.0)  # type: ignore[arg-type]
+    some = writers.Writers(save, None)  # type: ignore[arg-type]
     tasks = [TaskId.block(number) for number in range(9)]
     for task in tasks[:4]:
         some.start(replace(STATE, task=task))
@@ -241,7 +241,7 @@ def test_saving_takes_at_most_its_share_of_the_time(monkeypatch: pytest.MonkeyPa
 
 
 def test_the_grace_follows_bytes_and_the_measured_rate() -> None:
-    some = writers.Writers(lambda _: TaskYielded(COARSE), None, 1.0)  # type: ignore[arg-type]
+    some = writers.Writers(lambda _: TaskYielded(COARSE), None)  # type: ignore[arg-type]
     tasks = [TaskId.block(number) for number in range(80)]
     state = RunState({task: TaskState(task, progress=Progressed(task, 1, 9, 1.0)) for task in tasks})
     assert some.grace(state, tasks) == writers.GRACE_S  # of unknown size
