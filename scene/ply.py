@@ -89,23 +89,28 @@ def write_ply_parts(
 
 def join_ply(
     path: Path,
-    parts: Sequence[tuple[Path, range | NDArray[np.int64]]],
+    parts: Sequence[tuple[Path, range | NDArray[np.bool_]]],
+    last: Gaussians | None = None,
     *,
     sky: int,
     offset: Vector = NO_OFFSET,
     exact: bool = False,
-) -> None:
+) -> int:
     """Writes rows of other PLYs, in order, as they stand there, atomically: at the speed of the disk.
 
     Args:
-        parts: files that `write_ply` wrote, each with the rows to take: a range with step 1, or (n,) numbers.
+        parts: files that `write_ply` wrote, each with its rows to take: a range with step 1, or (N,) which.
+        last: a few Gaussians that are in no file, after them.
         sky: how many rows, at the end of all, are sky.
         exact: `Gaussians.exact` of all of them.
 
+    Returns the number of Gaussians written.
     Raises PlyError: a file is truncated, or has another layout; OSError: a file cannot be read or written.
     """
+    count = sum(len(rows) if isinstance(rows, range) else int(rows.sum()) for _, rows in parts)
+    count += len(last) if last else 0
     with atomic(path) as temporary, temporary.open("wb", buffering=0) as file:
-        file.write(_header(sum(len(rows) for _, rows in parts), sky, offset, exact))
+        file.write(_header(count, sky, offset, exact))
         for source, rows in parts:
             table = read_table(source)
             if table.dtype != _ROW:
@@ -113,7 +118,10 @@ def join_ply(
             if isinstance(rows, range):
                 _copy_rows(table, rows, file)
             else:
-                _copy_some(table, rows, file)
+                _copy_some(table, np.flatnonzero(rows), file)
+        if last:
+            write_all(file, memoryview(_encode(last, slice(None), SH_REST).tobytes()))
+    return count
 
 
 def read_ply(path: StrPath) -> Gaussians:

@@ -59,7 +59,7 @@ def test_a_position_that_is_not_finite_stops_the_cut() -> None:
 def test_merge_has_each_gaussian_once_and_sky_last(tmp_path: Path) -> None:
     whole, coarse = replace(model(300, 40), exact=True), tmp_path / "coarse.ply"
     write_ply(coarse, whole, offset=(1.0, 2.0, 3.5))
-    assert merge(files(tmp_path, whole), coarse, tmp_path / "all.ply") == 300
+    assert merge(dict.fromkeys(files(tmp_path, whole)), coarse, tmp_path / "all.ply") == 300
     merged = read_ply(tmp_path / "all.ply")
     assert merged.sky == 40 and merged.exact
     parts = [retained(whole, cell(block), 0.0) for block in range(GRID.count)]
@@ -73,14 +73,21 @@ def test_merge_has_each_gaussian_once_and_sky_last(tmp_path: Path) -> None:
 
 def test_empty_blocks_and_no_sky_merge_to_an_empty_model(tmp_path: Path) -> None:
     nothing = model(0, 0)
-    assert merge(files(tmp_path, nothing), saved(tmp_path / "coarse.ply", nothing), tmp_path / "all.ply") == 0
+    assert (
+        merge(
+            dict.fromkeys(files(tmp_path, nothing)),
+            saved(tmp_path / "coarse.ply", nothing),
+            tmp_path / "all.ply",
+        )
+        == 0
+    )
     assert len(read_ply(tmp_path / "all.ply")) == 0
 
 
 def test_a_block_with_sky_is_refused(tmp_path: Path) -> None:
     block = saved(tmp_path / "block.ply", model(10, 4))
     with pytest.raises(RunError, match="4 sky Gaussians"):
-        merge([block], block, tmp_path / "all.ply")
+        merge({block: None}, block, tmp_path / "all.ply")
 
 
 def test_a_truncated_block_leaves_no_merged_file(tmp_path: Path) -> None:
@@ -88,5 +95,5 @@ def test_a_truncated_block_leaves_no_merged_file(tmp_path: Path) -> None:
     coarse = saved(tmp_path / "coarse.ply", model(50, 0))
     first.write_bytes(first.read_bytes()[:-10])
     with pytest.raises(InputError, match="truncated"):
-        merge([first, *rest], coarse, tmp_path / "all.ply")
+        merge(dict.fromkeys([first, *rest]), coarse, tmp_path / "all.ply")
     assert not (tmp_path / "all.ply").exists()

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ from panolog.scene.ply import (
     write_ply_parts,
 )
 from panolog.workers.capture.captured import Captured, joined
-from panolog.workers.merge import merge, retained
+from panolog.workers.merge import merge, retained, retains
 from panolog.workers.tasks import COARSE, MERGE, TaskId
 from panolog.workers.training.checkpoint import SavedModel
 
@@ -62,13 +63,17 @@ def merge_run(
     limit has ended: which blocks are taken from their checkpoints.
     Raises OSError, InputError or RunError if that fails.
     """
-    started = time.monotonic()
-    parts, faces = _block_plys(folder, state, plan, early), range(len(margins.faces))
+    started, faces = time.monotonic(), range(len(margins.faces))
     repaired = [face for face in faces if state.status(TaskId.repair(face)) == Status.DONE]
-    if repaired:
-        _merge_repaired(folder, parts, margins, repaired)
-    else:
-        merge(parts, folder.model(COARSE), folder.point_cloud)
+
+    def rest(piece: Gaussians) -> NDArray[np.bool_]:
+        """(N,) what no repair has trained."""
+        return np.isin(margins.of(piece.means.numpy()), repaired, invert=True)
+
+    blocks = _block_plys(folder, state, plan, early)
+    parts = {path: _rows(path, rest) if repaired else None for path in blocks}
+    parts |= {folder.model(TaskId.repair(face)): None for face in repaired}
+    merge(parts, folder.model(COARSE), folder.point_cloud)
     return _merged(folder, started)
 
 
@@ -80,26 +85,13 @@ def unite_blocks(folder: RunFolder, state: RunState, plan: Plan, task: TaskId) -
     started = time.monotonic()
     output = folder.model(task)
     folder.make(output.parent)
-    count = merge(_block_plys(folder, state, plan), folder.model(COARSE), output)
+    count = merge(dict.fromkeys(_block_plys(folder, state, plan)), folder.model(COARSE), output)
     return _saved(folder, task, count, 0, started)
 
 
-def _merge_repaired(
-    folder: RunFolder, blocks: Sequence[Path], margins: Regions, repaired: Sequence[int]
-) -> None:
-    """Writes what no repair has trained of each block, what the repairs have, and the sky."""
-    coarse = folder.model(COARSE)
-    sky = read_sky(coarse)
-
-    def parts() -> Iterator[Gaussians]:
-        for path in blocks:
-            for piece in read_ply_chunks(path):
-                yield piece.select(torch.from_numpy(~np.isin(margins.of(piece.means.numpy()), repaired)))
-        for face in repaired:
-            yield from read_ply_chunks(folder.model(TaskId.repair(face)))
-        yield sky
-
-    _write(folder.point_cloud, parts, len(sky), coarse)
+def _rows(path: Path, keep: Callable[[Gaussians], NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """(N,) which rows of a file to keep. Args: keep, (n,) which of a piece."""
+    return np.concatenate([np.empty(0, np.bool_), *map(keep, read_ply_chunks(path))])
 
 
 def join_districts(folder: RunFolder, scene: Scene, districts: Districts, iterations: int) -> ModelSaved:
@@ -121,16 +113,15 @@ def join_districts(folder: RunFolder, scene: Scene, districts: Districts, iterat
 
 def _join(path: Path, files: Sequence[tuple[Path, Volume | None]]) -> int:
     """Writes what each file has in its cell, None = all, in order, and one sky; returns how many they are."""
-    sky = _mean([read_sky(file) for file, _ in files])
+    sky, first = _mean([read_sky(file) for file, _ in files]), files[0][0]
+    parts = [(file, _rows(file, partial(_kept, cell=cell))) for file, cell in files]
+    return join_ply(path, parts, sky, sky=len(sky), offset=ply_offset(first), exact=ply_exact(first))
 
-    def parts() -> Iterator[Gaussians]:
-        for file, cell in files:
-            for piece in read_ply_chunks(file):
-                scenery = torch.arange(len(piece)) < piece.scene.stop
-                yield piece.select(scenery) if cell is None else retained(piece, cell, 0.0)
-        yield sky
 
-    return _write(path, parts, len(sky), files[0][0])
+def _kept(piece: Gaussians, cell: Volume | None) -> NDArray[np.bool_]:
+    """(N,) what is in a cell, None = all; never sky."""
+    scenery: NDArray[np.bool_] = np.arange(len(piece)) < piece.scene.stop
+    return scenery if cell is None else retains(piece, cell, 0.0).numpy()
 
 
 def _mean(skies: Sequence[Gaussians]) -> Gaussians:
@@ -224,7 +215,7 @@ def _keep_coarse(folder: RunFolder, plan: Plan, blocks: Sequence[int]) -> None:
     for block in blocks:
         path = folder.kept(block)
         folder.make(path.parent)
-        join_ply(path, [(coarse, np.flatnonzero(labels == block))], sky=0, offset=offset, exact=exact)
+        join_ply(path, [(coarse, labels == block)], sky=0, offset=offset, exact=exact)
 
 
 def _labels(piece: Gaussians, plan: Plan) -> NDArray[np.int64]:
@@ -237,17 +228,6 @@ def _labels(piece: Gaussians, plan: Plan) -> NDArray[np.int64]:
         raise RunError(f"the Stage I model cannot be cut: {error}") from error
     labels[piece.scene] = np.where(seen, blocks, -1)
     return labels
-
-
-def _write(path: Path, parts: Callable[[], Iterator[Gaussians]], sky: int, model: Path) -> int:
-    """Writes Gaussians as one file, with the offset and the projection of a model; returns how many.
-
-    Args: parts is called twice, since the header, which comes first, has their number; sky, how many of them
-    at the end are sky.
-    """
-    count = sum(map(len, parts()))
-    write_ply_parts(path, parts(), count=count, sky=sky, offset=ply_offset(model), exact=ply_exact(model))
-    return count
 
 
 def _saved(folder: RunFolder, task: TaskId, count: int, iterations: int, started: float) -> ModelSaved:
