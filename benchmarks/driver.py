@@ -31,11 +31,11 @@ from panolog.orchestrator.engine.stages.scenes import scene_of
 from panolog.orchestrator.runs import folder as run_folder
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.config import PassesConfig, RunConfig
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import SceneRef, make_info, read_info, write_info
 from panolog.orchestrator.runs.records import ModelSaved, Progressed, RunBegan, Stored, TaskStarted
 from panolog.orchestrator.runs.state import RunState
-from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.runs.thinning import DENSE
 from panolog.partition.cells import Grid
 from panolog.scene.read import read_scene

@@ -12,6 +12,7 @@ from typing import Any, cast
 
 from panolog.orchestrator.engine.scheduling.pool import Pool
 from panolog.orchestrator.runs.config import change
+from panolog.orchestrator.runs.database import Database, read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import make_info, read_info, write_info
 from panolog.orchestrator.runs.machines.machine import cores
@@ -26,7 +27,6 @@ from panolog.orchestrator.runs.records import (
     TaskStarted,
     task_name,
 )
-from panolog.orchestrator.runs.store import Database, read_records
 from panolog.scene.errors import RunError
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId

@@ -19,7 +19,7 @@ from panolog.scene.pictures.headers import ImageInfo, read_header, without_orien
 from panolog.scene.pictures.jpeg import is_cut
 from panolog.scene.pictures.kinds import describe_picture, kind_of
 from panolog.scene.pictures.profiles import JPEG, JPEG_SCAN, PNG, chunks, jpeg_segments, to_srgb
-from panolog.scene.stores.outline import whole
+from panolog.scene.stores.stored_scenes import whole
 
 _TAIL = 65_536  # bytes searched for the end of a JPEG before the whole file is: cameras append little
 _HEAD = 262_144  # bytes in which the pixels of a PNG must begin, if not all of it is there

@@ -31,7 +31,7 @@ from panolog.scene.files import StrPath, file_of, stem_of
 from panolog.scene.image_files import check_layer, layer_record, read_infos, shows_ends
 from panolog.scene.model import NO_OFFSET, Panorama, Scene, Vector
 from panolog.scene.ply_table import read_table, read_vertices
-from panolog.scene.stores.outline import outline
+from panolog.scene.stores.stored_scenes import outline
 from panolog.scene.stores.url import is_url
 
 DEPTHS, SKY_MASKS, MASKS = "depths", "skymasks", "masks"

@@ -20,7 +20,7 @@ from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
 from panolog.workers.evaluation import evaluate_view
 from panolog.workers.events import Calibration, IterationCost
-from panolog.workers.growth import additions, population
+from panolog.workers.growth_law import additions, population
 from panolog.workers.meter import host_peak, memory_in_use, reset_peaks
 from panolog.workers.metrics import load_lpips
 from panolog.workers.sound_views import open_cache

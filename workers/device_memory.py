@@ -8,7 +8,7 @@ new parameters or moments of one kind at a time, without gradients: less than an
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from panolog.workers.training.pipeline import AHEAD, MARGIN
+from panolog.workers.training.iterations import AHEAD, MARGIN
 
 VALUES = 59 * 4  # bytes of one Gaussian's parameters
 # What torch.cuda.max_memory_allocated leaves out: the CUDA context of the process (its stacks, the code of

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.paper.results import Result, Results
 from benchmarks.paper.tables import Overlap
-from panolog.orchestrator.watch.views.palette import BLOCK_COLORS
+from panolog.orchestrator.watch.views.block_colors import BLOCK_COLORS
 
 _INK = "#22272e"
 _SIZE = (5.4, 3.4)  # inches: as wide as a phone, so that its text is not reduced much there

@@ -98,7 +98,7 @@ class TrainingStep:
         return self.state.moving(self.rates, self.rows)
 
     def iteration(self) -> None:
-        """A whole iteration, as in `workers.training.pipeline`."""
+        """A whole iteration, as in `workers.training.iterations`."""
         launch, problem = ops.launcher(self.view.target.device), self.problem()
         if launch is None:
             take(problem, self.moving(), 1, screen=True)

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from panolog.export.sog.archive import Archive, Folder
-from panolog.export.sog.folder import INDEX, META
 from panolog.export.sog.layers import COLUMNS
 from panolog.export.sog.palette import MOST as MOST_ENTRIES
+from panolog.export.sog.whole_folder import INDEX, META
 from panolog.export.sog.write import MOST
 from panolog.export.splats import REST, Splats, quaternions
 from panolog.scene.errors import FormatError

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from panolog.export.detail import MOST, SIDE, Corners, Detail, Node, around
-from panolog.export.sog.folder import GENERATOR, INDEX, META, new_folder, save
+from panolog.export.sog.whole_folder import GENERATOR, INDEX, META, new_folder, save
 from panolog.export.sog.write import encode, json_bytes, numbers, threads
 from panolog.export.splats import InMemory, Splats, SplatSource
 from panolog.scene.errors import FormatError

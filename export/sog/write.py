@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from panolog.export.sog.folder import GENERATOR, META
 from panolog.export.sog.layers import Layers, make_layers
+from panolog.export.sog.whole_folder import GENERATOR, META
 from panolog.export.splats import SplatSource
 from panolog.scene.errors import FormatError
 from panolog.scene.files import StrPath, atomic

@@ -20,7 +20,7 @@ from panolog.orchestrator.cli import (
     scene,
 )
 from panolog.orchestrator.cli.console import Lasting, say
-from panolog.orchestrator.cli.usage import Command, Group, flag
+from panolog.orchestrator.cli.syntax import Command, Group, flag
 from panolog.orchestrator.runs import log
 from panolog.scene.errors import InputError, PanologError, explained, in_one_line
 

@@ -19,7 +19,7 @@ from panolog.orchestrator.cli.options import (
     run_config,
     wanted,
 )
-from panolog.orchestrator.cli.usage import Command, Group, argument, option
+from panolog.orchestrator.cli.syntax import Command, Group, argument, option
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ def _start(
     as_json: bool,
 ) -> None:
     from panolog.orchestrator.engine.cluster.jobs import connect
-    from panolog.orchestrator.watch.follower.plan import words_elsewhere
+    from panolog.orchestrator.watch.follower.recipients import words_elsewhere
 
     words = [*words, *words_elsewhere(*targets), *(["--at-end", at_end] if at_end else [])]
     with progress_bar(f"waiting for the cluster at {address}"):

@@ -9,7 +9,7 @@ import typer
 
 from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
 from panolog.orchestrator.cli.options import BlockArg, JsonOption, RunArg
-from panolog.orchestrator.cli.usage import argument, flag, option
+from panolog.orchestrator.cli.syntax import argument, flag, option
 from panolog.scene.errors import ConfigError, RunFolderError
 from panolog.scene.stores.url import is_url, parse_url
 
@@ -62,9 +62,9 @@ def release(
 def _request(run: Path, action: str, block: int | None = None, node: str | None = None) -> None:
     """Sends a request to the driver. Raises InputError if no driver runs or the state does not allow it."""
     from panolog.orchestrator.runs import control
+    from panolog.orchestrator.runs.database import read_milestones
     from panolog.orchestrator.runs.folder import RunFolder, read_head
     from panolog.orchestrator.runs.state import replay
-    from panolog.orchestrator.runs.store import read_milestones
     from panolog.scene.errors import InputError
 
     folder, wanted = RunFolder(run), control.request(action, block, node)

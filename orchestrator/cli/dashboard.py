@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from panolog.orchestrator.cli.console import say
-from panolog.orchestrator.cli.usage import argument, flag, option
+from panolog.orchestrator.cli.syntax import argument, flag, option
 from panolog.scene.errors import InputError
 
 PORT = 8360  # fixed, so that an open page reconnects to a restarted server
@@ -48,7 +48,7 @@ def dashboard(
 
 def _queue() -> Path | None:
     """The user's queue; None for a user without a home."""
-    from panolog.orchestrator.runs.queue.store import default_folder
+    from panolog.orchestrator.runs.queue.database import default_folder
     from panolog.scene.errors import QueueError
 
     try:

@@ -8,7 +8,7 @@ from typing import Annotated
 from panolog.orchestrator.cli.console import print_result, progress_bar, say
 from panolog.orchestrator.cli.options import JsonOption
 from panolog.orchestrator.cli.stores import opened
-from panolog.orchestrator.cli.usage import argument, flag, option
+from panolog.orchestrator.cli.syntax import argument, flag, option
 from panolog.scene.errors import InputError
 from panolog.scene.stores.url import is_url
 

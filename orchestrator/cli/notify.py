@@ -10,7 +10,7 @@ import typer
 
 from panolog.orchestrator.cli.console import say
 from panolog.orchestrator.cli.options import NotifyOption
-from panolog.orchestrator.cli.usage import Command, Group, argument
+from panolog.orchestrator.cli.syntax import Command, Group, argument
 from panolog.scene.errors import ConfigError
 
 app = typer.Typer(cls=Group, no_args_is_help=True, help="Notifications of runs: test.")
@@ -28,14 +28,14 @@ def test(
 ) -> None:
     """Send a test message to the targets of --notify and of PANOLOG_NOTIFY."""
     from panolog.orchestrator.watch.follower.notifications import trial_of
-    from panolog.orchestrator.watch.follower.plan import read_plan
+    from panolog.orchestrator.watch.follower.recipients import read_recipients
     from panolog.orchestrator.watch.follower.sending import send
 
-    plan, _ = read_plan(notify or (), (), os.environ)
-    if not plan.targets:
+    recipients, _ = read_recipients(notify or (), (), os.environ)
+    if not recipients.targets:
         raise ConfigError("notify test: there is no target; give --notify KIND:URL or set PANOLOG_NOTIFY")
     wrong = []
-    for target in plan.targets:
+    for target in recipients.targets:
         refusal = send(target, trial_of(run.resolve().name, f"test-{secrets.token_hex(8)}", time.time()))
         if refusal is None:
             say(f"sent to {target.label}")

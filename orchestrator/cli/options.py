@@ -7,7 +7,7 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from panolog.orchestrator.cli.usage import argument, flag, option
+from panolog.orchestrator.cli.syntax import argument, flag, option
 from panolog.scene.errors import ConfigError, InputError
 
 if TYPE_CHECKING:

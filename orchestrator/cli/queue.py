@@ -12,7 +12,7 @@ import typer
 from panolog.orchestrator.cli import run as runs
 from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
 from panolog.orchestrator.cli.options import BUDGET, JsonOption, followed, preparation, run_config, wanted
-from panolog.orchestrator.cli.usage import Command, Group, argument, flag, option
+from panolog.orchestrator.cli.syntax import Command, Group, argument, flag, option
 from panolog.scene.errors import QueueError
 
 if TYPE_CHECKING:
@@ -95,8 +95,8 @@ def add(
     **given: Any,
 ) -> None:
     """Add a run to the queue: the arguments and options of `panolog run`."""
+    from panolog.orchestrator.runs.queue.database import opened
     from panolog.orchestrator.runs.queue.entries import Command as Words
-    from panolog.orchestrator.runs.queue.store import opened
 
     given |= _absolute(given)
     root = Path(given["output"])
@@ -115,7 +115,7 @@ def list_(
     as_json: JsonOption = False,
 ) -> None:
     """Show the entries of the queue in order."""
-    from panolog.orchestrator.runs.queue.store import opened
+    from panolog.orchestrator.runs.queue.database import opened
     from panolog.orchestrator.runs.queue.view import view_queue
 
     with opened(_folder(queue), make=False) as found:
@@ -132,8 +132,8 @@ def move(
     queue: QueueOption = None,
 ) -> None:
     """Move an entry that waits."""
+    from panolog.orchestrator.runs.queue.database import opened
     from panolog.orchestrator.runs.queue.entries import State
-    from panolog.orchestrator.runs.queue.store import opened
 
     if (before is not None) + first + last != 1:
         raise QueueError("queue move: give one of --before ID, --first and --last")
@@ -146,7 +146,7 @@ def move(
 @app.command(cls=Command)
 def remove(id: IdArg, queue: QueueOption = None) -> None:
     """Remove an entry that is not running; its run folder stays."""
-    from panolog.orchestrator.runs.queue.store import opened
+    from panolog.orchestrator.runs.queue.database import opened
     from panolog.orchestrator.runs.queue.view import remove_entry
 
     with opened(_folder(queue), make=False) as found:
@@ -164,7 +164,7 @@ def retry(
     """Let a run that has failed or was stopped wait again; it is resumed. Options replace its share."""
     from dataclasses import replace
 
-    from panolog.orchestrator.runs.queue.store import opened
+    from panolog.orchestrator.runs.queue.database import opened
 
     memory = None if ram is None else int(ram * 2**30)
     values = {"gpus": gpus, "cores": cores, "memory": memory}
@@ -185,8 +185,8 @@ def run(
     queue: QueueOption = None,
 ) -> None:
     """Run what waits, in order; first resume what was running."""
+    from panolog.orchestrator.runs.queue.database import opened
     from panolog.orchestrator.runs.queue.runner import Limits, run_queue, sole_runner
-    from panolog.orchestrator.runs.queue.store import opened
 
     folder = _folder(queue)
     with opened(folder) as found, sole_runner(folder):
@@ -195,7 +195,7 @@ def run(
 
 
 def _folder(given: Path | None) -> Path:
-    from panolog.orchestrator.runs.queue.store import default_folder
+    from panolog.orchestrator.runs.queue.database import default_folder
 
     return default_folder() if given is None else given.absolute()
 
@@ -234,13 +234,13 @@ def _check(given: dict[str, Any]) -> str:
 
     Raises InputError as it does.
     """
-    from panolog.orchestrator.watch.follower.plan import read_plan
+    from panolog.orchestrator.watch.follower.recipients import read_recipients
 
     def made(make: Callable[..., Any]) -> Any:
         return make(**{name: given[name] for name in inspect.signature(make).parameters})
 
     config, options, (notify, log) = made(run_config), made(preparation), made(followed)
-    read_plan(notify, log, os.environ)
+    read_recipients(notify, log, os.environ)
     made(wanted)
     output = Path(given["output"])
     if (output / "run.json").exists():

@@ -18,7 +18,7 @@ from panolog.orchestrator.cli.options import (
     RunArg,
 )
 from panolog.orchestrator.cli.stores import opened
-from panolog.orchestrator.cli.usage import argument, flag, option
+from panolog.orchestrator.cli.syntax import argument, flag, option
 from panolog.scene.errors import InputError
 from panolog.scene.stores.url import is_url
 

@@ -37,7 +37,7 @@ from panolog.orchestrator.cli.options import (
     wanted,
 )
 from panolog.orchestrator.cli.stores import mirrored, opened
-from panolog.orchestrator.cli.usage import argument, flag, option
+from panolog.orchestrator.cli.syntax import argument, flag, option
 
 if TYPE_CHECKING:
     from panolog.orchestrator.runs.config import RunConfig
@@ -239,8 +239,8 @@ def events(
 
 def _print_events(run: Path, *, follow: bool) -> None:
     from panolog.orchestrator.runs import lock
+    from panolog.orchestrator.runs.database import as_event, read_records
     from panolog.orchestrator.runs.folder import RunFolder, read_head
-    from panolog.orchestrator.runs.store import as_event, read_records
 
     folder = RunFolder(run)
     read_head(folder)
@@ -274,12 +274,12 @@ def _complain(line: str) -> None:
 def _followed(root: Path, notify: list[str], log: list[str]) -> Iterator[None]:
     """Follows a run while the context lasts, if that is wanted. Raises ConfigError for wrong options."""
     from panolog.orchestrator.cli.session.companion import companion_follower
-    from panolog.orchestrator.watch.follower.plan import read_plan
+    from panolog.orchestrator.watch.follower.recipients import read_recipients
 
-    plan, secret = read_plan(notify, log, os.environ)
+    recipients, secret = read_recipients(notify, log, os.environ)
     for name in secret:  # neither Ray nor a worker gets them
         os.environ.pop(name, None)
-    with companion_follower(root, plan, say):
+    with companion_follower(root, recipients, say):
         yield
 
 

@@ -19,7 +19,7 @@ from panolog.orchestrator.cli.options import (
     grouped,
     reconstruction,
 )
-from panolog.orchestrator.cli.usage import Command, Group, argument, flag, option
+from panolog.orchestrator.cli.syntax import Command, Group, argument, flag, option
 from panolog.scene.errors import InputError
 
 app = typer.Typer(
@@ -220,7 +220,7 @@ def models(
     as_json: JsonOption = False,
 ) -> None:
     """List networks for --mask-model and --depth-model, or check one; nothing is downloaded."""
-    from panolog.prepare.networks.known import check_network, list_lines, networks_as_json
+    from panolog.prepare.networks.catalogue import check_network, list_lines, networks_as_json
 
     if model is None:
         print_result(networks_as_json(), list_lines(), as_json=as_json)

@@ -19,17 +19,17 @@ def mirrored(
 
     Args: run, a folder or a URL; local, the folder that `--local` names; resumes, whether the run exists;
     force, take it from another driver; mirror, false if another process copies it.
-    Raises as `plan_of` and `companion.mirrored`.
+    Raises as `settings_of` and `mirror_process.mirrored`.
     """
     if not mirror or not (is_url(run) or resumes or local):  # as most runs: nothing of stores is imported
         yield Path(run)
         return
-    from panolog.orchestrator.runs.storage.companion import mirrored as kept
-    from panolog.orchestrator.runs.storage.plan import plan_of
+    from panolog.orchestrator.runs.storage.mirror_process import mirrored as kept
+    from panolog.orchestrator.runs.storage.mirror_settings import settings_of
 
-    plan = plan_of(run, local, os.environ, resumes=resumes, force=force)
-    with kept(plan, say):
-        yield plan.root if plan else Path(run)
+    settings = settings_of(run, local, os.environ, resumes=resumes, force=force)
+    with kept(settings, say):
+        yield settings.root if settings else Path(run)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from typing import Any
 from typing_extensions import assert_never
 
 from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.database import read_milestones
 from panolog.orchestrator.runs.folder import RunFolder, read_below
 from panolog.orchestrator.runs.machines.history import NodeState
 from panolog.orchestrator.runs.records import (
@@ -31,7 +32,6 @@ from panolog.orchestrator.runs.records import (
     UnpauseRequested,
 )
 from panolog.orchestrator.runs.state import RunState, Status, TaskState, replay
-from panolog.orchestrator.runs.store import read_milestones
 from panolog.scene.errors import InputError, RunFolderError
 from panolog.scene.files import FULL, write_bytes
 from panolog.workers.tasks import StrEnum, TaskId

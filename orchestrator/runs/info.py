@@ -16,11 +16,11 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from panolog.orchestrator.runs.config import RESOLVED, RunConfig
+from panolog.orchestrator.runs.database import read_milestones
 from panolog.orchestrator.runs.folder import RunFolder, command_line, flat, read_json, write_json
-from panolog.orchestrator.runs.reading import WAYS_OUT
 from panolog.orchestrator.runs.records import PreflightSaved, RunBegan, Stored
+from panolog.orchestrator.runs.sql import WAYS_OUT
 from panolog.orchestrator.runs.state import replay
-from panolog.orchestrator.runs.store import read_milestones
 from panolog.scene.errors import ConfigError, RunFolderError, wrong_value
 from panolog.scene.files import SUFFIX
 from panolog.scene.model import NO_OFFSET, Vector

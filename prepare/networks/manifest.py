@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
-from panolog.prepare.networks.tiles import Tiles
+from panolog.prepare.networks.square_views import Tiles
 from panolog.scene.errors import ConfigError, in_one_line, wrong_value
 
 MAX_BYTES = 65_536  # of a manifest

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from panolog.prepare.networks.manifest import Classes, Ignore, MaskManifest, manifest_path, read_manifest
 from panolog.prepare.networks.network import Network, model_digest, run_all
 from panolog.prepare.networks.seam import Floats, blend, named, network_images, plane
-from panolog.prepare.networks.tiles import Tiles
+from panolog.prepare.networks.square_views import Tiles
 
 
 class MoverNetwork:

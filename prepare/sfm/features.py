@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import load_grey
 from panolog.prepare.provenance import read_mask, sampled
-from panolog.prepare.sfm.faces import BAND, DOWN, UP, Faces
+from panolog.prepare.sfm.conformal_views import BAND, DOWN, UP, Faces
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.errors import RunError
 from panolog.scene.image_files import read_info

@@ -7,10 +7,10 @@ import pytest
 from benchmarks.runs import borrow_stage_one
 from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.database import read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Outcome, TaskStarted
 from panolog.orchestrator.runs.state import ignore
-from panolog.orchestrator.runs.store import read_records
 from panolog.workers.calibration import CalibrateSpec
 from panolog.workers.tasks import COARSE, Stage
 from tests.orchestrator.calibrated import says

@@ -13,10 +13,10 @@ import pytest
 
 import panolog
 from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.orchestrator.runs.records import Progressed, RunBegan
-from panolog.orchestrator.runs.store import Database
 from panolog.prepare.importers import import_scene
 from panolog.scene.image_files import read_info
 from panolog.workers.tasks import COARSE

@@ -16,16 +16,16 @@ from panolog.orchestrator.engine.driver.driver import Driver, Hooks
 from panolog.orchestrator.engine.driver.job import Job
 from panolog.orchestrator.engine.driver.journal import Journal
 from panolog.orchestrator.engine.driver.requests import Stop
-from panolog.orchestrator.engine.scheduling.delivery import announced
+from panolog.orchestrator.engine.scheduling.large_messages import announced
 from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
 from panolog.orchestrator.engine.scheduling.pool import NONE, Ended, Failed, Hello, InProcess, Message, Pool
 from panolog.orchestrator.runs.clock import CLOCK, Clock
 from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.database import Database, read_milestones, read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines.nodes import Node, Placement
 from panolog.orchestrator.runs.records import Failure, RunBegan
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore, replay
-from panolog.orchestrator.runs.store import Database, read_milestones, read_records
 from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.workers.evaluation import EvaluateSpec

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.orchestrator.runs.records import ModelSaved, Record, RunBegan, Stored, TaskStarted
 from panolog.orchestrator.runs.state import RunState, replay
-from panolog.orchestrator.runs.store import Database
 from panolog.workers.tasks import TaskId
 
 BEGAN = RunBegan("host", 1, resumed=False)

@@ -11,9 +11,9 @@ from playwright.sync_api import Page, expect
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.queue import processes
+from panolog.orchestrator.runs.queue.database import Queue
 from panolog.orchestrator.runs.queue.entries import Command, Needs, Share, State
 from panolog.orchestrator.runs.queue.runner import lock_of
-from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.watch.views.comparison.page import write_comparison
 from panolog.orchestrator.watch.views.pages.report import write_report
 from tests.orchestrator.watch.dashboard.browser import DESK, PHONE

@@ -13,6 +13,7 @@ from panolog.orchestrator.engine.stages.outline import write_sketch
 from panolog.orchestrator.engine.stages.partitioning import plan_records, write_plan
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.orchestrator.runs.info import PENDING, RunInfo, SceneRef, read_info, write_info
 from panolog.orchestrator.runs.machines.gpus import GpuUsage
@@ -51,7 +52,6 @@ from panolog.orchestrator.runs.records import (
     TaskYielded,
     ViewEvaluated,
 )
-from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import write_report
 from panolog.workers.tasks import COARSE, EVAL, PREPARE, TaskId
 from tests.visual import town

@@ -30,8 +30,8 @@ from panolog.scene.tensors.transfer import packed_bytes, unpack
 from panolog.workers import device_memory
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, densify
+from panolog.workers.training.iterations import AHEAD
 from panolog.workers.training.optimizer import ModelState
-from panolog.workers.training.pipeline import AHEAD
 from panolog.workers.training.trainer import Trainer
 from tests.renderer.cuda.stubbed import no_launch
 from tests.workers.small import WIDTH

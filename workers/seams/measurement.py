@@ -26,7 +26,7 @@ from panolog.workers.comparison import with_block
 from panolog.workers.events import Event, SeamMeasured
 from panolog.workers.merge import retained
 from panolog.workers.seams import schema
-from panolog.workers.seams.looks import Looks
+from panolog.workers.seams.cameras import Looks
 from panolog.workers.seams.pictures import Picture
 from panolog.workers.seams.schema import Seam
 from panolog.workers.seams.strips import Colors, Difference, Errors, Look, Seen, Strip, see, strip_of

@@ -148,7 +148,7 @@ class DensifyConfig(Group):
         default=0.8,
         ge=0,
         description="the budget of a task that starts with n Gaussians and has p pixels of a panorama is"
-        " n · (1 + growth · (0.85 + 0.5 ln(p / n))), the law that clone-split follows (workers/growth.py);"
+        " n · (1 + growth · (0.85 + 0.5 ln(p / n))), that of clone-split (workers/growth_law.py);"
         " 0.8 gives a street about as many as clone-split",
     )
     long_runs: float = Field(

@@ -22,7 +22,7 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import view_bytes
 from panolog.scene.model import Panorama
 from panolog.scene.tensors.transfer import Mover, Moving, pack, packed_bytes
-from panolog.workers.training.pipeline import AHEAD
+from panolog.workers.training.iterations import AHEAD
 from panolog.workers.training.task_config import CacheConfig
 
 T = TypeVar("T")

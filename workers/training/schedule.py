@@ -16,7 +16,7 @@ from panolog.workers.training.config import DensifyConfig, TrainConfig
 FULL_RUN = 30_000  # iterations that the config's schedules are stated for
 SHORT_RUN = 1_500  # iterations up to which the budget of Gaussians is `densify.growth`'s
 AVERAGED = 32  # models in an average, about: 13 were as good as 62
-GROWTH_OFFSET, GROWTH_SLOPE = 0.85, 0.5  # by the pixels of each Gaussian, measured: workers/growth.py
+GROWTH_OFFSET, GROWTH_SLOPE = 0.85, 0.5  # by the pixels of each Gaussian, measured: workers/growth_law.py
 
 
 @lru_cache(maxsize=4)

@@ -34,6 +34,7 @@ from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.tasks import COARSE, Progress
 from panolog.workers.training.checkpoint import loaded
+from panolog.workers.training.checkpointing import Outbox, Saver, Tensors, copied
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, rate_units
 from panolog.workers.training.exterior import Exterior, Rooms, exterior_last, inside
@@ -44,11 +45,10 @@ from panolog.workers.training.initialise import (
     points_of,
     scene_length,
 )
+from panolog.workers.training.iterations import Direct, Pipeline, Planned
 from panolog.workers.training.loss import Loss, loss_rows
 from panolog.workers.training.optimizer import AVERAGE, Average, ModelState, check_kind, trained_rows
-from panolog.workers.training.pipeline import Direct, Pipeline, Plan
 from panolog.workers.training.relocate import Growth, Place
-from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
 from panolog.workers.training.schedule import Schedule, order
 from panolog.workers.training.surfaces import Surfaces
 
@@ -320,11 +320,11 @@ class Trainer:
         """Waits for the iterations that have begun: all is then as after the last. Raises as `step`."""
         self.pipeline.settle()
 
-    def _not_finite(self, what: str, plan: Plan) -> RunError:
-        where = f"iteration {plan.iteration}, view {self.scene.panoramas[plan.view].name}"
+    def _not_finite(self, what: str, planned: Planned) -> RunError:
+        where = f"iteration {planned.iteration}, view {self.scene.panoramas[planned.view].name}"
         return RunError(f"{self.spec.task}: the {what} is not finite at {where}")
 
-    def _plan(self, iteration: int, view: View) -> Plan:
+    def _plan(self, iteration: int, view: View) -> Planned:
         """An iteration as it is to be done."""
         degree, weight = self.schedule.sh_degree(iteration), self.loss.depth_weight(iteration)
         around = self._around(view.row)
@@ -344,7 +344,7 @@ class Trainer:
             moving=self.learning.moving(iteration),
             absolute=self.statistics.absolute is not None and self.schedule.collects(iteration),
         )
-        return Plan(
+        return Planned(
             iteration=iteration,
             view=view.row,
             problem=problem,

@@ -7,7 +7,7 @@ from panolog.orchestrator.runs.config import RunConfig
 from panolog.partition.bounds import baseline
 from panolog.prepare.check.layers import look_at_layers
 from panolog.scene.model import Scene
-from panolog.scene.stores.outline import url_of
+from panolog.scene.stores.stored_scenes import url_of
 
 
 def describe(scene: Scene) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from panolog.orchestrator.watch.views.site.build import (
 )
 from panolog.orchestrator.watch.views.site.photographs import STORE_S, photograph
 from panolog.scene.errors import InputError, StoreLostError
-from panolog.scene.stores.outline import local_folder
+from panolog.scene.stores.stored_scenes import local_folder
 from panolog.scene.write import StageProgress, no_progress
 
 _CACHED = 32  # photographs, of some hundred kilobytes each

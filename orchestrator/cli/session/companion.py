@@ -10,7 +10,7 @@ from subprocess import DEVNULL, PIPE
 from threading import Thread
 
 from panolog.orchestrator.runs.machines.children import send_line, start_companion
-from panolog.orchestrator.watch.follower.plan import END, LAST_S, FollowerPlan, to_json
+from panolog.orchestrator.watch.follower.recipients import END, LAST_S, Recipients, to_json
 
 _TIMEOUT_S = 8.0  # for the process to send its pages the last state of the run, and to end
 _FOLLOWER_S = LAST_S + 5.0  # for the follower to end
@@ -54,16 +54,16 @@ def companion_dashboard(run: Path, say: Callable[[str], None]) -> Iterator[Threa
 
 
 @contextmanager
-def companion_follower(run: Path, plan: FollowerPlan, say: Callable[[str], None]) -> Iterator[None]:
+def companion_follower(run: Path, recipients: Recipients, say: Callable[[str], None]) -> Iterator[None]:
     """Follows a run while the context lasts, and then until the last news are delivered, for a bounded time.
 
     Its failure does not affect the run. If it was killed, another one delivers what is left at the end.
     Args: say, called with a line for each thing that could not be done.
     """
-    if not plan:
+    if not recipients:
         yield
         return
-    start = partial(start_companion, "panolog.orchestrator.watch.follower", to_json(plan, run))
+    start = partial(start_companion, "panolog.orchestrator.watch.follower", to_json(recipients, run))
     process = start()
     try:
         yield

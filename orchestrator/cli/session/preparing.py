@@ -24,7 +24,7 @@ from panolog.prepare.panorama_files import PanoramaFile
 from panolog.scene.errors import ConfigError, RunFolderError, SceneError
 from panolog.scene.model import Scene
 from panolog.scene.read import MASKS, MIN_CAMERAS, model_folder, read_scene
-from panolog.scene.stores.outline import url_of
+from panolog.scene.stores.stored_scenes import url_of
 from panolog.scene.stores.url import is_url
 
 Given = Path | str | Sequence[Path | str]  # a scene, or panoramas and videos

@@ -25,6 +25,7 @@ from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs import folder as run_folder
 from panolog.orchestrator.runs import info as run_info
 from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import RunInfo
 from panolog.orchestrator.runs.money.account import lost_with_driver
@@ -37,7 +38,6 @@ from panolog.orchestrator.runs.records import Noticed, Outcome, Preparing, Recor
 from panolog.orchestrator.runs.retention.clean import remove_all
 from panolog.orchestrator.runs.retention.survey import models_of_parts
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore
-from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.pages.report import report_or_notice
 from panolog.scene.errors import RunFolderError, RunLockedError, installed
 from panolog.scene.files import remove_partial
@@ -204,7 +204,7 @@ class _Beginning:
     def prepare(self, info: RunInfo, settings: Settings | None) -> RunInfo:
         """Makes the scene of a run that was given none, and returns run.json with it. Raises as `make`."""
         if settings is not None:
-            from panolog.orchestrator.cli.session.making import Preparation
+            from panolog.orchestrator.cli.session.scene_making import Preparation
 
             self.made = Preparation(self.folder, settings, info.config, self.journal).make()
             config = preparing.with_width(self.made.width, info.config)

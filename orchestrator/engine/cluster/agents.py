@@ -16,7 +16,7 @@ from ray.exceptions import RayError
 
 from panolog.orchestrator.engine.cluster.nodes import on_node
 from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
-from panolog.orchestrator.engine.scheduling.watch import Watch
+from panolog.orchestrator.engine.scheduling.machine_end import Watch
 from panolog.orchestrator.runs.records import Leaving
 from panolog.workers import stopping
 

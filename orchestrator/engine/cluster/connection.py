@@ -60,8 +60,8 @@ def connect(
         signal.signal(signal.SIGTERM, signal.default_int_handler if unset else before)
         if address:
             meanwhile()
-        from panolog.orchestrator.engine.cluster.files import FileSharing, key_of  # noqa: PLC0415
         from panolog.orchestrator.engine.cluster.pool import RayPool  # noqa: PLC0415
+        from panolog.orchestrator.engine.cluster.remote_files import FileSharing, key_of  # noqa: PLC0415
 
         sharing = FileSharing(root) if address else None
         pool = RayPool(sharing, key_of(root))

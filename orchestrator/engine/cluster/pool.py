@@ -21,10 +21,10 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from panolog.orchestrator.engine.cluster.agents import Agents
 from panolog.orchestrator.engine.cluster.autoscaler import Autoscaler
 from panolog.orchestrator.engine.cluster.failures import CUT_OFF, failure_of, reported
-from panolog.orchestrator.engine.cluster.files import FileSharing, RayValue, run_remotely
 from panolog.orchestrator.engine.cluster.nodes import RayNodes
 from panolog.orchestrator.engine.cluster.places import Others, Places
-from panolog.orchestrator.engine.scheduling.delivery import Large, announced
+from panolog.orchestrator.engine.cluster.remote_files import FileSharing, RayValue, run_remotely
+from panolog.orchestrator.engine.scheduling.large_messages import Large, announced
 from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
 from panolog.orchestrator.engine.scheduling.pool import (
     NONE,

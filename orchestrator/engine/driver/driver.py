@@ -17,14 +17,14 @@ from panolog.orchestrator.engine.driver.ending import end_recorded
 from panolog.orchestrator.engine.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.engine.driver.journal import Journal, Patience
 from panolog.orchestrator.engine.driver.machines import Machines
+from panolog.orchestrator.engine.driver.own_results import Deliver, OnPlan, Results
 from panolog.orchestrator.engine.driver.policy import outcome
 from panolog.orchestrator.engine.driver.purse import Purse
 from panolog.orchestrator.engine.driver.requests import Requests, Stop
-from panolog.orchestrator.engine.driver.results import Deliver, OnPlan, Results
 from panolog.orchestrator.engine.driver.saving import Usages, make_outbox, remove_checkpoints, save, tidy
 from panolog.orchestrator.engine.driver.writers import Writers
 from panolog.orchestrator.engine.scheduling import quarantine
-from panolog.orchestrator.engine.scheduling.delivery import Large, payload
+from panolog.orchestrator.engine.scheduling.large_messages import Large, payload
 from panolog.orchestrator.engine.scheduling.placement import Placed
 from panolog.orchestrator.engine.scheduling.pool import Ended, Failed, Hello, Pool
 from panolog.orchestrator.engine.stages.evaluation import Evaluation

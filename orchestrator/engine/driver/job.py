@@ -11,7 +11,7 @@ from scipy.sparse import csc_array
 from typing_extensions import assert_never
 
 from panolog.orchestrator.engine.driver import policy
-from panolog.orchestrator.engine.estimates.parts import districts_of
+from panolog.orchestrator.engine.estimates.place_parts import districts_of
 from panolog.orchestrator.engine.scheduling.pool import Sharing
 from panolog.orchestrator.engine.stages.evaluation import Evaluation
 from panolog.orchestrator.engine.stages.first_look import shown_row
@@ -32,7 +32,7 @@ from panolog.scene.model import Scene
 from panolog.scene.ply import read_scene_means
 from panolog.workers.evaluation import FACES, EvaluateSpec
 from panolog.workers.scoring import ScoreSpec, in_shards, shards_of
-from panolog.workers.seams.looks import Looks
+from panolog.workers.seams.cameras import Looks
 from panolog.workers.seams.measurement import Seams
 from panolog.workers.specs import ModelFile, ScenePart, Source
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId

@@ -14,8 +14,8 @@ from typing import TypeVar
 
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.clock import CLOCK, Clock, Steady
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.presence import Presence, why_waiting
-from panolog.orchestrator.runs.reading import TIMEOUT_S
 from panolog.orchestrator.runs.records import (
     CheckpointSaved,
     Noticed,
@@ -29,8 +29,8 @@ from panolog.orchestrator.runs.records import (
     Transferred,
     ViewEvaluated,
 )
+from panolog.orchestrator.runs.sql import TIMEOUT_S
 from panolog.orchestrator.runs.state import OnChange, RunState, apply, ignore, replay
-from panolog.orchestrator.runs.store import Database
 from panolog.scene.errors import RunError
 
 _LOG = logging.getLogger(__name__)

@@ -20,8 +20,9 @@ from traceback import format_exception
 
 import torch
 
-from panolog.orchestrator.engine.scheduling.delivery import announced
+from panolog.orchestrator.engine.scheduling.large_messages import announced
 from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
+from panolog.orchestrator.engine.scheduling.machine_end import Watch
 from panolog.orchestrator.engine.scheduling.pool import (
     NONE,
     Ended,
@@ -32,7 +33,6 @@ from panolog.orchestrator.engine.scheduling.pool import (
     guarded,
     on_its_card,
 )
-from panolog.orchestrator.engine.scheduling.watch import Watch
 from panolog.orchestrator.runs import log
 from panolog.orchestrator.runs.machines.gpus import describe_gpus
 from panolog.orchestrator.runs.machines.machine import cores, instance_type, memory, oom_kills, share

@@ -13,6 +13,7 @@ from typing_extensions import assert_never
 from panolog.orchestrator.engine.stages.captures import save_captured
 from panolog.orchestrator.runs import thinning
 from panolog.orchestrator.runs.clock import Clock
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines.usage import INTERVAL_S, Usage
 from panolog.orchestrator.runs.records import (
@@ -28,7 +29,6 @@ from panolog.orchestrator.runs.records import (
     ViewEvaluated,
 )
 from panolog.orchestrator.runs.state import RunState, Status
-from panolog.orchestrator.runs.store import Database
 from panolog.partition.scores import write_scores
 from panolog.scene.files import publish, remove_partial, write_bytes
 from panolog.scene.model import Scene
@@ -46,7 +46,7 @@ from panolog.workers.events import (
 )
 from panolog.workers.tasks import COARSE, Progress, TaskId, Transfer
 from panolog.workers.training import checkpoint
-from panolog.workers.training.saving import Outbox
+from panolog.workers.training.checkpointing import Outbox
 
 _LOG = logging.getLogger(__name__)
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # of file systems without hard links

@@ -18,7 +18,7 @@ import numpy as np
 from panolog.orchestrator.engine.estimates.calibration import Basis
 from panolog.orchestrator.runs.state import RunState, Status, TaskState
 from panolog.scene.images import MOST_THREADS
-from panolog.workers.growth import Period
+from panolog.workers.growth_law import Period
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
 _DECODERS = 4  # threads that decode panoramas on the CPU, at most

@@ -6,8 +6,8 @@ panoramas; decoded panoramas stay within `cache.memory`. A block with a baked ex
 has; the fullest cell is expected to have as large a share of the Gaussians as of the sparse points.
 
 Time. An iteration takes a + b · Gaussians seconds: the calibration has tried two numbers of them, and
-`workers.growth` predicts how many there will be. Tasks that share the cores have one thread each, or as many
-as there are cores for each of them. Checkpoints and previews are left out: they cost less than the rest errs.
+`workers.growth_law` predicts how many there will be. Tasks that share the cores have one thread each, or as
+many as there are cores for each. Checkpoints and previews are left out: they cost less than the rest errs.
 """
 
 import math
@@ -18,7 +18,7 @@ from functools import cache, cached_property
 from panolog.orchestrator.engine.estimates import calibration
 from panolog.orchestrator.engine.estimates.calibration import AVERAGE, CHECKPOINT, PIXEL, TRAINED, Basis
 from panolog.orchestrator.engine.estimates.costs import Estimate, Pace, StageEstimate
-from panolog.orchestrator.engine.estimates.parts import Parts
+from panolog.orchestrator.engine.estimates.place_parts import Parts
 from panolog.orchestrator.engine.scheduling.placement import USABLE
 from panolog.orchestrator.runs.config import RunConfig
 from panolog.orchestrator.runs.machines.nodes import Node
@@ -27,7 +27,7 @@ from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
 from panolog.workers import device_memory
 from panolog.workers.device_memory import VALUES
-from panolog.workers.growth import Period, additions, population
+from panolog.workers.growth_law import Period, additions, population
 from panolog.workers.metrics import LPIPS_BYTES
 from panolog.workers.showing.previews import PREVIEW_WIDTH
 from panolog.workers.tasks import Stage

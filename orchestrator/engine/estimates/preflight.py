@@ -10,7 +10,7 @@ from typing import Any
 from panolog.orchestrator.engine.estimates.calibration import Basis, assumed, await_machine, calibrate
 from panolog.orchestrator.engine.estimates.costs import Estimate, StageEstimate
 from panolog.orchestrator.engine.estimates.estimate import Estimator
-from panolog.orchestrator.engine.estimates.parts import districts_of
+from panolog.orchestrator.engine.estimates.place_parts import districts_of
 from panolog.orchestrator.engine.estimates.suggestions import (
     DIVISIONS,
     Settings,

@@ -16,7 +16,7 @@ from heapq import heapify, heappop, heappush
 
 import numpy as np
 
-from panolog.orchestrator.engine.scheduling.assignment import Floats, assign_lpt
+from panolog.orchestrator.engine.scheduling.longest_first import Floats, assign_lpt
 from panolog.orchestrator.runs.machines.nodes import Gpu, Node, Placement
 from panolog.workers.tasks import TaskId
 

@@ -12,7 +12,7 @@ from typing import Protocol, TypeVar
 
 import torch
 
-from panolog.orchestrator.engine.scheduling.delivery import Large
+from panolog.orchestrator.engine.scheduling.large_messages import Large
 from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
 from panolog.orchestrator.engine.scheduling.scaling import NO_GROWTH, Growth
 from panolog.orchestrator.runs.machines.nodes import Node, Placement

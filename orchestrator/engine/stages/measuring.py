@@ -16,7 +16,7 @@ from panolog.prepare.check.misplaced import find_misplaced
 from panolog.prepare.check.residuals import describe as describe_residuals
 from panolog.scene.files import some_of
 from panolog.scene.model import Scene
-from panolog.scene.stores.outline import url_of
+from panolog.scene.stores.stored_scenes import url_of
 from panolog.workers.capture.captured import Captured
 from panolog.workers.capture.config import ExposureConfig, PosesConfig
 

@@ -24,9 +24,9 @@ from panolog.orchestrator.runs.control import state_of
 from panolog.orchestrator.runs.folder import RunFolder, command_line
 from panolog.orchestrator.runs.machines.children import bound_to_parent, signals_blocked
 from panolog.orchestrator.runs.queue import processes
+from panolog.orchestrator.runs.queue.database import Queue
 from panolog.orchestrator.runs.queue.entries import Entry, Share, State
 from panolog.orchestrator.runs.queue.shares import Capacity, NeverFitsError, environment
-from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.runs.records import Outcome
 from panolog.scene.errors import QueueError, RunLockedError, last_line
 

@@ -9,10 +9,10 @@ from typing import Any
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.queue import processes
+from panolog.orchestrator.runs.queue.database import Queue
 from panolog.orchestrator.runs.queue.entries import Entry, State
 from panolog.orchestrator.runs.queue.runner import lock_of, log_of, sole_runner
 from panolog.orchestrator.runs.queue.shares import describe
-from panolog.orchestrator.runs.queue.store import Queue
 
 _LEFT = "interrupted"  # how a running entry is shown while no runner is at work and nothing of it is alive
 

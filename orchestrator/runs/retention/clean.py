@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder, removed_models, write_json
 from panolog.orchestrator.runs.records import Noticed
 from panolog.orchestrator.runs.retention.survey import Kind, Removal, Survey, Wanted, survey
-from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.runs.units import DURATION, gib, seconds_of
 from panolog.scene.errors import ConfigError, PanologError, RunLockedError, in_one_line
 

@@ -1,4 +1,4 @@
-"""The process of a mirror: gets its plan in the first line of stdin, and ends after stdin does.
+"""The process of a mirror: gets its settings in the first line of stdin, and ends after stdin does.
 
 It says what its parent needs as JSON lines on stdout. It ignores the signals that end a run, so that it
 copies the last checkpoints; SIGTERM ends it. Separate: it is a program.
@@ -16,7 +16,7 @@ from panolog.orchestrator.runs.storage.fetch import bring
 from panolog.orchestrator.runs.storage.layout import Manifest, current
 from panolog.orchestrator.runs.storage.lease import Lease, take
 from panolog.orchestrator.runs.storage.mirror import Mirror
-from panolog.orchestrator.runs.storage.plan import MIRROR_PLAN, MirrorPlan
+from panolog.orchestrator.runs.storage.mirror_settings import MIRROR_SETTINGS, MirrorSettings
 from panolog.orchestrator.runs.units import gib
 from panolog.scene.errors import (
     InputError,
@@ -37,7 +37,7 @@ def main() -> None:
     line = sys.stdin.readline()
     if not line.endswith("\n"):  # its parent has ended before
         return
-    plan = MIRROR_PLAN.validate_json(line)
+    settings = MIRROR_SETTINGS.validate_json(line)
     ended, stop = threading.Event(), threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})  # blocked where another one was killed
@@ -48,23 +48,23 @@ def main() -> None:
 
     threading.Thread(target=wait, daemon=True).start()
     try:
-        store, lease, manifest = _begun(plan)
+        store, lease, manifest = _begun(settings)
     except (PanologError, OSError) as error:
         _tell(error=in_one_line(error), code=2 if isinstance(error, InputError) else 1)
         return
     _tell(ready=True)
-    _follow(plan, Mirror(RunFolder(plan.root), store, lease, manifest), lease, ended, stop)
+    _follow(settings, Mirror(RunFolder(settings.root), store, lease, manifest), lease, ended, stop)
 
 
-def _begun(plan: MirrorPlan) -> tuple[Store, Lease, Manifest | None]:
+def _begun(settings: MirrorSettings) -> tuple[Store, Lease, Manifest | None]:
     """Takes the lease, and brings the run if it is to be resumed. Raises PanologError."""
-    folder, store = RunFolder(plan.root), open_store(plan.url, _PATIENCE_S)
-    lease = take(store, plan.root, force=plan.force, again=plan.again)
+    folder, store = RunFolder(settings.root), open_store(settings.url, _PATIENCE_S)
+    lease = take(store, settings.root, force=settings.force, again=settings.again)
     try:
         manifest = current(store)
-        if plan.again:
+        if settings.again:
             return store, lease, manifest
-        if plan.resumes:
+        if settings.resumes:
             bring(store, folder, manifest, lambda line: _tell(say=line))
         elif manifest is not None:
             raise RunFolderError(f"{store.url}: holds a run; use `panolog resume {store.url}`")
@@ -76,10 +76,10 @@ def _begun(plan: MirrorPlan) -> tuple[Store, Lease, Manifest | None]:
 
 
 def _follow(
-    plan: MirrorPlan, mirror: Mirror, lease: Lease, ended: threading.Event, stop: threading.Event
+    settings: MirrorSettings, mirror: Mirror, lease: Lease, ended: threading.Event, stop: threading.Event
 ) -> None:
-    folder = RunFolder(plan.root)
-    mirror.follow(ended, stop, plan.period, plan.patience)
+    folder = RunFolder(settings.root)
+    mirror.follow(ended, stop, settings.period, settings.patience)
     with suppress(StoreError, StoreLostError):
         lease.release()
     if lease.lost and lock.held(folder.lock):  # what is trained from now on would be lost

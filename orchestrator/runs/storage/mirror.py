@@ -17,9 +17,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.database import read_milestones
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.reading import reading
 from panolog.orchestrator.runs.records import Outcome
+from panolog.orchestrator.runs.sql import reading
 from panolog.orchestrator.runs.state import RunState, Status, replay
 from panolog.orchestrator.runs.storage.layout import (
     DATABASE,
@@ -38,7 +39,6 @@ from panolog.orchestrator.runs.storage.layout import (
 )
 from panolog.orchestrator.runs.storage.lease import Lease
 from panolog.orchestrator.runs.storage.state import MirrorState, write_state
-from panolog.orchestrator.runs.store import read_milestones
 from panolog.scene.errors import RunFolderError, RunLockedError, StoreError, StoreLostError, in_one_line
 from panolog.scene.stores.store import Store
 

@@ -103,7 +103,7 @@ from panolog.orchestrator.watch.views.plan_page import (
     view_camera,
 )
 from panolog.scene.errors import InputError
-from panolog.scene.stores.outline import local_folder, made_here
+from panolog.scene.stores.stored_scenes import local_folder, made_here
 from panolog.scene.stores.url import is_url
 from panolog.workers.tasks import COARSE
 

@@ -25,7 +25,7 @@ from panolog.orchestrator.watch.views.site.photographs import STORE_S, require_s
 from panolog.scene.errors import InputError, StoreLostError
 from panolog.scene.files import natural_key
 from panolog.scene.read import check_names, image_folder, model_folder
-from panolog.scene.stores.outline import made_here, whole
+from panolog.scene.stores.stored_scenes import made_here, whole
 
 _SIZE = 50_000_000  # bytes of a JPEG at most
 _COVER = 320  # pixels of the width of a run's picture in the list

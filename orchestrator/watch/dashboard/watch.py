@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from panolog.orchestrator.runs import lock, presence, reading
+from panolog.orchestrator.runs import lock, presence, sql
+from panolog.orchestrator.runs.database import as_event, read_milestones, read_news
 from panolog.orchestrator.runs.folder import RunFolder, read_json, shown_model
 from panolog.orchestrator.runs.records import RunBegan, RunEnded, Stored
 from panolog.orchestrator.runs.storage.state import read_state
-from panolog.orchestrator.runs.store import as_event, read_milestones, read_news
 from panolog.orchestrator.watch.dashboard import actions
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry, require_plain
 from panolog.orchestrator.watch.dashboard.messages import Results, RunChanges, RunPage, RunRow
@@ -279,7 +279,7 @@ def error_line(error: Exception, root: Path) -> str:
 
 def _database_stamp(database: Path) -> tuple[Any, ...] | None:
     """Which file the database is, and values that each commit changes; None if there is none."""
-    return reading.version(database, timeout_s=LOCK_TIMEOUT_S) if database.exists() else None
+    return sql.version(database, timeout_s=LOCK_TIMEOUT_S) if database.exists() else None
 
 
 def _follows(stamp: tuple[Any, ...], before: tuple[Any, ...]) -> bool:

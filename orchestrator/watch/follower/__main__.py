@@ -1,4 +1,4 @@
-"""The process of a follower: gets its plan in the first line of stdin, and ends after the line END there.
+"""The process of a follower: gets its recipients in the first line of stdin, and ends after the line END.
 
 The end of stdin is no sign: a process that is killed closes its pipes before its lock of the run, one by one,
 and gives its children another parent when all are closed. So that it delivers the last news, a follower
@@ -12,7 +12,7 @@ import threading
 from contextlib import suppress
 
 from panolog.orchestrator.watch.follower.follower import Follower
-from panolog.orchestrator.watch.follower.plan import END, from_json
+from panolog.orchestrator.watch.follower.recipients import END, from_json
 
 
 def main() -> None:
@@ -22,7 +22,7 @@ def main() -> None:
     line = sys.stdin.readline()
     if not line.endswith("\n"):  # its parent has ended before
         return
-    root, parent, plan = from_json(line)
+    root, parent, recipients = from_json(line)
     ended = threading.Event()
 
     def wait() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
             ended.set()
 
     threading.Thread(target=wait, daemon=True).start()
-    problems = Follower(root, parent, plan).follow(ended)
+    problems = Follower(root, parent, recipients).follow(ended)
     with suppress(OSError):  # the parent is gone
         for problem in problems:
             print(problem, flush=True)

@@ -12,7 +12,7 @@ from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.watch.follower.board import Board
 from panolog.orchestrator.watch.follower.couriers import Courier
 from panolog.orchestrator.watch.follower.loggers import Logger
-from panolog.orchestrator.watch.follower.plan import LAST_S, FollowerPlan, SinkChoice
+from panolog.orchestrator.watch.follower.recipients import LAST_S, Recipients, SinkChoice
 from panolog.orchestrator.watch.follower.sinks.interface import Sink
 from panolog.orchestrator.watch.follower.watcher import Watcher
 
@@ -23,15 +23,15 @@ _ORPHAN_S = 60.0  # that a driver without its supervisor gets to write its last 
 class Follower:
     """Follows one run. Args: parent, the process whose end is the end of the run's command."""
 
-    def __init__(self, root: Path, parent: int, plan: FollowerPlan) -> None:
+    def __init__(self, root: Path, parent: int, recipients: Recipients) -> None:
         self._folder, self._parent = RunFolder(root), parent
-        self._watcher = Watcher(self._folder, plan.stalled)
+        self._watcher = Watcher(self._folder, recipients.stalled)
         self._board = Board()
         kept = self._folder.follower
-        couriers = [Courier(it, self._board, kept / _name(it.kind, it.label)) for it in plan.targets]
+        couriers = [Courier(it, self._board, kept / _name(it.kind, it.label)) for it in recipients.targets]
         loggers = [
             Logger(it.kind, partial(_made, it, root), self._board, root, kept / _name(it.kind, it.place))
-            for it in plan.sinks
+            for it in recipients.sinks
         ]
         self._threads: list[Courier | Logger] = [*couriers, *loggers]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.runs.folder import RunFolder, flat, read_json
-from panolog.orchestrator.runs.reading import query
+from panolog.orchestrator.runs.sql import query
 from panolog.orchestrator.watch.follower.board import Board, News
 from panolog.orchestrator.watch.follower.ledger import Ledger
 from panolog.orchestrator.watch.follower.sinks.interface import Facts, Point, Sink, Value

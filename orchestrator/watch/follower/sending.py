@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, Request, build_opener
 
 from panolog.orchestrator.watch.follower.notifications import Notification
-from panolog.orchestrator.watch.follower.shapes import mail_of, post_of
+from panolog.orchestrator.watch.follower.payloads import mail_of, post_of
 from panolog.orchestrator.watch.follower.targets import Target
 
 _TIMEOUT_S = 10.0  # to connect, and for each answer

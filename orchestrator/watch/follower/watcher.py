@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from panolog.orchestrator.runs import presence
+from panolog.orchestrator.runs.database import read_milestones, read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.money.records import BudgetNear
-from panolog.orchestrator.runs.reading import version
 from panolog.orchestrator.runs.records import Outcome, RunBegan, RunEnded, Stored
+from panolog.orchestrator.runs.sql import version
 from panolog.orchestrator.runs.state import RunState, Status, apply, replay
-from panolog.orchestrator.runs.store import read_milestones, read_records
 from panolog.orchestrator.watch.follower.board import ALL, News
 from panolog.orchestrator.watch.follower.notifications import (
     Losses,

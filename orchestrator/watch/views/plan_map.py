@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.watch.views.palette import SEAM_GRADES, block_color, seam_grade
+from panolog.orchestrator.watch.views.block_colors import SEAM_GRADES, block_color, seam_grade
 from panolog.partition.cells import Face, Grid
 from panolog.partition.contraction import contract, expand
 from panolog.partition.faces import Plane, planes_between

@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from panolog.orchestrator.runs.reading import has_table, query
-from panolog.orchestrator.runs.store import EVENT, MILESTONE, PICTURES
+from panolog.orchestrator.runs.database import EVENT, MILESTONE, PICTURES
+from panolog.orchestrator.runs.sql import has_table, query
 
 LOCK_TIMEOUT_S = 5.0  # to wait for the driver, which locks the database for milliseconds
 SEARCHED = 50_000  # records that one search for a text reads

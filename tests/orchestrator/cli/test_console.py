@@ -21,9 +21,9 @@ from typer.main import get_command
 from panolog.orchestrator.cli import app, console
 from panolog.orchestrator.cli.console import Lasting
 from panolog.orchestrator.runs import log
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.records import Outcome, Record, RunBegan, RunEnded, TaskFailed, TaskStarted
 from panolog.orchestrator.runs.state import replay
-from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.summary import summarize
 from panolog.orchestrator.watch.views.terminal import page, progress
 from panolog.workers.tasks import COARSE

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.queue.database import opened
 from panolog.orchestrator.runs.queue.entries import Needs, State
-from panolog.orchestrator.runs.queue.store import opened
 from tests.orchestrator.cli.program import call, one_line, shown
 from tests.orchestrator.history import begun
 from tests.scenes import write_scene

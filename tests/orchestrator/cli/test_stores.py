@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.runs.storage.plan import MIRROR_PLAN, local_folder, plan_of
+from panolog.orchestrator.runs.storage.mirror_settings import MIRROR_SETTINGS, local_folder, settings_of
 from panolog.scene.errors import ConfigError
 from panolog.scene.stores.cache import FOLDER
 from tests.orchestrator.cli.program import call
@@ -49,12 +49,12 @@ def test_the_local_folder_of_a_url_is_always_the_same(tmp_path: Path) -> None:
     assert first == local_folder("file:///place/run", environment)
     assert first.parent == tmp_path / "runs"
     assert first != local_folder("file:///other/run", environment)
-    plan = plan_of("file:///place/run/", None, environment, resumes=False)
+    plan = settings_of("file:///place/run/", None, environment, resumes=False)
     assert plan is not None
     assert (plan.root, plan.url) == (first, "file:///place/run")
-    assert MIRROR_PLAN.validate_json(MIRROR_PLAN.dump_json(plan)) == plan
+    assert MIRROR_SETTINGS.validate_json(MIRROR_SETTINGS.dump_json(plan)) == plan
 
 
 def test_wrong_variables_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="write a number above 0"):
-        plan_of("file:///place/run", tmp_path, {"PANOLOG_STORE_SECONDS": "often"}, resumes=False)
+        settings_of("file:///place/run", tmp_path, {"PANOLOG_STORE_SECONDS": "often"}, resumes=False)

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from panolog.orchestrator.runs.database import from_json, to_json
 from panolog.orchestrator.runs.money.records import BudgetReached, BudgetSet
 from panolog.orchestrator.runs.records import (
     BlockPlan,
@@ -25,7 +26,6 @@ from panolog.orchestrator.runs.records import (
     TaskFailed,
 )
 from panolog.orchestrator.runs.state import Status, replay
-from panolog.orchestrator.runs.store import from_json, to_json
 from panolog.orchestrator.watch.views.summary import stage_of, summarize
 from panolog.scene.errors import InputError
 from panolog.workers.tasks import COARSE, EVAL, TaskId

@@ -14,10 +14,10 @@ from panolog.orchestrator.engine.driver.local_pool import local_pool
 from panolog.orchestrator.runs import control
 from panolog.orchestrator.runs.config import load_config
 from panolog.orchestrator.runs.control import Action
+from panolog.orchestrator.runs.database import read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import CheckpointSaved, Stored, TaskStarted, TaskYielded
 from panolog.orchestrator.runs.state import OnChange, RunState, ignore
-from panolog.orchestrator.runs.store import read_records
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, TaskId

@@ -12,10 +12,10 @@ from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.engine.driver.local_pool import local_pool
 from panolog.orchestrator.runs.config import load_config
 from panolog.orchestrator.runs.control import state_of
+from panolog.orchestrator.runs.database import read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Noticed, RunBegan, RunEnded
 from panolog.orchestrator.runs.state import RunState, ignore
-from panolog.orchestrator.runs.store import read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.whole_runs.test_whole_runs import SETS

@@ -11,9 +11,9 @@ from subprocess import PIPE
 import psutil
 import pytest
 
+from panolog.orchestrator.runs.database import read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import TaskStarted
-from panolog.orchestrator.runs.store import read_records
 from panolog.scene.ply import ply_header
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, EVAL, TaskId

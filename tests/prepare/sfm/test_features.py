@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from panolog.prepare.sfm import features
-from panolog.prepare.sfm.faces import BAND, Faces
+from panolog.prepare.sfm.conformal_views import BAND, Faces
 from panolog.prepare.sfm.features import Features, features_of, processes_for
 from panolog.prepare.sfm.workspace import silence_colmap
 from panolog.scene.errors import RunError

@@ -26,7 +26,6 @@ from panolog.scene.tensors import transfer
 from panolog.workers.comparison import with_block
 from panolog.workers.events import Checkpoint, Preview
 from panolog.workers.specs import Value
-from panolog.workers.training import pipeline
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.exterior import BAKED, BakedViews, Exterior, Rooms, exterior_last, inside
 from panolog.workers.training.loss import Loss
@@ -123,7 +122,7 @@ def test_a_block_that_ends_early_leaves_neither_its_thread_nor_its_file(
         events = train(task)
         while not readers():
             next(events)
-        monkeypatch.setattr(pipeline, "take", lambda *_, **__: 1 / 0)
+        monkeypatch.setattr(iterations, "take", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             list(events)
         assert not readers() and files.pop().closed and not files

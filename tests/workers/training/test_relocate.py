@@ -11,7 +11,7 @@ import torch
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians, logit
-from panolog.workers.growth import population
+from panolog.workers.growth_law import population
 from panolog.workers.training.config import DensifyConfig, TrainConfig
 from panolog.workers.training.densify import Statistics
 from panolog.workers.training.optimizer import ModelState

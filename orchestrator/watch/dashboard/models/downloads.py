@@ -9,7 +9,7 @@ from fastapi.responses import Response
 
 from panolog.orchestrator.runs.folder import open_below
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
-from panolog.orchestrator.watch.dashboard.models.making import Maker, Turns, reading
+from panolog.orchestrator.watch.dashboard.models.model_process import Maker, Turns, reading
 from panolog.orchestrator.watch.dashboard.responses import Download, file_name
 from panolog.scene.errors import InputError
 

@@ -27,7 +27,7 @@ from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import open_below, read_below, shown_model
 from panolog.orchestrator.runs.machines.machine import cores
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
-from panolog.orchestrator.watch.dashboard.models.making import Maker, Turns, reading
+from panolog.orchestrator.watch.dashboard.models.model_process import Maker, Turns, reading
 from panolog.orchestrator.watch.dashboard.pictures import panorama
 from panolog.orchestrator.watch.dashboard.responses import Download
 from panolog.orchestrator.watch.views.site.photographs import WIDE

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from panolog.orchestrator.runs.queue.database import DATABASE, opened
 from panolog.orchestrator.runs.queue.entries import Entry, State
 from panolog.orchestrator.runs.queue.shares import describe
-from panolog.orchestrator.runs.queue.store import DATABASE, opened
 from panolog.orchestrator.runs.queue.view import QueueView, remove_entry, view_queue
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.orchestrator.watch.dashboard.messages import QueueList, QueueRow

@@ -7,6 +7,7 @@ from typing import Any
 
 from panolog.orchestrator.runs.folder import flat, part_of
 from panolog.orchestrator.runs.state import Status
+from panolog.orchestrator.watch.views.block_colors import block_color
 from panolog.orchestrator.watch.views.comparison.fairness import warnings
 from panolog.orchestrator.watch.views.comparison.measured import Measured, finite, whole
 from panolog.orchestrator.watch.views.comparison.reading import ReadRun, UnreadRun
@@ -21,7 +22,6 @@ from panolog.orchestrator.watch.views.comparison.schema import (
     StageTime,
     Trained,
 )
-from panolog.orchestrator.watch.views.palette import block_color
 from panolog.orchestrator.watch.views.run_view import RunView, scene_name
 from panolog.orchestrator.watch.views.summary import STAGES, TaskView
 from panolog.scene.files import natural_key

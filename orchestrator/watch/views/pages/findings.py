@@ -6,8 +6,8 @@ from typing import Annotated, TypeVar
 from pydantic import Field
 
 from panolog.orchestrator.runs.folder import RunFolder, is_below
+from panolog.orchestrator.watch.views.block_colors import SEAM_GRADES, seam_grade
 from panolog.orchestrator.watch.views.comparison.measured import MEASURED_ANEW, read_seams
-from panolog.orchestrator.watch.views.palette import SEAM_GRADES, seam_grade
 from panolog.orchestrator.watch.views.preparation import version_of
 from panolog.orchestrator.watch.views.summary import Text, ViewModel
 from panolog.workers.seams.schema import Seam

@@ -24,9 +24,9 @@ from panolog.export.site.page import (
 )
 from panolog.export.site.write import MOST_IN_ONE, SKY, write_page, write_site
 from panolog.export.sky import WIDTH, render_sky, write_sky_image
-from panolog.export.sog.folder import INDEX
 from panolog.export.sog.read import count_of
 from panolog.export.sog.streamed import write_streamed
+from panolog.export.sog.whole_folder import INDEX
 from panolog.export.sog.write import write_sog
 from panolog.export.splats import InMemory, Selection, Splats
 from panolog.orchestrator.runs.folder import RunFolder, read_head, shown_model
@@ -35,7 +35,7 @@ from panolog.orchestrator.watch.views.site.source import Model, open_model
 from panolog.orchestrator.watch.views.site.viewpoints import Viewpoint, Viewpoints, read_viewpoints
 from panolog.scene.errors import InputError
 from panolog.scene.files import Locate, here, write_bytes
-from panolog.scene.stores.outline import local_folder
+from panolog.scene.stores.stored_scenes import local_folder
 from panolog.scene.write import StageProgress, no_progress
 from panolog.workers.tasks import TaskId
 

@@ -18,8 +18,8 @@ from panolog.scene.errors import InputError
 from panolog.scene.files import file_of
 from panolog.scene.pictures.profiles import in_srgb
 from panolog.scene.read import check_names, image_folder, model_folder
-from panolog.scene.stores.outline import whole
 from panolog.scene.stores.store import PATIENCE_S
+from panolog.scene.stores.stored_scenes import whole
 
 WIDE = 2048  # pixels of a copy in 3D
 STORE_S = 10.0  # for which a store may fail before a page shows no picture

@@ -13,6 +13,7 @@ import pytest
 from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.engine.cluster import connection
 from panolog.orchestrator.runs.control import state_of
+from panolog.orchestrator.runs.database import read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.money.limits import Wanted
 from panolog.orchestrator.runs.money.prices import PriceList
@@ -27,7 +28,6 @@ from panolog.orchestrator.runs.records import (
 from panolog.orchestrator.runs.state import RunState, ignore
 from panolog.orchestrator.runs.storage.layout import OBJECTS, current
 from panolog.orchestrator.runs.storage.lease import holder
-from panolog.orchestrator.runs.store import read_records
 from panolog.scene.stores.store import open_store
 from panolog.workers.calibration import CalibrateSpec
 from panolog.workers.specs import TaskSpec

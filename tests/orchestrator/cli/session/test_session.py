@@ -21,6 +21,7 @@ from panolog.orchestrator.cli.session import preparing, session
 from panolog.orchestrator.runs import folder as run_folder
 from panolog.orchestrator.runs import info as run_info
 from panolog.orchestrator.runs.config import RunConfig, load_config
+from panolog.orchestrator.runs.database import read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import RunInfo, own_code, read_info
 from panolog.orchestrator.runs.records import (
@@ -32,7 +33,6 @@ from panolog.orchestrator.runs.records import (
     RunWaiting,
 )
 from panolog.orchestrator.runs.state import ignore
-from panolog.orchestrator.runs.store import read_records
 from panolog.orchestrator.watch.views.plan_map import read_points
 from panolog.scene.errors import ClusterLostError, InputError, RunError, SceneError
 from panolog.scene.read import read_scene
@@ -211,7 +211,7 @@ def test_a_resume_waits_for_a_disk_that_is_full_when_run_db_is_opened(
             raise sqlite3.OperationalError("database or disk is full")
         return sqlite3.Connection(*arguments, **named)
 
-    monkeypatch.setattr("panolog.orchestrator.runs.store.sqlite3.connect", connect)
+    monkeypatch.setattr("panolog.orchestrator.runs.database.sqlite3.connect", connect)
     slept: list[float] = []
     monkeypatch.setattr("panolog.orchestrator.cli.session.session.time.sleep", slept.append)
     resume(killed)

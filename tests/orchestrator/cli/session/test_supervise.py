@@ -13,10 +13,10 @@ import pytest
 from panolog.orchestrator.cli.session import supervise
 from panolog.orchestrator.cli.session.supervise import Supervised, cause
 from panolog.orchestrator.runs import control, lock
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import Outcome, RunBegan
 from panolog.orchestrator.runs.state import RunState, ignore
-from panolog.orchestrator.runs.store import Database
 from tests.orchestrator.cli.program import call, one_line
 from tests.ray_head import wait_until
 
@@ -25,7 +25,7 @@ DRIVER = """
 import os, sys
 from pathlib import Path
 from panolog.orchestrator.runs.records import CheckpointSaved, Outcome, RunBegan, RunEnded
-from panolog.orchestrator.runs.store import Database
+from panolog.orchestrator.runs.database import Database
 from panolog.workers.tasks import COARSE
 
 root, number = Path({root!r}), len(Path({log!r}).read_text().splitlines())

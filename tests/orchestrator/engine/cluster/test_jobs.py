@@ -20,9 +20,9 @@ from panolog.orchestrator.engine.cluster.jobs import RUN_KEY, Cluster, ClusterJo
 from panolog.orchestrator.runs import log
 from panolog.orchestrator.runs.config import as_settings, load_config
 from panolog.orchestrator.runs.control import state_of
+from panolog.orchestrator.runs.database import read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import TaskStarted
-from panolog.orchestrator.runs.store import read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.cli.program import call, one_line

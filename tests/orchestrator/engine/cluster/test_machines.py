@@ -11,6 +11,7 @@ import pytest
 from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.engine.driver.local_pool import local_pool
 from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.database import read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import (
     CheckpointSaved,
@@ -21,7 +22,6 @@ from panolog.orchestrator.runs.records import (
     Transferred,
 )
 from panolog.orchestrator.runs.state import ignore
-from panolog.orchestrator.runs.store import read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from tests.orchestrator.cli.program import shown

@@ -14,6 +14,7 @@ from panolog.orchestrator.engine.driver import driver, saving
 from panolog.orchestrator.engine.driver.purse import require_enough, verdict
 from panolog.orchestrator.engine.estimates.costs import slowness
 from panolog.orchestrator.engine.scheduling.scaling import STARTUP_S
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines.nodes import Node
 from panolog.orchestrator.runs.money.account import lost_with_driver
@@ -26,7 +27,6 @@ from panolog.orchestrator.runs.money.records import (
 )
 from panolog.orchestrator.runs.records import Outcome, PreflightSaved, Record, RunBegan, Stored
 from panolog.orchestrator.runs.state import RunState, Status, replay
-from panolog.orchestrator.runs.store import Database
 from panolog.scene.errors import ConfigError, RunError
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply

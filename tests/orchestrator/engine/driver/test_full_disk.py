@@ -13,13 +13,13 @@ import pytest
 import torch
 
 from panolog.orchestrator.engine.driver import driver as driver_module
-from panolog.orchestrator.engine.driver import results, saving
+from panolog.orchestrator.engine.driver import own_results, saving
 from panolog.orchestrator.engine.stages import evaluation
 from panolog.orchestrator.runs import control, presence
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.presence import why_waiting
 from panolog.orchestrator.runs.records import ModelSaved, Record, RunContinued, RunWaiting
 from panolog.orchestrator.runs.state import RunState
-from panolog.orchestrator.runs.store import Database
 from panolog.scene.errors import RunError
 from panolog.workers.events import Checkpoint, Event, Preview, Trained
 from panolog.workers.tasks import COARSE, TaskId
@@ -74,9 +74,9 @@ def test_a_disk_that_takes_nothing_for_a_while_delays_the_run_and_nothing_else(
 @pytest.mark.parametrize(
     ("module", "name"),
     [
-        (results, "decide_plan"),
-        (results, "write_plan"),
-        (results, "merge_run"),
+        (own_results, "decide_plan"),
+        (own_results, "write_plan"),
+        (own_results, "merge_run"),
         (evaluation, "write_json"),
     ],
 )
@@ -138,7 +138,7 @@ def test_a_run_that_waits_can_be_stopped(quick: Harness, monkeypatch: pytest.Mon
         quick.stop.signal() if how == "signal" else request(quick, '{"action": "stop"}')
         raise FULL
 
-    monkeypatch.setattr(results, "merge_run", full)
+    monkeypatch.setattr(own_results, "merge_run", full)
     with pytest.raises(KeyboardInterrupt):
         quick.drive()
     monkeypatch.undo()

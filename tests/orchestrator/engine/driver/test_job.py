@@ -24,7 +24,7 @@ from panolog.partition.cells import Cell, Grid
 from panolog.partition.faces import Plane
 from panolog.scene.ply import write_ply
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.growth import Period, population
+from panolog.workers.growth_law import Period, population
 from panolog.workers.specs import ModelFile
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from panolog.workers.training.initialise import scene_gaussians

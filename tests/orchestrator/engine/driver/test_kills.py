@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from panolog.orchestrator.runs.clock import Clock
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.records import Record, Stored
 from panolog.orchestrator.runs.state import Status
-from panolog.orchestrator.runs.store import Database
 from tests.orchestrator.fakes import Harness
 
 pytestmark = pytest.mark.system

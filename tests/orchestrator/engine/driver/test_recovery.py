@@ -14,6 +14,7 @@ import torch
 from panolog.orchestrator.engine.driver import driver as driver_module
 from panolog.orchestrator.engine.driver import saving, writers
 from panolog.orchestrator.engine.scheduling.pool import Failed
+from panolog.orchestrator.runs.database import Database, read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines.nodes import Gpu, Node
 from panolog.orchestrator.runs.records import (
@@ -25,7 +26,6 @@ from panolog.orchestrator.runs.records import (
     TaskFailed,
     TaskStarted,
 )
-from panolog.orchestrator.runs.store import Database, read_records
 from panolog.scene.errors import ClusterLostError, InputError, RunError, RunLockedError
 from panolog.workers.events import Calibration, Checkpoint, Event, Trained
 from panolog.workers.specs import TaskSpec

@@ -22,8 +22,9 @@ from panolog.orchestrator.engine.driver import saving, writers
 from panolog.orchestrator.engine.driver.journal import Backlog, Journal
 from panolog.orchestrator.engine.driver.writers import LARGE
 from panolog.orchestrator.engine.estimates.calibration import CHECKPOINT
-from panolog.orchestrator.engine.scheduling.delivery import Large, announced
+from panolog.orchestrator.engine.scheduling.large_messages import Large, announced
 from panolog.orchestrator.engine.scheduling.pool import Message
+from panolog.orchestrator.runs.database import Database, read_records
 from panolog.orchestrator.runs.machines.nodes import Node
 from panolog.orchestrator.runs.presence import Presence
 from panolog.orchestrator.runs.records import (
@@ -36,12 +37,11 @@ from panolog.orchestrator.runs.records import (
     TaskYielded,
 )
 from panolog.orchestrator.runs.state import RunState, Status, TaskState
-from panolog.orchestrator.runs.store import Database, read_records
 from panolog.workers.events import Checkpoint, CheckpointWritten, Event, Notice, Trained
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Progress, Stage, TaskId
 from panolog.workers.training import checkpoint
-from panolog.workers.training.saving import Outbox, Saver
+from panolog.workers.training.checkpointing import Outbox, Saver
 from panolog.workers.training.task_config import CheckpointConfig
 from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.fakes import FakePool, Harness, trained, well
@@ -224,7 +224,7 @@ def test_a_file_that_is_not_whole_is_left_out(
 
 def test_saving_takes_at_most_its_share_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr("panolog.workers.training.saving.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("panolog.workers.training.checkpointing.time.monotonic", lambda: now[0])
     saver, saved = Saver(CheckpointConfig(every=10, share=0.02), None), list[float]()
 
     def state(_: object) -> Checkpoint:

@@ -10,6 +10,7 @@ import pytest
 
 from panolog.orchestrator.engine.scheduling import metadata as module
 from panolog.orchestrator.engine.scheduling.leaving import LeaveNotice
+from panolog.orchestrator.engine.scheduling.machine_end import Watch
 from panolog.orchestrator.engine.scheduling.metadata import (
     VARIABLE,
     Amazon,
@@ -20,7 +21,6 @@ from panolog.orchestrator.engine.scheduling.metadata import (
     Service,
     detect,
 )
-from panolog.orchestrator.engine.scheduling.watch import Watch
 from panolog.orchestrator.runs.records import Leaving
 from tests.metadata_service import NAME, Metadata, metadata
 
@@ -218,7 +218,7 @@ def test_a_service_that_fails_withdraws_nothing(
     later = watch.notice()
     assert later is not None and later.seconds is not None and found.seconds is not None
     assert later.seconds < found.seconds
-    monkeypatch.setattr("panolog.orchestrator.engine.scheduling.watch._SURVIVED_S", -1000.0)
+    monkeypatch.setattr("panolog.orchestrator.engine.scheduling.machine_end._SURVIVED_S", -1000.0)
     assert watch.wait(Leaving.PREEMPTION, 60) is None  # the machine was hibernated, and works again
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from panolog.orchestrator.engine.scheduling.assignment import assign_lpt
+from panolog.orchestrator.engine.scheduling.longest_first import assign_lpt
 from panolog.orchestrator.engine.scheduling.placement import Demand, Running, largest, place
 from panolog.orchestrator.runs.machines.nodes import Gpu, Node, Placement
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from panolog.orchestrator.runs.database import read_milestones
 from panolog.orchestrator.runs.machines import gpus
 from panolog.orchestrator.runs.machines.gpus import GpuUsage, describe_gpus
 from panolog.orchestrator.runs.machines.nodes import Gpu, Node
 from panolog.orchestrator.runs.machines.usage import Usage, measure, with_usage
-from panolog.orchestrator.runs.store import read_milestones
 from panolog.orchestrator.watch.views import queries
 from panolog.orchestrator.watch.views.history import History
 from panolog.orchestrator.watch.views.run_view import view_run

@@ -11,6 +11,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.database import read_milestones
 from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.orchestrator.runs.info import PENDING, make_info, read_info, write_info
 from panolog.orchestrator.runs.preparation import notes
@@ -18,7 +19,6 @@ from panolog.orchestrator.runs.preparation.notes import Counts, StepProgress, St
 from panolog.orchestrator.runs.preparation.settings import Settings, Step, write_settings
 from panolog.orchestrator.runs.records import Outcome, Preparing, RunBegan, RunEnded
 from panolog.orchestrator.runs.state import replay
-from panolog.orchestrator.runs.store import read_milestones
 from panolog.orchestrator.watch.views.preparation import view_preparation
 from panolog.orchestrator.watch.views.timing import progress_of
 from panolog.workers.tasks import PREPARE

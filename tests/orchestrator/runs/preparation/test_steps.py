@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
-from panolog.orchestrator.cli.session import making, session
+from panolog.orchestrator.cli.session import scene_making, session
 from panolog.orchestrator.engine.driver import purse
 from panolog.orchestrator.runs import control
+from panolog.orchestrator.runs.database import read_records
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.info import PENDING, read_info
 from panolog.orchestrator.runs.money.limits import Wanted
@@ -24,7 +25,6 @@ from panolog.orchestrator.runs.preparation import notes
 from panolog.orchestrator.runs.preparation.settings import Options, Step, read_settings
 from panolog.orchestrator.runs.records import Noticed, Preparing
 from panolog.orchestrator.runs.state import ignore
-from panolog.orchestrator.runs.store import read_records
 from panolog.orchestrator.watch.dashboard.api import encoded_map
 from panolog.orchestrator.watch.dashboard.discovery import RunEntry
 from panolog.prepare.sfm.pipeline import workspace_folder
@@ -131,7 +131,7 @@ def test_a_limit_of_cost_counts_the_making_of_the_scene(
     raw: Path, sfm: FakeSfm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     look = purse.require_left  # once something is made: else nothing would be left of the run
-    monkeypatch.setattr(making, "require_left", lambda *known: sfm.done and look(*known))
+    monkeypatch.setattr(scene_making, "require_left", lambda *known: sfm.done and look(*known))
     prices = PriceList(currency="USD", machine=(MachinePrice(name="any", price=1e9, host="*"),))
     folder, work = RunFolder(tmp_path / "run"), (ignore, calibrating(), None)
     with pytest.raises(ConfigError, match=r"the limit of 1e-06 USD is reached before there is a scene"):

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from panolog.orchestrator.runs.queue.database import Queue
 from panolog.orchestrator.runs.queue.entries import Command, Entry, Needs, State
-from panolog.orchestrator.runs.queue.store import Queue
 from tests.ray_head import wait_until
 
 ANY = Needs()  # an even part
@@ -21,7 +21,7 @@ import signal, sys
 from pathlib import Path
 from panolog.orchestrator.runs.queue import processes
 from panolog.orchestrator.runs.queue.runner import Limits, run_queue, sole_runner
-from panolog.orchestrator.runs.queue.store import opened
+from panolog.orchestrator.runs.queue.database import opened
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 folder, boot, at_once, forever, *program = sys.argv[1:]

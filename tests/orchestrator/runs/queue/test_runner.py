@@ -14,9 +14,9 @@ import pytest
 
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.queue import processes
+from panolog.orchestrator.runs.queue.database import Queue
 from panolog.orchestrator.runs.queue.entries import State
 from panolog.orchestrator.runs.queue.runner import log_of
-from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.runs.queue.view import remove_entry, view_queue
 from panolog.scene.errors import QueueError
 from tests.orchestrator.runs.queue.queues import RUNNER, Scripted
@@ -122,7 +122,7 @@ def test_a_runner_that_is_killed_at_the_gate_has_begun_nothing(tmp_path: Path) -
     queue = Scripted(tmp_path)
     queue.add("a")
     code = (
-        "import os, signal; from panolog.orchestrator.runs.queue.store import Queue;"
+        "import os, signal; from panolog.orchestrator.runs.queue.database import Queue;"
         "Queue.launched = lambda *_: os.kill(os.getpid(), signal.SIGKILL);"
     )
     program = (sys.executable, "-S", str(Path(__file__).with_name("stand_in.py")), str(queue.log))

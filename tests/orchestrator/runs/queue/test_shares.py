@@ -10,9 +10,9 @@ import pytest
 
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.machines.machine import memory, memory_total, memory_usage
+from panolog.orchestrator.runs.queue.database import Queue
 from panolog.orchestrator.runs.queue.entries import Command, Entry, Needs, Share, State
 from panolog.orchestrator.runs.queue.shares import Capacity, NeverFitsError, describe, environment
-from panolog.orchestrator.runs.queue.store import Queue
 from panolog.orchestrator.runs.queue.view import view_queue
 from panolog.scene.errors import ConfigError
 from tests.nvidia_smi import print_gpus

@@ -11,6 +11,7 @@ import pytest
 
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.config import RunConfig
+from panolog.orchestrator.runs.database import Database, read_milestones, read_records
 from panolog.orchestrator.runs.folder import RunFolder, model_of, removed_models
 from panolog.orchestrator.runs.info import SceneRef, make_info, write_info
 from panolog.orchestrator.runs.records import (
@@ -24,7 +25,6 @@ from panolog.orchestrator.runs.records import (
     ScoresSaved,
 )
 from panolog.orchestrator.runs.state import replay
-from panolog.orchestrator.runs.store import Database, read_milestones, read_records
 from panolog.scene.errors import RunFolderError
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.cli.program import call

@@ -10,9 +10,9 @@ import torch
 
 from panolog.orchestrator.cli.session import session
 from panolog.orchestrator.runs.config import load_config
+from panolog.orchestrator.runs.database import read_milestones
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.state import ignore, replay
-from panolog.orchestrator.runs.store import read_milestones
 from panolog.workers.calibration import CalibrateSpec
 from panolog.workers.events import Calibration, Checkpoint, Event, Trained
 from panolog.workers.specs import TaskSpec

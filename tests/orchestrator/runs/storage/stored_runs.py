@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+from panolog.orchestrator.runs.database import Database, read_milestones
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import CheckpointSaved, Outcome, Record, RunBegan, RunEnded
 from panolog.orchestrator.runs.state import replay
@@ -13,7 +14,6 @@ from panolog.orchestrator.runs.storage.fetch import bring
 from panolog.orchestrator.runs.storage.layout import current
 from panolog.orchestrator.runs.storage.lease import Lease, take
 from panolog.orchestrator.runs.storage.mirror import Mirror
-from panolog.orchestrator.runs.store import Database, read_milestones
 from panolog.scene.files import write_bytes
 from panolog.scene.stores.store import Store
 from panolog.workers.tasks import COARSE

@@ -16,6 +16,7 @@ from scipy.sparse import csr_array
 from panolog.orchestrator.engine.stages.partitioning import plan_records, write_plan
 from panolog.orchestrator.runs import control, lock
 from panolog.orchestrator.runs.control import Action, ControlRequest
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.records import (
     Leaving,
     NodeLeaving,
@@ -28,7 +29,6 @@ from panolog.orchestrator.runs.records import (
     TaskFailed,
 )
 from panolog.orchestrator.runs.storage.state import MirrorState, write_state
-from panolog.orchestrator.runs.store import Database
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.workers.tasks import COARSE, Stage, TaskId

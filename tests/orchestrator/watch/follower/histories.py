@@ -3,6 +3,7 @@
 from contextlib import closing
 from pathlib import Path
 
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.runs.records import (
     CheckpointSaved,
@@ -15,7 +16,6 @@ from panolog.orchestrator.runs.records import (
     RunEnded,
     TaskStarted,
 )
-from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.views.queries import series
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.fakes import SetClock

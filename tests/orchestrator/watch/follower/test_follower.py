@@ -14,7 +14,7 @@ import pytest
 from panolog.orchestrator.cli.session.companion import companion_follower
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.watch.follower.follower import Follower
-from panolog.orchestrator.watch.follower.plan import FollowerPlan, SinkChoice
+from panolog.orchestrator.watch.follower.recipients import Recipients, SinkChoice
 from panolog.orchestrator.watch.follower.targets import Target
 from panolog.orchestrator.watch.follower.watcher import Watcher
 from tests.orchestrator.watch.follower import histories
@@ -28,11 +28,11 @@ FOLLOWER = "panolog.orchestrator.watch.follower"
 DYING = """
 import os, signal, subprocess, sys
 from pathlib import Path
-from panolog.orchestrator.watch.follower.plan import read_plan, to_json
+from panolog.orchestrator.watch.follower.recipients import read_recipients, to_json
 from panolog.orchestrator.runs import lock
 
 root = Path(sys.argv[1])
-plan, _ = read_plan(["webhook:env:HOOK"], (), {"HOOK": sys.argv[2], "HOME": "/nowhere"})
+plan, _ = read_recipients(["webhook:env:HOOK"], (), {"HOOK": sys.argv[2], "HOME": "/nowhere"})
 with lock.hold(root / "lock"):
     command = [sys.executable, "-m", "panolog.orchestrator.watch.follower"]
     process = subprocess.Popen(command, stdin=subprocess.PIPE)
@@ -42,8 +42,8 @@ with lock.hold(root / "lock"):
 """
 
 
-def plan_of(server: Receiver, *more: Target) -> FollowerPlan:
-    return FollowerPlan((Target("webhook", "hook", f"{server.url}/x", secret="s"), *more))
+def plan_of(server: Receiver, *more: Target) -> Recipients:
+    return Recipients((Target("webhook", "hook", f"{server.url}/x", secret="s"), *more))
 
 
 def follower_of(parent: int) -> psutil.Process:
@@ -155,7 +155,7 @@ def test_a_target_that_hangs_neither_holds_up_the_others_nor_the_run_for_ever(
     folder, ended = histories.write(tmp_path / "run"), threading.Event()
     ended.set()
     with receiver(hangs=True) as hung:
-        plan = FollowerPlan((Target("webhook", "hung", hung.url),))
+        plan = Recipients((Target("webhook", "hung", hung.url),))
         Follower(folder.root, os.getppid(), plan).follow(ended)
         assert not hung.hang.is_set()  # its end was not waited for
         hung.hang.set()
@@ -206,7 +206,7 @@ def test_an_error_that_nothing_foresees_ends_one_thread_alone(
     folder, ended = histories.write(tmp_path / "run"), threading.Event()
     ended.set()
     with receiver() as server:
-        plan = FollowerPlan(plan_of(server).targets, (SinkChoice("tensorboard"),))
+        plan = Recipients(plan_of(server).targets, (SinkChoice("tensorboard"),))
         problems = Follower(folder.root, os.getppid(), plan).follow(ended)
     assert problems == ["log tensorboard: internal error: ValueError"]
     assert server.texts == ["run.done"]

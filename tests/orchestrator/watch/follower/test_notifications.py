@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.machines.history import MACHINE_DIED
 from panolog.orchestrator.runs.money.records import BudgetNear, BudgetReached
 from panolog.orchestrator.runs.presence import Presence
@@ -28,7 +29,6 @@ from panolog.orchestrator.runs.records import (
     TaskStarted,
     TaskYielded,
 )
-from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.follower.board import ALL, Board, News
 from panolog.orchestrator.watch.follower.couriers import Courier
 from panolog.orchestrator.watch.follower.ledger import Ledger

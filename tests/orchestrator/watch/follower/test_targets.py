@@ -7,9 +7,9 @@ import pytest
 import trustme
 
 from panolog.orchestrator.watch.follower.notifications import Kind, Notification
-from panolog.orchestrator.watch.follower.plan import from_json, read_plan, to_json
+from panolog.orchestrator.watch.follower.payloads import signature
+from panolog.orchestrator.watch.follower.recipients import from_json, read_recipients, to_json
 from panolog.orchestrator.watch.follower.sending import Refusal, send
-from panolog.orchestrator.watch.follower.shapes import signature
 from panolog.orchestrator.watch.follower.targets import Target
 from panolog.scene.errors import ConfigError
 from tests.orchestrator.watch.follower.mail_server import ELSEWHERE, Encryption, Mailbox, mailbox
@@ -20,7 +20,7 @@ SLACK = f"https://hooks.slack.com/services/{SECRET}"
 
 
 def targets(*given: str, **environment: str) -> tuple[Target, ...]:
-    plan, _ = read_plan(given, (), {"HOME": "/nowhere", "NETRC": "/nowhere/netrc", **environment})
+    plan, _ = read_recipients(given, (), {"HOME": "/nowhere", "NETRC": "/nowhere/netrc", **environment})
     return plan.targets
 
 
@@ -125,21 +125,21 @@ def test_what_a_plan_cannot_have_is_one_line_without_a_secret(
     netrc = private(tmp_path / "netrc", f"machine mail.example login me passwort {SECRET}\n")
     missing = {"wandb": None}
     monkeypatch.setattr(
-        "panolog.orchestrator.watch.follower.plan.find_spec", lambda name: missing.get(name, "there")
+        "panolog.orchestrator.watch.follower.recipients.find_spec", lambda name: missing.get(name, "there")
     )
     notify, log, variables = WRONG[line]
     with pytest.raises(ConfigError, match=line) as caught:
-        read_plan(notify, log, {"NETRC": str(netrc), **variables})
+        read_recipients(notify, log, {"NETRC": str(netrc), **variables})
     assert SECRET not in str(caught.value)
 
 
 def test_variables_with_secrets_are_named_so_that_no_other_process_gets_them() -> None:
-    _, used = read_plan(["slack:env:HOOK"], (), {"HOOK": SLACK})
+    _, used = read_recipients(["slack:env:HOOK"], (), {"HOOK": SLACK})
     assert {"HOOK", "PANOLOG_NOTIFY"} <= used
 
 
 def test_a_plan_reaches_the_follower_whole(tmp_path: Path) -> None:
-    plan, _ = read_plan(["slack:env:HOOK"], (), {"HOOK": SLACK, "PANOLOG_NOTIFY_STALLED": "0.5"})
+    plan, _ = read_recipients(["slack:env:HOOK"], (), {"HOOK": SLACK, "PANOLOG_NOTIFY_STALLED": "0.5"})
     root, _, there = from_json(to_json(plan, tmp_path))
     assert (root, there) == (tmp_path, plan)
     assert plan.stalled == 30

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.runs.folder import RunFolder
 from panolog.orchestrator.watch.views import plan_map
+from panolog.orchestrator.watch.views.block_colors import BLOCK_COLORS, SEAM_GRADES, block_color
 from panolog.orchestrator.watch.views.exposures import exposure_curve
 from panolog.orchestrator.watch.views.pages.encoding import encode
-from panolog.orchestrator.watch.views.palette import BLOCK_COLORS, SEAM_GRADES, block_color
 from panolog.orchestrator.watch.views.plan_picture import BELOW, LABEL, SIDE, WIDTH, plan_picture
 from panolog.partition.cells import Grid
 from panolog.partition.contraction import contract

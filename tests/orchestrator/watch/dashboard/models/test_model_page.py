@@ -17,8 +17,8 @@ from panolog.export.reading import read_model
 from panolog.orchestrator.engine.stages.partitioning import write_plan
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.folder import RunFolder, write_json
-from panolog.orchestrator.watch.dashboard.models import downloads, making, pages
-from panolog.orchestrator.watch.dashboard.models.making import Maker
+from panolog.orchestrator.watch.dashboard.models import downloads, model_process, pages
+from panolog.orchestrator.watch.dashboard.models.model_process import Maker
 from panolog.orchestrator.watch.dashboard.models.pages import page_policy
 from panolog.orchestrator.watch.views.site.build import Wanted, site_of_run, write_folder
 from panolog.scene.gaussians import Gaussians
@@ -82,7 +82,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 def served(folder: RunFolder) -> Iterator[Served]:
     """A server that requires a token, and a client that has it."""
     with pytest.MonkeyPatch.context() as patch, serving(folder.root.parent, token=TOKEN) as served:
-        patch.setattr(making, "_IDLE_S", 0.2)  # its process ends with each test
+        patch.setattr(model_process, "_IDLE_S", 0.2)  # its process ends with each test
         served.client.headers["Authorization"] = f"Bearer {TOKEN}"
         yield served
 
@@ -165,7 +165,7 @@ def test_a_model_in_training_is_replaced_by_newer_ones_and_the_view_stays(
     """From its first picture on: upright, at a panorama, with cameras, before there is a plan."""
     monkeypatch.setattr(pages, "_REFRESH_S", 1)
     monkeypatch.setattr(pages, "_SHARE", 1e6)  # as soon as there is one
-    monkeypatch.setattr(making, "_IDLE_S", 600)  # one process makes all pages
+    monkeypatch.setattr(model_process, "_IDLE_S", 600)  # one process makes all pages
     folder = write_run(tmp_path / "run")
     folder.make(folder.outline.parent)
     write_json(folder.outline, plan().to_json())

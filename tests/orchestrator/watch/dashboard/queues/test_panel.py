@@ -14,9 +14,9 @@ from playwright.sync_api import Browser, Page, expect
 
 from panolog.orchestrator.runs import lock
 from panolog.orchestrator.runs.queue import processes
+from panolog.orchestrator.runs.queue.database import DATABASE, Queue
 from panolog.orchestrator.runs.queue.entries import Command, Needs, Share, State
 from panolog.orchestrator.runs.queue.runner import lock_of
-from panolog.orchestrator.runs.queue.store import DATABASE, Queue
 from panolog.orchestrator.watch.dashboard.messages import QueueList
 from tests.orchestrator.watch.dashboard.browser import PHONE, SMALL, opened
 from tests.orchestrator.watch.dashboard.served import EVIL, POST, Served, serving, streaming, write_run

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.orchestrator.runs.records import (
     BlockPlan,
@@ -20,7 +21,6 @@ from panolog.orchestrator.runs.records import (
     Record,
     RunEnded,
 )
-from panolog.orchestrator.runs.store import Database
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.orchestrator.history import BEGAN, begun, started
 

@@ -17,10 +17,10 @@ from panolog.orchestrator.cli.session import session  # cli_results has commands
 from panolog.orchestrator.engine.driver.journal import Journal
 from panolog.orchestrator.engine.scheduling.pool import Failed
 from panolog.orchestrator.runs import lock
+from panolog.orchestrator.runs.database import Database
 from panolog.orchestrator.runs.folder import RunFolder, write_json
 from panolog.orchestrator.runs.info import read_info
 from panolog.orchestrator.runs.records import Noticed, Stored, TaskFailed
-from panolog.orchestrator.runs.store import Database
 from panolog.orchestrator.watch.dashboard.messages import (
     EventList,
     HeldOutViews,

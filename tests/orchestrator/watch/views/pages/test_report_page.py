@@ -19,8 +19,8 @@ from panolog.orchestrator.runs.records import (
     TaskFailed,
     ViewEvaluated,
 )
+from panolog.orchestrator.watch.views.block_colors import SEAM_GRADES
 from panolog.orchestrator.watch.views.pages.report import write_report
-from panolog.orchestrator.watch.views.palette import SEAM_GRADES
 from panolog.workers.seams.schema import SeamsFile
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.orchestrator.history import append

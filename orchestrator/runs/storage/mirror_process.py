@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from panolog.orchestrator.runs.machines.children import ENDS, start_companion
-from panolog.orchestrator.runs.storage.plan import MIRROR_PLAN, MirrorPlan
+from panolog.orchestrator.runs.storage.mirror_settings import MIRROR_SETTINGS, MirrorSettings
 from panolog.scene.errors import RunError, StoreError
 
 _AGAIN_S, _LONGEST_S = 10.0, 600.0  # before a mirror that was killed is started again: first, at most
@@ -20,19 +20,19 @@ Say = Callable[[str], None]
 
 
 @contextmanager
-def mirrored(plan: MirrorPlan | None, say: Say) -> Iterator[None]:
+def mirrored(settings: MirrorSettings | None, say: Say) -> Iterator[None]:
     """Mirrors a run while the context lasts, then until the store has all of it. The run never waits for it.
 
     The context begins when the run is this command's, and on this machine if it is to be resumed. A mirror
-    that was killed is started again. Args: plan, None for a run that is in no store; say, called with lines.
+    that was killed is started again. Args: settings, None for a run in no store; say, called with lines.
     Raises StoreError if the run is another driver's, or cannot be brought; after the context RunError if the
     store does not have all of it.
     """
-    if plan is None:
+    if settings is None:
         yield
         return
-    say(f"the run is in {plan.root} on this machine, and is copied to {plan.url} as it proceeds")
-    mirror = _Keeper(plan, say)
+    say(f"the run is in {settings.root} on this machine, and is copied to {settings.url} as it proceeds")
+    mirror = _Keeper(settings, say)
     try:
         yield
     except BaseException:
@@ -44,11 +44,11 @@ def mirrored(plan: MirrorPlan | None, say: Say) -> Iterator[None]:
 
 
 class _Keeper:
-    def __init__(self, plan: MirrorPlan, say: Say) -> None:
-        self._plan, self._say = plan, say
+    def __init__(self, settings: MirrorSettings, say: Say) -> None:
+        self._settings, self._say = settings, say
         self._left = ""
         self._ended = threading.Event()
-        self._start(plan)
+        self._start(settings)
         self._begin()
         self._thread = threading.Thread(target=self._keep, name="mirror", daemon=True)
         # A thread has the mask of the one that starts it: requests to stop go to the main thread, also in a
@@ -70,12 +70,12 @@ class _Keeper:
             self._process.terminate()
             self._thread.join(_STOP_S)
             self._process.kill()
-            return self._left or f"not all of the run is in {self._plan.url}: interrupted"
-        hint = f"`panolog resume {self._plan.url}` on this machine copies the rest"
+            return self._left or f"not all of the run is in {self._settings.url}: interrupted"
+        hint = f"`panolog resume {self._settings.url}` on this machine copies the rest"
         return f"{self._left}; {hint}" if self._left else ""
 
-    def _start(self, plan: MirrorPlan) -> None:
-        line = MIRROR_PLAN.dump_json(plan).decode()
+    def _start(self, settings: MirrorSettings) -> None:
+        line = MIRROR_SETTINGS.dump_json(settings).decode()
         self._process = start_companion("panolog.orchestrator.runs.storage", line)
 
     def _end_input(self) -> None:
@@ -94,7 +94,8 @@ class _Keeper:
             if content.get("ready"):
                 return
             self._say(str(content.get("say", "")))
-        raise RunError(f"{self._plan.url}: the process of its mirror has ended (code {self._process.wait()})")
+        code = self._process.wait()
+        raise RunError(f"{self._settings.url}: the process of its mirror has ended (code {code})")
 
     def _keep(self) -> None:
         """Reads what the mirror says, and starts another one if it was killed; later each time."""
@@ -107,14 +108,14 @@ class _Keeper:
                 return
             code, complaint = f"code {self._process.returncode}", self._process.complaint
             why = f"{code}: {complaint}" if complaint else code
-            self._left = killed = f"{self._plan.url}: its mirror was killed ({why})"
+            self._left = killed = f"{self._settings.url}: its mirror was killed ({why})"
             if time.monotonic() - began > _LONGEST_S:
                 pause, tries = _AGAIN_S, 0
             last = self._ended.wait(pause)
             pause, tries = min(2 * pause, _LONGEST_S), tries + 1
             if last and tries > _TRIES:
                 return
-            self._start(replace(self._plan, again=True, force=False))  # in place of one that was killed
+            self._start(replace(self._settings, again=True, force=False))  # in place of one that was killed
             if last:
                 self._end_input()
             try:

@@ -17,7 +17,7 @@ from panolog.scene.errors import RunError
 from panolog.workers.events import Checkpoint, Event
 from panolog.workers.specs import Value
 from panolog.workers.tasks import Progress
-from panolog.workers.training import pipeline
+from panolog.workers.training import iterations
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.recipes import RECIPES, Recipe
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
@@ -135,9 +135,9 @@ def contents(events: list[Event]) -> list[object]:
 def small_room(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Room for fewer pairs of splats and tiles than there are."""
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "MARGIN", 0.5)
-        patch.setattr(pipeline, "_UNSEEN", 0.5)
-        patch.setattr(pipeline, "_LEAST", 0)
+        patch.setattr(iterations, "MARGIN", 0.5)
+        patch.setattr(iterations, "_UNSEEN", 0.5)
+        patch.setattr(iterations, "_LEAST", 0)
         yield
 
 
@@ -145,13 +145,13 @@ def small_room(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def waited(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Iterations for which the host has waited."""
     found: list[int] = []
-    carefully = pipeline.Pipeline._carefully
+    carefully = iterations.Pipeline._carefully
 
-    def counting(self: pipeline.Pipeline, plan: pipeline.Plan) -> None:
-        found.append(plan.iteration)
-        carefully(self, plan)
+    def counting(self: iterations.Pipeline, planned: iterations.Planned) -> None:
+        found.append(planned.iteration)
+        carefully(self, planned)
 
-    monkeypatch.setattr(pipeline.Pipeline, "_carefully", counting)
+    monkeypatch.setattr(iterations.Pipeline, "_carefully", counting)
     return found
 
 
@@ -279,9 +279,9 @@ def test_no_wait_in_a_usual_iteration(
     groups |= {"exposure": LEARNS["exposure"]} if kind == "learns" else {}
     task = changed(block if exterior == "baked" else spec, projection=projection, **groups)
     with stubbed(without_pairs), warm(task) as (trainer, steps):
-        assert isinstance(trainer.pipeline, pipeline.Pipeline)
+        assert isinstance(trainer.pipeline, iterations.Pipeline)
         with counted((trainer.pipeline._reports,)) as found:
-            assert all(len(trainer.pipeline._launched) < pipeline.AHEAD for _ in steps)
+            assert all(len(trainer.pipeline._launched) < iterations.AHEAD for _ in steps)
         assert found == {}
 
 
@@ -292,7 +292,7 @@ def test_no_wait_in_the_default_recipe(kind: str, spec: TrainSpec, block: TrainS
     assert config.loss.sphere and config.stage2.exterior == "baked"
     task = replace(block if kind == "block" else spec, config=config, iterations=1000)
     with stubbed(without_pairs), warm(task) as (trainer, _):
-        assert isinstance(trainer.pipeline, pipeline.Pipeline)
+        assert isinstance(trainer.pipeline, iterations.Pipeline)
         with counted((trainer.pipeline._reports,)) as found:
             for iteration in range(2, 202):
                 trainer.step(iteration, trainer._view(iteration))
@@ -322,11 +322,11 @@ def test_the_host_sleeps_while_it_waits_for_an_iteration(
 
     monkeypatch.setattr("torch.cuda.Event", event)
     with stubbed(without_pairs), warm(spec) as (trainer, steps):
-        assert isinstance(trainer.pipeline, pipeline.Pipeline)
+        assert isinstance(trainer.pipeline, iterations.Pipeline)
         trainer.pipeline._cuda = True
         count = len(list(steps))
     assert [each.blocking for each in made] == [True] * count
-    assert sum(each.synchronize.call_count for each in made) == count - pipeline.AHEAD + 1
+    assert sum(each.synchronize.call_count for each in made) == count - iterations.AHEAD + 1
 
 
 def test_captures_learnt_on_a_card_are_those_of_the_cpu(spec: TrainSpec) -> None:

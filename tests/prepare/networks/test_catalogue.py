@@ -8,8 +8,8 @@ import pytest
 import yaml
 from onnx import helper
 
-from panolog.prepare.networks import known
-from panolog.prepare.networks.known import Known, known_networks
+from panolog.prepare.networks import catalogue
+from panolog.prepare.networks.catalogue import Known, known_networks
 from panolog.prepare.networks.manifest import MaskManifest, read_manifest
 from panolog.prepare.networks.network import sha256
 from tests.orchestrator.cli.program import call, one_line, shown
@@ -25,7 +25,7 @@ DEPTH = {
 
 @pytest.fixture(autouse=True)
 def small_town(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(known, "_TOWN", 64)
+    monkeypatch.setattr(catalogue, "_TOWN", 64)
 
 
 def reds(folder: Path, threshold: float = 0.9) -> Path:
@@ -79,7 +79,7 @@ def test_a_file_of_the_list_gets_its_manifest_and_keeps_the_users(
     path.unlink()
     listed = known_networks()[0].model_dump()
     entry = Known(**listed | {"name": "reds", "sha256": sha256(model).hex(), "manifest": manifest})
-    monkeypatch.setattr(known, "known_networks", lambda: (*known_networks(), entry))
+    monkeypatch.setattr(catalogue, "known_networks", lambda: (*known_networks(), entry))
     first = call("models", model, "--width", 128)
     assert first.exit_code == 0, first.output
     assert "net.yaml: written, as the SHA-256 is that of reds" in first.stderr

@@ -16,7 +16,6 @@ from typing import Any
 from panolog.orchestrator.runs import thinning
 from panolog.orchestrator.runs.clock import CLOCK, Clock
 from panolog.orchestrator.runs.money.records import OfRun
-from panolog.orchestrator.runs.reading import TIMEOUT_S, has_table, query, require_own_journal, unusable
 from panolog.orchestrator.runs.records import (
     BlockPlan,
     CheckpointSaved,
@@ -32,6 +31,7 @@ from panolog.orchestrator.runs.records import (
     Stored,
     task_name,
 )
+from panolog.orchestrator.runs.sql import TIMEOUT_S, has_table, query, require_own_journal, unusable
 from panolog.scene.errors import RunFolderError, RunLockedError
 from panolog.workers.tasks import TaskId
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from panolog.orchestrator.runs.queue import processes
+from panolog.orchestrator.runs.queue.database import DATABASE, Queue, default_folder, opened
 from panolog.orchestrator.runs.queue.entries import Command, Needs, Share, State
-from panolog.orchestrator.runs.queue.store import DATABASE, Queue, default_folder, opened
 from panolog.orchestrator.runs.queue.view import view_queue
 from panolog.scene.errors import QueueError
 from tests.orchestrator.fakes import SetClock
@@ -159,7 +159,7 @@ def test_a_queue_of_version_1_is_taken_over(tmp_path: Path) -> None:
 
 def test_many_commands_at_once_lose_nothing(tmp_path: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from panolog.orchestrator.runs.queue.store import opened;"
+        "import sys; from pathlib import Path; from panolog.orchestrator.runs.queue.database import opened;"
         "from panolog.orchestrator.runs.queue.entries import Command\n"
         "for number in range(8):\n"
         "    with opened(Path(sys.argv[1])) as queue:\n"

@@ -35,7 +35,7 @@ _LEAST = 1024  # pairs
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Plan:
+class Planned:
     """An iteration before it is launched."""
 
     iteration: int
@@ -68,29 +68,29 @@ class Direct:
     """The iterations of one task on the CPU: each is over when `run` returns."""
 
     def __init__(
-        self, finished: Callable[[float, float], None], broken: Callable[[str, Plan], RunError]
+        self, finished: Callable[[float, float], None], broken: Callable[[str, Planned], RunError]
     ) -> None:
         """Args: as those of `Pipeline`."""
         self._finished = finished
         self._broken = broken
 
-    def run(self, plan: Plan) -> None:
+    def run(self, planned: Planned) -> None:
         """One iteration. Raises RunError if its loss or a gradient is not finite."""
-        problem, counts = plan.problem, plan.statistics is not None
-        moving = plan.state.moving(plan.rates, plan.rows)
+        problem, counts = planned.problem, planned.statistics is not None
+        moving = planned.state.moving(planned.rates, planned.rows)
         try:
-            found = take(problem, moving, plan.iteration, screen=counts)
+            found = take(problem, moving, planned.iteration, screen=counts)
         except FloatingPointError as error:
-            raise self._broken(str(error), plan) from error
-        plan.state.bound(*plan.sizes)
+            raise self._broken(str(error), planned) from error
+        planned.state.bound(*planned.sizes)
         seen, loss, learnt = found
-        if plan.statistics is not None and learnt.screen is not None:
+        if planned.statistics is not None and learnt.screen is not None:
             visible = seen.state == ops.VISIBLE
-            plan.statistics.add(learnt.screen, visible, problem.model["means"], problem.camera)
-        if plan.learning is not None:
-            plan.learning.step(plan.visit(seen.color, seen.inverse_depth, loss.exposure, None))
+            planned.statistics.add(learnt.screen, visible, problem.model["means"], problem.camera)
+        if planned.learning is not None:
+            planned.learning.step(planned.visit(seen.color, seen.inverse_depth, loss.exposure, None))
             if learnt.motion is not None:
-                plan.learning.learn_motion(plan.view, plan.iteration, learnt.motion.numpy())
+                planned.learning.learn_motion(planned.view, planned.iteration, learnt.motion.numpy())
         self._finished(loss.value, loss.squared)
 
     def settle(self) -> None:
@@ -99,7 +99,7 @@ class Direct:
 
 @dataclass(frozen=True, eq=False)
 class _Launched:
-    plan: Plan
+    planned: Planned
     report: Tensor  # (4,) or (31,) float64 on the host, valid when the event is over
     event: torch.cuda.Event | None
 
@@ -112,7 +112,7 @@ class Pipeline:
         launch: Launch,
         device: torch.device,
         finished: Callable[[float, float], None],
-        broken: Callable[[str, Plan], RunError],
+        broken: Callable[[str, Planned], RunError],
     ) -> None:
         """No iteration is launched.
 
@@ -129,17 +129,17 @@ class Pipeline:
         self._launched: deque[_Launched] = deque()
         self._density: dict[int, float] = {}  # pairs for each Gaussian, by view
 
-    def run(self, plan: Plan) -> None:
+    def run(self, planned: Planned) -> None:
         """Launches an iteration; reads those that are over.
 
         Raises RunError if in one of these a loss or gradient is not finite, or there are more than 2³¹ pairs
         of splats and tiles.
         """
-        room = self._room(plan)
+        room = self._room(planned)
         if room is None:
-            self._carefully(plan)
+            self._carefully(planned)
             return
-        self._enqueue(plan, room)
+        self._enqueue(planned, room)
         while self._launched and (len(self._launched) >= AHEAD or self._over(self._launched[0])):
             self._read()
 
@@ -151,42 +151,42 @@ class Pipeline:
         while self._launched:
             self._read()
 
-    def _room(self, plan: Plan) -> int | None:
+    def _room(self, planned: Planned) -> int | None:
         """Pairs to have room for; None before any count is known."""
         if not self._density:
             return None
-        known = self._density.get(plan.view)
+        known = self._density.get(planned.view)
         density = _UNSEEN * max(self._density.values()) if known is None else MARGIN * known
-        count = len(plan.state.gaussians)
+        count = len(planned.state.gaussians)
         return min(_LEAST + math.ceil(density * count), parts.MAX_PAIRS)
 
-    def _enqueue(self, plan: Plan, room: int | None) -> None:
+    def _enqueue(self, planned: Planned, room: int | None) -> None:
         """Launches all of an iteration."""
-        moving = plan.state.moving(plan.rates, plan.rows)
-        found = iteration.take(self._launch, plan.problem, moving, plan.iteration, self._status, room)
-        plan.state.bound(*plan.sizes)
-        if plan.statistics is not None:
-            into = plan.statistics
+        moving = planned.state.moving(planned.rates, planned.rows)
+        found = iteration.take(self._launch, planned.problem, moving, planned.iteration, self._status, room)
+        planned.state.bound(*planned.sizes)
+        if planned.statistics is not None:
+            into = planned.statistics
             iteration.add_statistics(
                 self._launch,
                 found,
                 self._status,
-                plan.problem,
+                planned.problem,
                 into.gradient,
                 into.views,
                 absolute=into.absolute,
                 angle=into.config.measure == "angle",
                 contribution=into.config.views == "contribution",
             )
-        if plan.learning is not None:
-            visit = plan.visit(found.color, found.inverse_depth, found.exposure, self._status.known)
-            plan.learning.step(visit)
-        report = self._reports[plan.iteration % AHEAD, : len(found.report)]
+        if planned.learning is not None:
+            visit = planned.visit(found.color, found.inverse_depth, found.exposure, self._status.known)
+            planned.learning.step(visit)
+        report = self._reports[planned.iteration % AHEAD, : len(found.report)]
         report.copy_(found.report, non_blocking=True)
         event = sleeping_event() if self._cuda else None
         if event is not None:
             event.record()
-        self._launched.append(_Launched(plan, report, event))
+        self._launched.append(_Launched(planned, report, event))
 
     def _over(self, launched: _Launched) -> bool:
         return launched.event is not None and bool(launched.event.query())  # type: ignore[no-untyped-call]
@@ -196,7 +196,7 @@ class Pipeline:
 
         Raises RunError if it took one by a gradient that is not finite: then the state is invalid.
         """
-        plans = [launched.plan for launched in self._launched]
+        plans = [launched.planned for launched in self._launched]
         if (status := self._note()) == 0:
             return
         while self._launched:  # none of them took a step
@@ -205,26 +205,26 @@ class Pipeline:
         if status >= iteration.BROKEN_GRADIENT:
             raise self._broken(iteration.not_finite(status), plans[0])
         self._carefully(plans[0])
-        for plan in plans[1:]:
-            self.run(plan)
+        for planned in plans[1:]:
+            self.run(planned)
 
     def _note(self) -> int:
         """Takes the oldest iteration off the list and returns its status."""
         launched = self._launched.popleft()
         if launched.event is not None:
             launched.event.synchronize()
-        plan, report = launched.plan, launched.report.numpy()
+        planned, report = launched.planned, launched.report.numpy()
         loss, squared, pairs, status = report[: iteration.REPORT].tolist()
-        self._density[plan.view] = pairs / max(len(plan.state.gaussians), 1)
+        self._density[planned.view] = pairs / max(len(planned.state.gaussians), 1)
         if status == 0:
-            if plan.learning is not None and plan.problem.moving:
-                plan.learning.learn_motion(plan.view, plan.iteration, report[iteration.REPORT :])
+            if planned.learning is not None and planned.problem.moving:
+                planned.learning.learn_motion(planned.view, planned.iteration, report[iteration.REPORT :])
             self._finished(loss, squared)
         return int(status)
 
-    def _carefully(self, plan: Plan) -> None:
+    def _carefully(self, planned: Planned) -> None:
         """One iteration for which the host waits. Raises RunError with the name of what is not finite."""
-        self._enqueue(plan, None)
+        self._enqueue(planned, None)
         if status := self._note():
             self._status.clear()
-            raise self._broken(iteration.not_finite(status), plan)
+            raise self._broken(iteration.not_finite(status), planned)

@@ -30,7 +30,7 @@ class SinkChoice:
 
 
 @dataclass(frozen=True)
-class FollowerPlan:
+class Recipients:
     """Whom a follower serves."""
 
     targets: tuple[Target, ...] = ()
@@ -42,10 +42,10 @@ class FollowerPlan:
         return bool(self.targets or self.sinks)
 
 
-def read_plan(
+def read_recipients(
     notify: Sequence[str], log: Sequence[str], environment: Mapping[str, str]
-) -> tuple[FollowerPlan, set[str]]:
-    """The plan of a command line, and the variables that held secrets: no other process should get these.
+) -> tuple[Recipients, set[str]]:
+    """The recipients of a command line, and the variables with secrets: no other process should get these.
 
     Args: notify, log, values of the options. Raises ConfigError for what is wrong with them.
     """
@@ -53,7 +53,7 @@ def read_plan(
     targets = read_targets(notify, references)
     choices = _once([_sink(text, environment) for text in log])
     stalled = 60 * positive(STALLED, environment, _STALLED_MIN, "minutes, such as 30")
-    return FollowerPlan(targets, choices, stalled), references.used
+    return Recipients(targets, choices, stalled), references.used
 
 
 def words_elsewhere(notify: Sequence[str], log: Sequence[str]) -> list[str]:
@@ -75,16 +75,16 @@ def words_elsewhere(notify: Sequence[str], log: Sequence[str]) -> list[str]:
     ]
 
 
-_LINE = TypeAdapter(tuple[Path, int, FollowerPlan])
+_LINE = TypeAdapter(tuple[Path, int, Recipients])
 
 
-def to_json(plan: FollowerPlan, root: Path) -> str:
-    """A plan for the follower of the run at `root`, in one line."""
-    return _LINE.dump_json((root.absolute(), os.getpid(), plan)).decode()
+def to_json(recipients: Recipients, root: Path) -> str:
+    """Recipients for the follower of the run at `root`, in one line."""
+    return _LINE.dump_json((root.absolute(), os.getpid(), recipients)).decode()
 
 
-def from_json(text: str) -> tuple[Path, int, FollowerPlan]:
-    """The run folder, the process that it belongs to, and the plan."""
+def from_json(text: str) -> tuple[Path, int, Recipients]:
+    """The run folder, the process that it belongs to, and the recipients."""
     return _LINE.validate_json(text)
 
 

@@ -9,10 +9,10 @@ import psutil
 import pytest
 
 from panolog.orchestrator.runs.machines.children import Companion
-from panolog.orchestrator.runs.storage import companion
-from panolog.orchestrator.runs.storage.companion import mirrored
+from panolog.orchestrator.runs.storage import mirror_process
 from panolog.orchestrator.runs.storage.lease import take
-from panolog.orchestrator.runs.storage.plan import MirrorPlan
+from panolog.orchestrator.runs.storage.mirror_process import mirrored
+from panolog.orchestrator.runs.storage.mirror_settings import MirrorSettings
 from panolog.scene.errors import RunError
 from panolog.scene.stores.store import open_store
 from tests.orchestrator.runs.storage.stored_runs import Driver, fetched
@@ -21,8 +21,8 @@ from tests.ray_head import living, wait_until
 pytestmark = pytest.mark.system
 
 
-def plan_of(tmp_path: Path) -> MirrorPlan:
-    return MirrorPlan(
+def plan_of(tmp_path: Path) -> MirrorSettings:
+    return MirrorSettings(
         tmp_path / "run", f"file://{tmp_path}/store", resumes=False, period=0.05, patience=300.0
     )
 
@@ -42,7 +42,7 @@ def mirror() -> psutil.Process:
 def test_a_mirror_that_is_killed_is_replaced_and_nothing_is_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(companion, "_AGAIN_S", 0.0)
+    monkeypatch.setattr(mirror_process, "_AGAIN_S", 0.0)
     said = list[str]()
     with mirrored(plan_of(tmp_path), said.append):
         driver = Driver(tmp_path / "run")
@@ -67,7 +67,7 @@ def test_a_mirror_that_is_killed_is_replaced_and_nothing_is_lost(
 def test_a_mirror_that_cannot_be_replaced_is_reported_at_once_and_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(companion, "_AGAIN_S", 0.0)
+    monkeypatch.setattr(mirror_process, "_AGAIN_S", 0.0)
     said, store = list[str](), open_store(f"file://{tmp_path}/store")
     with pytest.raises(RunError, match="is at work on it"), mirrored(plan_of(tmp_path), said.append):
         driver = Driver(tmp_path / "run")
@@ -91,7 +91,7 @@ def test_a_mirror_that_fails_each_time_is_given_up_with_its_reason(
         plans.append(plan)
         return Companion([sys.executable, "-c", program], plan)
 
-    monkeypatch.setattr(companion, "start_companion", start)
+    monkeypatch.setattr(mirror_process, "start_companion", start)
     with pytest.raises(RunError, match=r"was killed \(code 1: EOFError"), mirrored(plan_of(tmp_path), print):
         pass
-    assert len(plans) == 1 + companion._TRIES
+    assert len(plans) == 1 + mirror_process._TRIES

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator.runs import reading, thinning
+from panolog.orchestrator.runs import sql, thinning
+from panolog.orchestrator.runs.database import Database, read_milestones, read_news, read_records
 from panolog.orchestrator.runs.records import (
     CheckpointSaved,
     ModelSaved,
@@ -16,7 +17,6 @@ from panolog.orchestrator.runs.records import (
     Record,
     RunBegan,
 )
-from panolog.orchestrator.runs.store import Database, read_milestones, read_news, read_records
 from panolog.orchestrator.runs.thinning import PREVIEWS, surplus
 from panolog.orchestrator.watch.views import queries
 from panolog.scene.errors import InputError, RunLockedError
@@ -138,7 +138,7 @@ def test_a_database_of_an_older_version_is_read_and_continued(path: Path) -> Non
         connection.executescript("DROP TABLE latest; DROP INDEX drivers; DROP TABLE nodes")
     assert [s.id for s in read_milestones(path)] == [1, 3, 5, 6, 7]
     assert [s.id for s in read_news(path, 4, 10)] == [5, 6, 7]
-    assert reading.version(path)[1:] == (7, None, None)
+    assert sql.version(path)[1:] == (7, None, None)
     assert queries.usages(path) == {}
     with closing(Database(path)) as database:
         assert [s.id for s in database.milestones()] == [1, 3, 5, 6, 7]

@@ -22,7 +22,7 @@ _NUMBER = "a number above 0"
 
 
 @dataclass(frozen=True)
-class MirrorPlan:
+class MirrorSettings:
     """What a mirror is to do."""
 
     root: Path  # the local folder
@@ -34,13 +34,13 @@ class MirrorPlan:
     patience: float = 60 * _PATIENCE_MIN  # seconds without progress after the run, before it gives up
 
 
-MIRROR_PLAN = TypeAdapter(MirrorPlan)  # from and to the line of JSON that the mirror gets
+MIRROR_SETTINGS = TypeAdapter(MirrorSettings)  # from and to the line of JSON that the mirror gets
 
 
-def plan_of(
+def settings_of(
     run: str, local: Path | None, environment: Mapping[str, str], *, resumes: bool, force: bool = False
-) -> MirrorPlan | None:
-    """The plan for a run that the command line names; None if it is a folder that is in no store.
+) -> MirrorSettings | None:
+    """The settings for a run that the command line names; None if it is a folder that is in no store.
 
     Args: run, a URL, or a folder whose mirror has noted its URL; local, the folder that `--local` names.
     Raises StoreError if the URL or its package is not as it must be, ConfigError for options without a URL or
@@ -62,7 +62,7 @@ def plan_of(
     require_package(url)
     period = positive(PERIOD, environment, _PERIOD_S, _NUMBER)
     patience = 60 * positive(PATIENCE, environment, _PATIENCE_MIN, _NUMBER)
-    return MirrorPlan(root, str(url), resumes, force, period=period, patience=patience)
+    return MirrorSettings(root, str(url), resumes, force, period=period, patience=patience)
 
 
 def local_folder(url: str, environment: Mapping[str, str]) -> Path:

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.runs.clock import CLOCK, Clock
+from panolog.orchestrator.runs.database import transaction
 from panolog.orchestrator.runs.queue.entries import Command, Entry, Identity, Needs, Share, State
-from panolog.orchestrator.runs.store import transaction
 from panolog.scene.errors import QueueError
 from panolog.scene.files import user_folder
 

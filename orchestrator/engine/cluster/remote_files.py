@@ -28,12 +28,12 @@ from ray.experimental import get_object_locations
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from panolog.orchestrator.engine.cluster.nodes import on_node
-from panolog.orchestrator.engine.scheduling.delivery import payload
+from panolog.orchestrator.engine.scheduling.large_messages import payload
 from panolog.orchestrator.runs.machines.usage import Usage, measure
 from panolog.scene.errors import RunError
 from panolog.scene.files import atomic, write_bytes
 from panolog.scene.stores.cache import Stored
-from panolog.scene.stores.outline import remember, stored_of
+from panolog.scene.stores.stored_scenes import remember, stored_of
 from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import Progress, Transfer

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 
-from panolog.workers.growth import additions, population
+from panolog.workers.growth_law import additions, population
 from panolog.workers.training.config import DensifyConfig, TrainConfig
 from panolog.workers.training.schedule import Schedule
 

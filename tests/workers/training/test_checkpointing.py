@@ -12,8 +12,8 @@ from torch import Tensor
 from panolog.scene.tensors.transfer import packed_bytes
 from panolog.workers.events import Checkpoint, CheckpointWritten, Event
 from panolog.workers.tasks import COARSE
-from panolog.workers.training import checkpoint, saving
-from panolog.workers.training.saving import Outbox, Saver, Staging
+from panolog.workers.training import checkpoint, checkpointing
+from panolog.workers.training.checkpointing import Outbox, Saver, Staging
 from panolog.workers.training.task_config import CheckpointConfig
 from tests.on_device import needs_a_card
 from tests.renderer.cuda.fake_cuda import Torch
@@ -25,7 +25,7 @@ OTHER = {name: tensor + 1 for name, tensor in ONE.items()}
 @pytest.fixture
 def cuda(monkeypatch: pytest.MonkeyPatch) -> Torch:
     fake = Torch()
-    monkeypatch.setattr(saving, "torch", fake)
+    monkeypatch.setattr(checkpointing, "torch", fake)
     return fake
 
 
@@ -35,7 +35,7 @@ def outbox(tmp_path: Path) -> Outbox:
     return Outbox(tmp_path, "token-1", tmp_path / "driver", "token")
 
 
-def state_of(tensors: Mapping[str, Tensor], iteration: int = 5) -> saving.State:
+def state_of(tensors: Mapping[str, Tensor], iteration: int = 5) -> checkpointing.State:
     """As `Trainer.checkpoint`."""
     return lambda copied: Checkpoint(COARSE, iteration, copied(tensors))
 
@@ -112,7 +112,7 @@ def test_what_a_worker_on_a_gpu_sends_is_not_changed_by_the_next(
 def times(config: CheckpointConfig, device: str, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Seconds at which it saves in five minutes of a hundred iterations a second."""
     now = [1000.0]
-    monkeypatch.setattr("panolog.workers.training.saving.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("panolog.workers.training.checkpointing.time.monotonic", lambda: now[0])
     saver, saved = Saver(config, None, device), list[float]()
     for iteration in range(1, 30_001):
         now[0] += 0.01

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.runs import lock, reading
-from panolog.orchestrator.runs.queue.store import Queue
+from panolog.orchestrator.runs import lock, sql
+from panolog.orchestrator.runs.database import Database, read_records
+from panolog.orchestrator.runs.queue.database import Queue
 from panolog.orchestrator.runs.records import Noticed
-from panolog.orchestrator.runs.store import Database, read_records
 from panolog.scene.errors import InputError
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.fakes import SetClock
@@ -64,21 +64,21 @@ def refused(*_: object) -> None:
 
 
 def test_a_reader_rolls_it_back_in_place(dead: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "copyfile", refused)
+    monkeypatch.setattr(sql, "copyfile", refused)
     assert messages(dead) == MESSAGES
     assert not journal(dead).exists()
-    assert reading.version(dead)[1] == len(MESSAGES)
+    assert sql.version(dead)[1] == len(MESSAGES)
 
 
 def test_a_reader_leaves_it_to_a_driver_that_starts(dead: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "copyfile", refused)
+    monkeypatch.setattr(sql, "copyfile", refused)
 
     class Starting(SetClock):
         def sleep(self, seconds: float) -> None:
             super().sleep(seconds)
             Database(dead).close()
 
-    monkeypatch.setattr(reading, "time", Starting())
+    monkeypatch.setattr(sql, "time", Starting())
     with lock.hold(dead.with_name("lock")):
         assert messages(dead) == MESSAGES
 
@@ -87,7 +87,7 @@ def test_the_folder_of_another_user_stays_as_it_is(dead: Path, monkeypatch: pyte
     before = dead.read_bytes(), journal(dead).read_bytes()
     user = os.geteuid()
     monkeypatch.setattr(os, "geteuid", lambda: user + 1)
-    assert reading.version(dead) == reading.version(dead)  # and no copy is made for it
+    assert sql.version(dead) == sql.version(dead)  # and no copy is made for it
     assert messages(dead) == MESSAGES
     assert (dead.read_bytes(), journal(dead).read_bytes()) == before
 
@@ -103,7 +103,7 @@ def test_a_path_may_lead_over_the_root(tmp_path: Path, monkeypatch: pytest.Monke
         assert queue.entries() == []
 
 
-@pytest.mark.parametrize("read", [read_records, Database, reading.version])
+@pytest.mark.parametrize("read", [read_records, Database, sql.version])
 def test_a_journal_that_names_another_file_does_not_remove_it(
     dead: Path, read: Callable[[Path], object]
 ) -> None:

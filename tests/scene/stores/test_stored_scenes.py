@@ -14,7 +14,7 @@ from panolog.scene.image_files import decode, decode_panorama
 from panolog.scene.images import load_view
 from panolog.scene.read import read_scene
 from panolog.scene.stores.cache import FOLDER, cache_folder
-from panolog.scene.stores.outline import local_folder, remember, stored_of, url_of
+from panolog.scene.stores.stored_scenes import local_folder, remember, stored_of, url_of
 from tests.scenes import write_scene
 
 WIDTH = 512  # of panoramas that are larger than their two ends

@@ -14,14 +14,20 @@ import pytest
 import ray
 import torch
 
-from panolog.orchestrator.engine.cluster import files as node_files
+from panolog.orchestrator.engine.cluster import remote_files as node_files
 from panolog.orchestrator.engine.cluster.connection import connect
-from panolog.orchestrator.engine.cluster.files import FileSharing, NodeFiles, RayValue, Stamp, run_remotely
+from panolog.orchestrator.engine.cluster.remote_files import (
+    FileSharing,
+    NodeFiles,
+    RayValue,
+    Stamp,
+    run_remotely,
+)
 from panolog.orchestrator.runs.machines.usage import Usage
 from panolog.scene.errors import RunError
 from panolog.scene.stores.cache import Stored
-from panolog.scene.stores.outline import stored_of
 from panolog.scene.stores.store import Version
+from panolog.scene.stores.stored_scenes import stored_of
 from panolog.workers.events import Checkpoint, Event, Preview
 from panolog.workers.tasks import COARSE, Progress, Transfer
 from tests.orchestrator.scripted import Scripted

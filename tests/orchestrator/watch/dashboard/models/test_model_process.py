@@ -7,8 +7,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from panolog.orchestrator.watch.dashboard.models import making
-from panolog.orchestrator.watch.dashboard.models.making import Maker
+from panolog.orchestrator.watch.dashboard.models import model_process
+from panolog.orchestrator.watch.dashboard.models.model_process import Maker
 from panolog.scene.errors import InputError
 from tests.orchestrator.watch.dashboard.models import trial
 
@@ -49,9 +49,9 @@ def test_one_process_makes_all_and_another_one_after_it_has_died_or_hung(
         assert await refused(make("fail")) == "ValueError: one line"
         assert await refused(make("die")) == "the thing could not be made"
         assert await make("print") < 60
-        monkeypatch.setattr(making, "_TIMEOUT_S", 1.0)
+        monkeypatch.setattr(model_process, "_TIMEOUT_S", 1.0)
         assert await refused(make("hang")) == "the thing was not made within 1 seconds"
-        monkeypatch.setattr(making, "_TIMEOUT_S", 300.0)
+        monkeypatch.setattr(model_process, "_TIMEOUT_S", 300.0)
         await make("print")
 
     found = with_maker(work, tmp_path / "notes")
@@ -59,7 +59,7 @@ def test_one_process_makes_all_and_another_one_after_it_has_died_or_hung(
 
 
 def test_it_ends_when_nothing_was_wanted_for_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(making, "_IDLE_S", 0.2)
+    monkeypatch.setattr(model_process, "_IDLE_S", 0.2)
 
     async def work(make: Make) -> None:
         await make("print")

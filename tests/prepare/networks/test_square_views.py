@@ -10,7 +10,7 @@ from onnx import helper
 
 from panolog.prepare.networks.masks import share_of_sphere
 from panolog.prepare.networks.movers import MoverNetwork
-from panolog.prepare.networks.tiles import Tiles
+from panolog.prepare.networks.square_views import Tiles
 from tests.prepare.networks.networks import CHANNELS, channel, given, save
 
 

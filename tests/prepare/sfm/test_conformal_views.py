@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from panolog.prepare.sfm.faces import BAND, DOWN, UP, Faces
+from panolog.prepare.sfm.conformal_views import BAND, DOWN, UP, Faces
 from panolog.scene.projection import rays_of_fractions
 
 WIDTH = 512
