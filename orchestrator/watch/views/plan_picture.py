@@ -74,9 +74,11 @@ def _map(figure: Figure, size: tuple[int, int]) -> Image.Image:
         x, y = np.array(part["x"], float), np.array(part["y"], float)
         return np.column_stack([(x - left) * scale, (top - y) * scale])
 
-    for ends in pairwise(places(parts["faces"])):
-        if np.isfinite(ends).all():
-            draw.line(np.ravel(ends).tolist(), _INK, 2 * _FINE)
+    faces = places(parts["faces"])
+    for line in np.split(
+        faces, np.flatnonzero(np.isnan(faces[:, 0]))
+    ):  # each but the first begins with a gap
+        draw.line(line[np.isfinite(line)].tolist(), _INK, 2 * _FINE, joint="curve")
     for ends in pairwise(places(parts["box"])):
         _dashes(draw, *ends)
     for part in figure["data"]:

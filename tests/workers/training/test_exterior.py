@@ -26,6 +26,7 @@ from panolog.scene.tensors import transfer
 from panolog.workers.comparison import with_block
 from panolog.workers.events import Checkpoint, Preview
 from panolog.workers.specs import Value
+from panolog.workers.training import iterations
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.exterior import BAKED, BakedViews, Exterior, Rooms, exterior_last, inside
 from panolog.workers.training.loss import Loss
@@ -116,8 +117,8 @@ def test_a_block_that_ends_early_leaves_neither_its_thread_nor_its_file(
     task = block(scene, initial, cache={"memory": 1e-6})
     gc.disable()
     try:
-        for iterations in (1, 5):
-            list(train(task, stop_at(len(task.views) + iterations)))
+        for steps in (1, 5):
+            list(train(task, stop_at(len(task.views) + steps)))
             assert not readers() and files.pop().closed and not files
         events = train(task)
         while not readers():
