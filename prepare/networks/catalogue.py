@@ -34,7 +34,7 @@ Trial = tuple[Network, float, float]
 
 
 class Known(ManifestPart):
-    """A network of the table known.yaml."""
+    """A network of the table catalogue.yaml."""
 
     name: str  # of its file, without .onnx
     purpose: str
