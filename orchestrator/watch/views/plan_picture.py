@@ -20,6 +20,7 @@ LABEL = 19  # pixels from the middle of a number to the rim of its disc
 _COUNTED = 4  # blocks up to which the numbers of each are above the map
 _TICKS = 12  # numbers of an axis, about
 _INK, _GREY, _WHITE = "#22272e", "#59616d", "#ffffff"
+_Draw = ImageDraw.ImageDraw
 
 
 def write_plan_picture(path: Path, plan: Plan, points: NDArray[np.floating]) -> None:
@@ -44,15 +45,15 @@ def plan_picture(plan: Plan, points: NDArray[np.floating]) -> Image.Image:
     inside = _map(figure, (_FINE * (WIDTH - 2 * SIDE), _FINE * height))
     picture.paste(inside, (_FINE * SIDE, _FINE * above))
     draw = ImageDraw.Draw(picture)
-    _text(draw, (SIDE, 35), title, 32, "lm", _INK)
+    _text(draw, (SIDE, 35), title, "lm", 32, _INK)
     for row, line in enumerate(lines):
-        _text(draw, (SIDE, 78 + 28 * row), line, 19, "lm")
+        _text(draw, (SIDE, 78 + 28 * row), line, "lm")
     for value in _ticks(left, right):
-        _text(draw, (SIDE + (value - left) * scale, above + height + 16), f"{value:g}", 17, "mm")
+        _text(draw, (SIDE + (value - left) * scale, above + height + 16), f"{value:g}", "mm", 17)
     for value in _ticks(bottom, top):
-        _text(draw, (SIDE - 10, above + (top - value) * scale), f"{value:g}", 17, "rm")
+        _text(draw, (SIDE - 10, above + (top - value) * scale), f"{value:g}", "rm", 17)
     names = " across, ".join(axis["title"]["text"] for axis in axes) + " up"
-    _text(draw, (WIDTH / 2, above + height + 46), names, 19, "mm")
+    _text(draw, (WIDTH / 2, above + height + 46), names, "mm")
     _legend(draw, figure["blocks"]["legend"], above + height + 88)
     return picture.reduce(_FINE)
 
@@ -75,9 +76,7 @@ def _map(figure: Figure, size: tuple[int, int]) -> Image.Image:
         return np.column_stack([(x - left) * scale, (top - y) * scale])
 
     faces = places(parts["faces"])
-    for line in np.split(
-        faces, np.flatnonzero(np.isnan(faces[:, 0]))
-    ):  # each but the first begins with a gap
+    for line in np.split(faces, np.flatnonzero(np.isnan(faces[:, 0]))):
         draw.line(line[np.isfinite(line)].tolist(), _INK, 2 * _FINE, joint="curve")
     for ends in pairwise(places(parts["box"])):
         _dashes(draw, *ends)
@@ -88,11 +87,11 @@ def _map(figure: Figure, size: tuple[int, int]) -> Image.Image:
                 draw.circle(place, radius, color, _WHITE, edge)
     for (x, y), block in zip(places(parts["labels"]).tolist(), parts["labels"]["customdata"], strict=True):
         draw.circle((x, y), LABEL * _FINE, _WHITE, blocks["colors"][block], 3 * _FINE)
-        _text(draw, (x / _FINE, y / _FINE), str(block), 19, "mm", _INK)
+        _text(draw, (x / _FINE, y / _FINE), str(block), "mm", ink=_INK)
     return cells
 
 
-def _dashes(draw: ImageDraw.ImageDraw, begin: NDArray[np.float64], end: NDArray[np.float64]) -> None:
+def _dashes(draw: _Draw, begin: NDArray[np.float64], end: NDArray[np.float64]) -> None:
     """A dashed line between two pixels."""
     count = max(round(float(np.linalg.norm(end - begin)) / (20 * _FINE)), 1)
     for dash in np.arange(count):
@@ -104,11 +103,8 @@ def _lines(plan: Plan, blocks: Figure) -> list[str]:
     """Title and parameters, and the numbers of each block where there are few."""
     margin, gap, config = plan.baseline * plan.config.rho_tri, "   ·   ", plan.config
     title = f"{counted(plan.grid.count, 'block')} ({plan.grid}), {counted(len(plan.rows), 'camera')}"
-    text = [
-        f"{plan.assignment.overlap:.2f} blocks per camera",
-        f"baseline {plan.baseline:.3g}, margin {margin:.3g}",
-    ]
-    text += [f"rho_tri {config.rho_tri:g}, tau_grad {config.tau_grad:g}"]
+    text = [f"{plan.assignment.overlap:.2f} blocks per camera", f"baseline {plan.baseline:.3g}"]
+    text += [f"margin {margin:.3g}", f"rho_tri {config.rho_tri:g}, tau_grad {config.tau_grad:g}"]
     if blocks["layers"] > 1:
         text.append(f"layer {blocks['layer'] + 1} of {blocks['layers']}")
     numbers = [
@@ -126,7 +122,7 @@ def _ticks(low: float, high: float) -> list[float]:
     return [n * step for n in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
-def _legend(draw: ImageDraw.ImageDraw, parts: list[tuple[str, str]], y: float) -> None:
+def _legend(draw: _Draw, parts: list[tuple[str, str]], y: float) -> None:
     """Sign and meaning of each part, side by side in the middle."""
     font = ImageFont.load_default(19 * _FINE)
     x = (WIDTH - sum(font.getlength(text) / _FINE + 80 for _, text in parts) + 40) / 2
@@ -141,18 +137,13 @@ def _legend(draw: ImageDraw.ImageDraw, parts: list[tuple[str, str]], y: float) -
             if part == "rings":
                 draw.circle(place.tolist(), 12 * _FINE, _WHITE, _GREY, 2 * _FINE)
             draw.circle(place.tolist(), 7 * _FINE, _GREY)
-        _text(draw, (x + 28, y), text, 19, "lm")
+        _text(draw, (x + 28, y), text, "lm")
         x += font.getlength(text) / _FINE + 80
 
 
 def _text(
-    draw: ImageDraw.ImageDraw,
-    place: tuple[float, float],
-    text: str,
-    size: int,
-    anchor: str,
-    color: str = _GREY,
+    draw: _Draw, at: tuple[float, float], text: str, anchor: str, size: int = 19, ink: str = _GREY
 ) -> None:
     """A text at a place of the picture. Args: size of its letters, pixels; anchor of Pillow."""
-    at = (place[0] * _FINE, place[1] * _FINE)
-    draw.text(at, text, color, ImageFont.load_default(size * _FINE), anchor)
+    place = (at[0] * _FINE, at[1] * _FINE)
+    draw.text(place, text, ink, ImageFont.load_default(size * _FINE), anchor)
