@@ -48,7 +48,7 @@ _AS_NEIGHBOURS = 0.9  # of the median coverage of the pairs that carry the recon
 _MARGIN = 0.85  # of the least coverage on the way between two without an order: with less they look alike
 _SHARED = 0.75  # of the median share of features of the pairs that carry: copies of houses stand apart
 _CLOSE = 0.5  # of the median step: who stands closer shares more than a front, or is a look-alike
-_DRIFTED = 20.0  # degrees that a walk may be off where it returns
+DRIFTED = 20.0  # degrees that a walk may be off where it returns
 _RIVALLED = 0.3  # of the edges of the tree that may have a rival
 _FEW = 0.25  # of the matches of a guess: what has fewer looks alike, whatever the guess does
 _MOST = 0.02  # contradictions for each panorama, but for those of the tree, of which there may be none
@@ -110,7 +110,7 @@ def find_contradictions(
     for pair, fit, median in against:
         guessed = sides[pair.between[0]] != sides[pair.between[1]]
         if skeleton.ordered:
-            counts = pair.coverage >= _AS_NEIGHBOURS * covered and (guessed or median < _DRIFTED)
+            counts = pair.coverage >= _AS_NEIGHBOURS * covered and (guessed or median < DRIFTED)
             usual_share = share
         else:
             path = tree_path(way, pair.between)

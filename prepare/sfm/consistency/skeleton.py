@@ -18,7 +18,8 @@ from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair
 
 Edge = tuple[int, int]  # rows of two panoramas, ascending
 _ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
-_WEAK = 0.5  # of the median coverage of neighbours: they come before others that share more, but are doubted
+_WEAK = 0.3, 0.5  # of coverage and share of neighbours: they come before what covers more, but are doubted
+_FEEBLE = 0.5  # of coverage of neighbours: they connect what nothing else does
 _AMONG_BEST = 0.75  # of the best coverage of either panorama
 _AT_ONCE = 256  # panoramas whose ways to all others are found together
 
@@ -69,15 +70,17 @@ def find_skeleton(
     """
     count = len(evidence.rays)
     pairs = [pair for pair in evidence.pairs if pair.between not in refuted]
+    pairs.sort(key=lambda it: (-it.coverage, -len(it.matches), it.between))
     if places is not None:
-        near = sorted(_near(pairs, places), key=lambda it: (it[1], it[0]))
-        tree = _strongest_tree(pairs, count, [edge for edge, _ in near])
-        return Skeleton(True, frozenset(tree))
+        metres = dict(_near(pairs, places))
+        nearest = sorted(pairs, key=lambda it: metres.get(it.between, np.inf))
+        return Skeleton(True, frozenset(_strongest_tree(nearest, count)))
     own = [pair for pair in pairs if not set(pair.between) & set(given)]
     ordered = is_ordered(own, count - len(given))
     firm = _chain(own, LIKE_OTHERS, LIKE_OTHERS) if ordered else frozenset()
-    weak = _chain(own, _WEAK) - firm if ordered else frozenset()
-    tree = _strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], weak, given)
+    weak = _chain(own, *_WEAK) - firm if ordered else frozenset()
+    feeble = _chain(own, _FEEBLE, 0.0) if ordered else frozenset()
+    tree = _strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], sorted(feeble), given)
     return Skeleton(
         ordered,
         frozenset(tree),
@@ -95,7 +98,7 @@ def is_ordered(pairs: Sequence[Pair], count: int) -> bool:
     return count > 2 and len(fit) >= _ORDERED * (count - 1)
 
 
-def _chain(pairs: Sequence[Pair], covered: float, shared: float = 0.0) -> frozenset[Edge]:
+def _chain(pairs: Sequence[Pair], covered: float, shared: float) -> frozenset[Edge]:
     """Neighbours in order with at least these parts of others' coverage and share: below, the walk jumped."""
     near = [pair for pair in pairs if pair.apart == 1]
     coverage, share = np.median([[pair.coverage, pair.share] for pair in near], axis=0).tolist()
@@ -113,26 +116,25 @@ def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> list[tuple[Edge
 def _strongest_tree(
     pairs: Sequence[Pair],
     count: int,
-    first: Sequence[Edge],
-    weak: frozenset[Edge] = frozenset(),
+    first: Iterable[Edge] = (),
+    last: Iterable[Edge] = (),
     given: Collection[int] = (),
 ) -> set[Edge]:
-    """Kruskal's tree: the edges `first` in their order, then by coverage, then by matches.
+    """Kruskal's tree of the edges `first`, then of the pairs in their order, then of the edges `last`.
 
-    Without edges that share much less than others, except `weak`: where the tree falls apart, it is unknown
-    what is right. Panoramas that are `given` are connected from the start.
+    Without pairs that share much less than those of the tree: where it falls apart, it is unknown what is
+    right. Panoramas that are `given` are connected from the start.
     """
-    rank, connected = {edge: place for place, edge in enumerate(first)}, set(given)
-    order = sorted(
-        (pair for pair in pairs if not connected.issuperset(pair.between)),
-        key=lambda it: (rank.get(it.between, len(rank)), -it.coverage, -len(it.matches), it.between),
-    )
+    coverage = {it.between: it.coverage for it in pairs if not set(given).issuperset(it.between)}
     star = [(min(given), row) for row in given if row > min(given)]
-    edges = [*star, *(pair.between for pair in order)]
-    tree = set(_spanning(edges, np.arange(1.0, len(edges) + 1), count)).difference(star)
-    usual = [pair.coverage for pair in pairs if pair.between in tree]
+
+    def tree(*edges: Edge) -> set[Edge]:
+        once = list(dict.fromkeys((*star, *edges)))
+        return set(_spanning(once, np.arange(1.0, len(once) + 1), count)).difference(star)
+
+    usual = [coverage[edge] for edge in tree(*first, *coverage)]
     least = LIKE_OTHERS * float(np.median(usual)) if usual else 0.0
-    return tree - {pair.between for pair in pairs if pair.coverage < least} | (tree & weak)
+    return tree(*first, *(edge for edge in coverage if coverage[edge] >= least), *last)
 
 
 def hops(edges: Iterable[Edge], count: int, between: Iterable[Edge], most: float) -> dict[Edge, float]:

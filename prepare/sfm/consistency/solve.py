@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.sfm.consistency.agreement import Posed, agrees, deviations, posed
 from panolog.prepare.sfm.consistency.contradictions import (
+    DRIFTED,
     Contradiction,
     Kept,
     consistent_part,
@@ -35,11 +36,14 @@ from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
 
 _CLOSE = 2.0  # degrees between where points are and where they are seen, for a pair that fits
-_DRIFT = 0.05  # degrees more for each panorama on the way between the two
+_DRIFT = 0.05  # degrees more for each panorama on the way between the two along pairs that fit
 _FARTHEST = 6.0  # degrees at most: a window further on is farther off
+_RETURNS = (
+    0.2  # degrees instead for what shares as much as neighbours, up to DRIFTED: thin walks drift so far
+)
 _SETTLED = 0.03  # of the pairs that are mapped: if no more change, another time changes no pose by much
 _PURE = 0.8  # share of the matches of a pair that fit, for those to count that cannot be judged
-_ROUNDS = 4  # of mapping with the pairs that fit
+_ROUNDS = 8  # of mapping with the pairs that fit
 _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
 _GUESSES = 4  # of what connects panoramas with a scene that they are added to
 _LOOSE = 100.0  # relative error of the scale across a link: one side is a point for the other
@@ -63,6 +67,39 @@ class Solution:
     def trusted(self) -> bool:
         """Whether its poses can be used as they are."""
         return is_trusted(self.contradictions, self.skeleton, self.found.poses)
+
+    @cached_property
+    def agreeing(self) -> Kept:
+        """The tree, and the pairs that fit the poses and points, but for drift.
+
+        What contradicts may have drifted as far as a walk does where it returns.
+        """
+        evidence, tree = self.evidence, self.skeleton.tree
+        off = {pair.between: deviations(self.found, evidence, pair) for pair in evidence.pairs}
+        close = {it.between for it in evidence.pairs if agrees(evidence, it, off[it.between], _CLOSE)}
+        way = hops(self.skeleton.edges | close, len(evidence.rays), off, _FARTHEST / _DRIFT)
+        against = {it.between for it in self.contradictions}
+        kept: Kept = {}
+        for pair in evidence.pairs:
+            rate, most = (_RETURNS, DRIFTED) if pair.between in against else (_DRIFT, _FARTHEST)
+            bound = min(_CLOSE + rate * way[pair.between], most)
+            matches = _fitting(evidence, pair, off[pair.between], bound)
+            if pair.between in tree:
+                kept[pair.between] = pair.matches
+            elif matches is not None and len(matches):
+                kept[pair.between] = matches
+        return kept
+
+    @property
+    def closing(self) -> bool:
+        """Whether what contradicts it may close a loop: it agrees but for drift, and was not mapped."""
+        return not self.kept.keys() >= self.agreeing.keys() & {it.between for it in self.contradictions}
+
+    @property
+    def settled(self) -> bool:
+        """Whether mapping what agrees would change no pose by much."""
+        change = self.agreeing.keys() ^ self.kept.keys()
+        return not self.closing and len(change) <= _SETTLED * len(self.kept)
 
     @cached_property
     def refuted(self) -> set[Edge]:
@@ -207,24 +244,59 @@ class Solver:
         """The reconstruction of these panoramas by the pairs that agree; None if there is none."""
         evidence, skeleton = self._evidence.among(rows), self._skeleton.among(rows)
         kept: Kept = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.tree}
-        best: Solution | None = None
+        best, reached = None, False
         for turn in range(_ROUNDS + 1):
-            part = write_pairs(self._work, kept, "pairs.db", self._given)
-            mapper = self._mapper if turn else "incremental"
-            model = map_pairs(part, mapper, self._max_error, self._progress, self._known)
-            if model is None:
+            new = self._mapped(evidence, skeleton, kept, self._mapper if turn else "incremental", self._known)
+            if new is None:
                 break
-            found = posed(model, self._ids)
-            against = find_contradictions(evidence, skeleton, found, _CLOSE, self._geometries.motion)
-            new = Solution(model, against, evidence, skeleton, found, kept, self._work.numbers, self._size)
-            better = best is None or (new.trusted, len(found.poses)) >= (best.trusted, len(best.found.poses))
+            if new.settled and not reached:
+                new, reached = self._reaching(new), True
+            better = best is None or (new.trusted, len(new.found.poses)) >= (
+                best.trusted,
+                len(best.found.poses),
+            )
             if turn <= 1 or better:  # the tree alone is not judged by all that its poses decide
                 best = new
-            again = _agreeing(new, drift=_DRIFT if turn == 0 else 0.0)
-            if (turn and new.refuted) or len(again.keys() ^ kept.keys()) <= _SETTLED * len(kept):
+            if new.settled or (turn and not new.closing and new.refuted):
                 break
-            kept = again
+            kept = new.agreeing
         return best
+
+    def _reaching(self, base: Solution) -> Solution:
+        """A reconstruction with panoramas that what agrees has not reached, by all their pairs.
+
+        Those that contradict are left out. The poses of the others stay.
+        """
+        evidence, posed_ = base.evidence, base.found.poses.keys()
+        rest = {row for pair in evidence.pairs for row in pair.between} - posed_
+        while rest:
+            known = rest | posed_
+            pairs = {it.between: it.matches for it in evidence.pairs if known.issuperset(it.between)}
+            kept = base.agreeing | {edge: matches for edge, matches in pairs.items() if rest & {*edge}}
+            new = self._mapped(evidence, base.skeleton, kept, "incremental", base.model)
+            wrong = {row for it in new.contradictions for row in it.between} & rest if new else rest
+            if new is not None and not wrong:
+                return new
+            rest -= wrong
+        return base
+
+    def _mapped(
+        self,
+        evidence: Evidence,
+        skeleton: Skeleton,
+        kept: Kept,
+        mapper: Mapper,
+        known: pycolmap.Reconstruction | None,
+    ) -> Solution | None:
+        """The reconstruction by these pairs; None if there is none. Args: known, poses that stay."""
+        given = () if known is None else posed(known, self._ids).poses
+        part = write_pairs(self._work, kept, "pairs.db", given)
+        model = map_pairs(part, mapper, self._max_error, self._progress, known)
+        if model is None:
+            return None
+        found = posed(model, self._ids)
+        against = find_contradictions(evidence, skeleton, found, _CLOSE, self._geometries.motion)
+        return Solution(model, against, evidence, skeleton, found, kept, self._work.numbers, self._size)
 
 
 def _looking_alike(pairs: Sequence[Pair], known: Sequence[Pair], given: Collection[int]) -> set[Edge]:
@@ -236,23 +308,6 @@ def _looking_alike(pairs: Sequence[Pair], known: Sequence[Pair], given: Collecti
     best = best_coverage(known)
     least = _AS_NEIGHBOURS * float(np.median(list(best.values()))) if best else 0.0
     return {it.between for it in pairs if it.coverage < least and not set(it.between).isdisjoint(given)}
-
-
-def _agreeing(solution: Solution, drift: float) -> Kept:
-    """The tree, pairs that fit the poses and points, and all of panoramas that have no pose yet."""
-    evidence, tree, poses = solution.evidence, solution.skeleton.tree, solution.found.poses
-    pairs = [pair.between for pair in evidence.pairs] if drift else []
-    way = hops(solution.skeleton.edges, len(evidence.rays), pairs, _FARTHEST / max(drift, _DRIFT))
-    kept: Kept = {}
-    for pair in evidence.pairs:
-        bound = min(_CLOSE + drift * way[pair.between], _FARTHEST) if drift else _CLOSE
-        matches = _fitting(solution.found, evidence, pair, bound)
-        unjudged = matches is None and not set(pair.between) <= poses.keys()
-        if pair.between in tree or unjudged:
-            kept[pair.between] = pair.matches
-        elif matches is not None and len(matches):
-            kept[pair.between] = matches
-    return kept
 
 
 def _shrunk(solution: Solution) -> set[int]:
@@ -279,14 +334,15 @@ def _unconfirmed(solution: Solution) -> set[int]:
     return {row for row in found.poses if held[row] < 2}.difference(*firm)
 
 
-def _fitting(found: Posed, evidence: Evidence, pair: Pair, bound: float) -> NDArray[np.int64] | None:
+def _fitting(
+    evidence: Evidence, pair: Pair, off: NDArray[np.float64], bound: float
+) -> NDArray[np.int64] | None:
     """The matches (M, 2) of a pair that fit, none where most do not; None if it cannot be judged."""
-    off = deviations(found, evidence, pair)
     known = np.isfinite(off)
     fits = agrees(evidence, pair, off, bound)
     if not fits:
         return None if fits is None else pair.matches[:0]
-    fit = known & (off <= max(bound, _CLOSE))
+    fit = known & (off <= bound)
     if fit.sum() >= _PURE * known.sum():
         fit |= ~known
     return pair.matches[fit]

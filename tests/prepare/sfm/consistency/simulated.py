@@ -34,19 +34,20 @@ def square(
     folder: Path,
     *,
     count: int = 32,
-    ground: bool = True,
+    ground: float = 1.0,
     order: NDArray[np.int64] | None = None,
     again: float = 0.0,
     dusk: int | None = None,
     points: float = 1.0,
 ) -> Square:
-    """Args: count, places on the way; ground, whether there are points that do not repeat; order, (K,) which
+    """Args: count, places on the way; ground, how many points do not repeat, in parts of
+    the usual number; order, (K,) which
     of these places panoramas have, in the order of their names; again, metres from a place to where a later
     panorama of it stands; dusk, the first of the panoramas that are taken in another light; points, how many,
     in parts of the usual number.
     """
     random = np.random.default_rng(1)
-    where, copy_of = _points(random, round(_FRONT * points), round(_FLOOR * points) * ground)
+    where, copy_of = _points(random, round(_FRONT * points), round(_FLOOR * points * ground))
     centers, rotations = _way(random, count)
     if order is not None:
         first = np.isin(np.arange(len(order)), np.unique(order, return_index=True)[1])

@@ -32,6 +32,7 @@ class Walk:
     jumps: int = 0  # where the next place is another one, often one that looks alike
     gap: int = 0  # places that are missing on both sides of a jump
     points: float = 1.0  # of as many as usual
+    ground: float = 1.0  # of as many points of the ground as usual: with few, look-alikes share as neighbours
     shuffled: bool = False
     seed: int = 0
 
@@ -51,7 +52,7 @@ class Walk:
 
     def outcome(self, folder: Path) -> str:
         """One of "whole", "parts", "refused" and "WRONG"."""
-        place = square(folder, count=self.count, order=self.order, points=self.points)
+        place = square(folder, count=self.count, order=self.order, points=self.points, ground=self.ground)
         with silence_colmap():
             parts = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
         if not parts:
@@ -64,12 +65,12 @@ class Walk:
 def walks() -> Iterator[Walk]:
     """The walks of the sweep, for each seed."""
     for seed in range(4):
-        for points in (1.0, 0.5):
+        for points, ground in ((1.0, 1.0), (0.5, 1.0), (1.0, 0.5)):
             for count in (16, 24):
                 for jumps in (1, 2, 3):
-                    yield Walk(count, jumps, points=points, seed=seed)
-                yield Walk(count, points=points, shuffled=True, seed=seed)
-                yield Walk(count, 1, gap=2, points=points, seed=seed)
+                    yield Walk(count, jumps, points=points, ground=ground, seed=seed)
+                yield Walk(count, points=points, ground=ground, shuffled=True, seed=seed)
+                yield Walk(count, 1, gap=2, points=points, ground=ground, seed=seed)
         yield Walk(16, 1, gap=2, shuffled=True, seed=seed)
 
 

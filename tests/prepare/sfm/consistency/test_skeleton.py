@@ -44,7 +44,7 @@ def test_without_order_those_that_share_most_of_the_sphere() -> None:
     assert found.tree == {(0, 3), (1, 3), (1, 4), (2, 4)}
 
 
-@pytest.mark.parametrize(("share", "other", "joined"), [(0.3, 0.7, True), (0.5, 0.9, False)])
+@pytest.mark.parametrize(("share", "other", "joined"), [(0.2, 0.7, True), (0.5, 0.9, False)])
 def test_an_interrupted_walk_is_joined_where_most_is_shared(share: float, other: float, joined: bool) -> None:
     """Neighbours that share less come before others, but are guesses."""
     walk = {(row, row + 1): 0.8 for row in range(11)} | {(5, 6): share}
@@ -61,6 +61,28 @@ def test_neighbours_that_share_few_features_are_a_guess(share: float, guessed: s
     found = find_skeleton(Evidence(tuple(np.empty((0, 3)) for _ in range(12)), pairs))
     assert found.tree == {pair.between for pair in pairs}
     assert found.guessed == guessed
+
+
+@pytest.mark.parametrize("other", [True, False])
+def test_neighbours_that_share_very_few_features_connect_what_nothing_else_does(other: bool) -> None:
+    walk = [Pair((row, row + 1), NOTHING, 0.8, share=0.36) for row in range(11)]
+    walk[5] = Pair((5, 6), NOTHING, 0.5, share=0.1)
+    found = find_skeleton(
+        Evidence(
+            tuple(np.empty((0, 3)) for _ in range(12)),
+            (*walk, *[Pair((2, 9), NOTHING, 0.7, share=0.2)] * other),
+        )
+    )
+    assert found.guessed == {(2, 9) if other else (5, 6)}
+    assert len(found.tree) == 11
+
+
+def test_neighbours_stay_where_others_of_the_tree_cover_more() -> None:
+    """What is joined out of order covers more than neighbours do: it does not make these a guess."""
+    walk = {(row, row + 1): 0.6 if row < 9 else 0.7 for row in range(16)} | {(5, 6): 0.46}
+    found = find_skeleton(_evidence(walk | {(3, 17): 1.0, (8, 18): 1.0, (12, 19): 1.0}, 20))
+    assert found.ordered and set(walk) <= found.tree
+    assert found.guessed == {(3, 17), (8, 18), (12, 19)}
 
 
 def test_what_has_many_rivals_is_not_trusted_and_is_cut_at_them() -> None:

@@ -1,12 +1,16 @@
 """A square with four equal sides: in order, in any order, and where the sides cannot be distinguished."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
+from panolog.prepare.sfm.consistency.agreement import Posed
+from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.consistency.solve import Solution, Solver
 from panolog.prepare.sfm.links import Link
 from panolog.prepare.sfm.mapping import map_pairs
@@ -35,7 +39,7 @@ def _error(place: Square, found: Solution) -> float:
 
 
 def test_neighbours_in_order_outweigh_sides_that_look_the_same(tmp_path: Path) -> None:
-    place = square(tmp_path, count=COUNT, ground=False)
+    place = square(tmp_path, count=COUNT, ground=0.0)
     found = _solve(place)
     assert found.skeleton.ordered
     assert _error(place, found) < 0.002 * length(place.centers)
@@ -58,7 +62,7 @@ def test_a_guess_where_the_walk_jumps_is_refuted_and_another_pair_joins_the_part
 
     monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.map_pairs", counted)
     order = np.array([0, 1, 2, 3, 4, 5, 13, 12, 11, 10, 9, 8, 7, 6, 14, 15])
-    place = square(tmp_path, count=COUNT, order=order)
+    place = square(tmp_path, count=COUNT, order=order, ground=0.5)
     found = _solve(place)
     assert found.skeleton.ordered and found.trusted
     assert _error(place, found) < 0.1
@@ -77,7 +81,7 @@ def test_a_jump_to_a_look_alike_with_what_lies_between_missing_is_not_trusted(
         solver = Solver(place.work, SIZE, "incremental", 2.0, no_progress)
         assert ordered or solver.parts(3) == []
         parts = solver.parts(3, doubtful=True)
-    assert solver.cuts
+    assert ordered or solver.cuts
     assert not ordered or [{*part.found.poses} for part in parts] == [{*range(6)}, {*range(6, 10)}]
     assert parts and all(part.trusted for part in parts)
     for part in parts:
@@ -89,8 +93,29 @@ def test_where_it_is_cut_a_guess_that_nothing_contradicts_stays(tmp_path: Path) 
     place = square(tmp_path, count=24, order=np.array([*range(8), *range(19, 9, -1), 22, 23]))
     with silence_colmap():
         parts = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
-    rows = [part.found.poses.keys() for part in parts]
-    assert rows[0] == {*range(8, 18)} and rows[1] > {0, 1, 2, 18, 19}
+    assert [{*part.found.poses} for part in parts] == [{*range(8), 18, 19}, {*range(8, 18)}]
+
+
+@pytest.mark.parametrize(("degrees", "closed"), [(0.3, True), (0.6, False)])
+def test_a_loop_is_closed_as_far_as_a_walk_may_have_drifted(
+    tmp_path: Path, degrees: float, closed: bool
+) -> None:
+    """Of each panorama from the one before: where the walk returns, all of it."""
+    found, returning = _solve(square(tmp_path, count=COUNT)), {(0, COUNT - 1)}
+    assert returning <= found.agreeing.keys()
+    poses, points = dict(found.found.poses), dict(found.found.points)
+    for row, (rotation, shift) in found.found.poses.items():
+        turn = Rotation.from_euler("z", degrees * row, degrees=True).as_matrix()
+        center = -rotation.T @ shift
+        poses[row] = (rotation @ turn.T, -rotation @ turn.T @ center)
+        points[row] = (found.found.points[row] - center) @ turn.T + center
+    tree = {
+        pair.between: pair.matches for pair in found.evidence.pairs if pair.between in found.skeleton.tree
+    }
+    against = [Contradiction(edge, 200, 0) for edge in sorted(returning)]
+    drifted = replace(found, found=Posed(poses, points), kept=tree, contradictions=against)
+    assert (returning <= drifted.agreeing.keys()) == closed
+    assert not returning & replace(drifted, contradictions=[]).agreeing.keys()
 
 
 @pytest.mark.parametrize("dusk", [None, 10], ids=["one light", "two"])
@@ -141,7 +166,7 @@ def test_what_has_shrunk_to_a_point_is_another_part(tmp_path: Path, monkeypatch:
 
 
 def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
-    place = square(tmp_path, count=COUNT, ground=False, order=np.random.default_rng(4).permutation(COUNT))
+    place = square(tmp_path, count=COUNT, ground=0.0, order=np.random.default_rng(4).permutation(COUNT))
     with silence_colmap():
         solver = Solver(place.work, SIZE, "incremental", 2.0, no_progress)
         assert solver.parts(3) == [] and solver.cuts
