@@ -77,13 +77,14 @@ class Solution:
         evidence, tree = self.evidence, self.skeleton.tree
         off = {pair.between: deviations(self.found, evidence, pair) for pair in evidence.pairs}
         close = {it.between for it in evidence.pairs if agrees(evidence, it, off[it.between], _CLOSE)}
-        way = hops(self.skeleton.edges | close, len(evidence.rays), off, _FARTHEST / _DRIFT)
-        against = {it.between for it in self.contradictions}
+        against, count = {it.between for it in self.contradictions}, len(evidence.rays)
+        way = hops(self.skeleton.edges | close, count, off, _FARTHEST / _DRIFT)
+        walk = hops(self.skeleton.edges, count, against, DRIFTED / _RETURNS)
+        most = {edge: min(_CLOSE + _DRIFT * steps, _FARTHEST) for edge, steps in way.items()}
+        most |= {edge: min(_CLOSE + _RETURNS * steps, DRIFTED) for edge, steps in walk.items()}
         kept: Kept = {}
         for pair in evidence.pairs:
-            rate, most = (_RETURNS, DRIFTED) if pair.between in against else (_DRIFT, _FARTHEST)
-            bound = min(_CLOSE + rate * way[pair.between], most)
-            matches = _fitting(evidence, pair, off[pair.between], bound)
+            matches = _fitting(evidence, pair, off[pair.between], most[pair.between])
             if pair.between in tree:
                 kept[pair.between] = pair.matches
             elif matches is not None and len(matches):

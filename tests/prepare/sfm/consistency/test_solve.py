@@ -150,6 +150,29 @@ def test_a_pose_that_a_single_pair_holds_needs_the_order(tmp_path: Path, ordered
     assert found.found.poses.keys() == {*range(COUNT)} - solver.unconfirmed
 
 
+@pytest.mark.parametrize(
+    ("shared", "added"), [({0, 22}, True), ({5, 11}, False)], ids=["neighbours", "look-alikes"]
+)
+def test_a_panorama_that_what_agrees_does_not_reach_is_added_last(
+    tmp_path: Path, shared: set[int], added: bool
+) -> None:
+    """The tree has none of the few features that it shares. It is added by all of them, if these agree."""
+    place = square(tmp_path, count=24)
+    ids, last = place.work.ids(), 23
+    with pycolmap.Database.open(place.work.database) as database:
+        for row in range(last):
+            geometry = database.read_two_view_geometry(ids[row], ids[last])
+            database.delete_two_view_geometry(ids[row], ids[last])
+            if row in shared:
+                geometry.inlier_matches = geometry.inlier_matches[:60]  # of a front
+                database.write_two_view_geometry(ids[row], ids[last], geometry)
+    with silence_colmap():
+        (found,) = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    assert last not in {row for edge in found.skeleton.tree for row in edge}
+    assert (last in found.found.poses) == added
+    assert found.trusted and off(found, place.centers) < 0.1
+
+
 def test_what_has_shrunk_to_a_point_is_another_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Links that no points hold are known to be weak, but need not be wrong."""
     weak = [Link((2, 3), (0, 1, 2), 0, np.inf), Link((1, 2), (0, 1), 3, 9.0)]
