@@ -1,8 +1,9 @@
 """From verified pairs to a reconstruction that look-alikes cannot mislead.
 
 The skeleton alone is mapped first. It has no loops, so no look-alike can bend it. All other pairs are then
-judged by it: their points must be where they are seen, but for its drift. With those that are, and with all
-of panoramas that it has not reached, the mapper starts again, until its result contradicts none of them.
+judged by it: their points must be where they are seen, but for its drift. With those that are, the mapper
+starts again, and closes wider loops each time, until no more pairs agree. Panoramas that this does not reach
+are added last.
 """
 
 from collections import Counter
