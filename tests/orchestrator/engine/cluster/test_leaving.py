@@ -62,7 +62,8 @@ class Spot:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
-    head = {"num_cpus": 0, "include_dashboard": False}
+    nice = {"worker_niceness": 0}  # by Ray's default of 15, workers starve under load
+    head = {"num_cpus": 0, "include_dashboard": False, "_system_config": nice}
     found = Cluster(initialize_head=True, head_node_args=head)
     try:
         ray.init(address=found.address, log_to_driver=False)
