@@ -125,7 +125,7 @@ def living(word: str, parent: int | None = None) -> list[psutil.Process]:
     return found
 
 
-def wait_until(holds: Callable[[], object], what: str, seconds: float = 120) -> None:
+def wait_until(holds: Callable[[], object], what: str, seconds: float = 300) -> None:
     """Looks until it holds; fails the test when that takes too long."""
     end = time.monotonic() + seconds
     while not holds():

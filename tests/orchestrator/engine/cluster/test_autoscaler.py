@@ -95,7 +95,7 @@ def come_and_go(address: str, folder: Path) -> list[str]:
         return able(pool.nodes(), cuda=False)  # the head has no cores
 
     def until(count: int) -> None:
-        end = time.monotonic() + 240
+        end = time.monotonic() + 500
         while len(there()) != count and time.monotonic() < end:
             pool.ready(0.5)
         known = sum(node.id in pool.growth().members for node in there())
