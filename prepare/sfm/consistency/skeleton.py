@@ -72,7 +72,7 @@ def find_skeleton(
     pairs = [pair for pair in evidence.pairs if pair.between not in refuted]
     pairs.sort(key=lambda it: (-it.coverage, -len(it.matches), it.between))
     if places is not None:
-        metres = dict(_near(pairs, places))
+        metres = _near(pairs, places)
         nearest = sorted(pairs, key=lambda it: metres.get(it.between, np.inf))
         return Skeleton(True, frozenset(_strongest_tree(nearest, count)))
     own = [pair for pair in pairs if not set(pair.between) & set(given)]
@@ -107,10 +107,10 @@ def _chain(pairs: Sequence[Pair], covered: float, shared: float) -> frozenset[Ed
     )
 
 
-def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> list[tuple[Edge, float]]:
-    """Pairs of panoramas whose places are known, and the metres between these."""
-    apart = [(it.between, float(np.linalg.norm(np.subtract(*places[list(it.between)])))) for it in pairs]
-    return [(edge, metres) for edge, metres in apart if np.isfinite(metres)]
+def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> dict[Edge, float]:
+    """The metres between the panoramas of each pair whose places are known."""
+    apart = {it.between: float(np.linalg.norm(np.subtract(*places[list(it.between)]))) for it in pairs}
+    return {edge: metres for edge, metres in apart.items() if np.isfinite(metres)}
 
 
 def _strongest_tree(

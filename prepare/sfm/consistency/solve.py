@@ -39,9 +39,7 @@ from panolog.scene.write import StageProgress
 _CLOSE = 2.0  # degrees between where points are and where they are seen, for a pair that fits
 _DRIFT = 0.05  # degrees more for each panorama on the way between the two along pairs that fit
 _FARTHEST = 6.0  # degrees at most: a window further on is farther off
-_RETURNS = (
-    0.2  # degrees instead for what shares as much as neighbours, up to DRIFTED: thin walks drift so far
-)
+_RETURNS = 0.2  # degrees instead, up to DRIFTED, for what shares as much as neighbours: thin walks drift so
 _SETTLED = 0.03  # of the pairs that are mapped: if no more change, another time changes no pose by much
 _PURE = 0.8  # share of the matches of a pair that fit, for those to count that cannot be judged
 _ROUNDS = 8  # of mapping with the pairs that fit
@@ -69,6 +67,11 @@ class Solution:
         """Whether its poses can be used as they are."""
         return is_trusted(self.contradictions, self.skeleton, self.found.poses)
 
+    @property
+    def rank(self) -> tuple[bool, int]:
+        """Of two reconstructions by the same skeleton, the better one has the higher."""
+        return self.trusted, len(self.found.poses)
+
     @cached_property
     def agreeing(self) -> Kept:
         """The tree, and the pairs that fit the poses and points, but for drift.
@@ -85,11 +88,10 @@ class Solution:
         most |= {edge: min(_CLOSE + _RETURNS * steps, DRIFTED) for edge, steps in walk.items()}
         kept: Kept = {}
         for pair in evidence.pairs:
-            matches = _fitting(evidence, pair, off[pair.between], most[pair.between])
-            if pair.between in tree:
-                kept[pair.between] = pair.matches
-            elif matches is not None and len(matches):
-                kept[pair.between] = matches
+            edge = pair.between
+            matches = pair.matches if edge in tree else _fitting(evidence, pair, off[edge], most[edge])
+            if len(matches):
+                kept[edge] = matches
         return kept
 
     @property
@@ -248,16 +250,13 @@ class Solver:
         kept: Kept = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.tree}
         best, reached = None, False
         for turn in range(_ROUNDS + 1):
-            new = self._mapped(evidence, skeleton, kept, self._mapper if turn else "incremental", self._known)
+            new = self._mapped(evidence, skeleton, kept, self._mapper if turn else "incremental")
             if new is None:
                 break
             if new.settled and not reached:
                 new, reached = self._reaching(new), True
-            better = best is None or (new.trusted, len(new.found.poses)) >= (
-                best.trusted,
-                len(best.found.poses),
-            )
-            if turn <= 1 or better:  # the tree alone is not judged by all that its poses decide
+            # The tree alone is not judged by all that its poses decide.
+            if best is None or turn == 1 or new.rank >= best.rank:
                 best = new
             if new.settled or (turn and not new.closing and new.refuted):
                 break
@@ -269,29 +268,27 @@ class Solver:
 
         Those that contradict are left out. The poses of the others stay.
         """
-        evidence, posed_ = base.evidence, base.found.poses.keys()
-        rest = {row for pair in evidence.pairs for row in pair.between} - posed_
+        pairs, found = base.evidence.pairs, base.found.poses.keys()
+        rest = {row for pair in pairs for row in pair.between} - found
         while rest:
-            known = rest | posed_
-            pairs = {it.between: it.matches for it in evidence.pairs if known.issuperset(it.between)}
-            kept = base.agreeing | {edge: matches for edge, matches in pairs.items() if rest & {*edge}}
-            new = self._mapped(evidence, base.skeleton, kept, "incremental", base.model)
-            wrong = {row for it in new.contradictions for row in it.between} & rest if new else rest
-            if new is not None and not wrong:
+            theirs = {
+                it.between: it.matches
+                for it in pairs
+                if rest & {*it.between} and {*it.between} <= rest | found
+            }
+            new = self._mapped(base.evidence, base.skeleton, base.agreeing | theirs, "incremental", base)
+            if new is None:
+                break
+            if not (wrong := {row for it in new.contradictions for row in it.between} & rest):
                 return new
             rest -= wrong
         return base
 
     def _mapped(
-        self,
-        evidence: Evidence,
-        skeleton: Skeleton,
-        kept: Kept,
-        mapper: Mapper,
-        known: pycolmap.Reconstruction | None,
+        self, evidence: Evidence, skeleton: Skeleton, kept: Kept, mapper: Mapper, base: Solution | None = None
     ) -> Solution | None:
-        """The reconstruction by these pairs; None if there is none. Args: known, poses that stay."""
-        given = () if known is None else posed(known, self._ids).poses
+        """The reconstruction by these pairs; None if there is none. Args: base, whose poses stay."""
+        known, given = (base.model, base.found.poses) if base else (self._known, self._given)
         part = write_pairs(self._work, kept, "pairs.db", given)
         model = map_pairs(part, mapper, self._max_error, self._progress, known)
         if model is None:
@@ -336,14 +333,11 @@ def _unconfirmed(solution: Solution) -> set[int]:
     return {row for row in found.poses if held[row] < 2}.difference(*firm)
 
 
-def _fitting(
-    evidence: Evidence, pair: Pair, off: NDArray[np.float64], bound: float
-) -> NDArray[np.int64] | None:
-    """The matches (M, 2) of a pair that fit, none where most do not; None if it cannot be judged."""
+def _fitting(evidence: Evidence, pair: Pair, off: NDArray[np.float64], bound: float) -> NDArray[np.int64]:
+    """The matches (M, 2) of a pair that fit, none where most do not, or where it cannot be judged."""
     known = np.isfinite(off)
-    fits = agrees(evidence, pair, off, bound)
-    if not fits:
-        return None if fits is None else pair.matches[:0]
+    if not agrees(evidence, pair, off, bound):
+        return pair.matches[:0]
     fit = known & (off <= bound)
     if fit.sum() >= _PURE * known.sum():
         fit |= ~known

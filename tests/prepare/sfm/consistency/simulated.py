@@ -40,11 +40,10 @@ def square(
     dusk: int | None = None,
     points: float = 1.0,
 ) -> Square:
-    """Args: count, places on the way; ground, how many points do not repeat, in parts of
-    the usual number; order, (K,) which
-    of these places panoramas have, in the order of their names; again, metres from a place to where a later
-    panorama of it stands; dusk, the first of the panoramas that are taken in another light; points, how many,
-    in parts of the usual number.
+    """Args: count, places on the way; points and ground, how many in all, and of the ground, which does not
+    repeat, in parts of the usual number; order, (K,) which of these places panoramas have, in the order of
+    their names; again, metres from a place to where a later panorama of it stands; dusk, the first of the
+    panoramas that are taken in another light.
     """
     random = np.random.default_rng(1)
     where, copy_of = _points(random, round(_FRONT * points), round(_FLOOR * points * ground))

@@ -100,7 +100,7 @@ def test_where_it_is_cut_a_guess_that_nothing_contradicts_stays(tmp_path: Path) 
 def test_a_loop_is_closed_as_far_as_a_walk_may_have_drifted(
     tmp_path: Path, degrees: float, closed: bool
 ) -> None:
-    """Of each panorama from the one before: where the walk returns, all of it."""
+    """Each panorama is turned against the one before, and the last one is off by the sum of all turns."""
     found, returning = _solve(square(tmp_path, count=COUNT)), {(0, COUNT - 1)}
     assert returning <= found.agreeing.keys()
     poses, points = dict(found.found.poses), dict(found.found.points)
