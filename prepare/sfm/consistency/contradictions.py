@@ -214,7 +214,8 @@ def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton,
 
     Each is the one that most lead across that none explains yet, of several that which fewest of the pairs
     that agree do. A large walk has many guesses, and few are wrong: where those of a whole way are refuted,
-    what takes their place is wrong. A guess with more matches than what contradicts it is no look-alike.
+    what takes their place is wrong. A guess with more matches than what contradicts it is no look-alike,
+    unless its own do.
 
     Args: kept, the pairs that agree.
     """
@@ -229,7 +230,8 @@ def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton,
         refuted |= {edge for edge, count in against.items() if (-count, agreeing[edge]) == first}
     for it, way in zip(contradictions, ways, strict=True):
         doubt.update(dict.fromkeys(way, it.matches))
-    return {edge for edge in refuted if doubt[edge] > len(kept.get(edge, ()))}
+    own = {it.between for it in contradictions}
+    return {edge for edge in refuted if edge in own or doubt[edge] > len(kept.get(edge, ()))}
 
 
 def _guesses(pairs: Sequence[Edge], skeleton: Skeleton) -> list[frozenset[Edge]]:

@@ -176,6 +176,7 @@ def test_of_many_guesses_those_are_refuted_that_most_contradictions_lead_across(
     across = [Contradiction(ends, 90, 0) for ends in ((0, 5), (3, 6), (4, 9))]
     assert refuted_guesses(across, skeleton, kept) == {(4, 5)}
     assert refuted_guesses(across[:1], skeleton, kept) == set()  # the guess has more matches
+    assert refuted_guesses([Contradiction((4, 5), 3, 3)], skeleton, kept) == {(4, 5)}  # it contradicts itself
     strong = Contradiction((0, 9), 101, 0)
     assert refuted_guesses([strong], skeleton, kept) == {(4, 5)}  # fewest pairs agree across it
     assert refuted_guesses([strong], skeleton, {}) == skeleton.guessed  # any of them
