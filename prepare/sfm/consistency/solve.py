@@ -188,12 +188,16 @@ class Solver:
         for _ in range(_GUESSES):
             if found is None or not found.refuted:
                 break
-            self._refuted |= found.refuted
-            before = self._skeleton
-            self._skeleton = find_skeleton(self._evidence, self._places, self._given, self._refuted)
-            self._evidence = self._thicker(self._evidence, self._skeleton.tree - before.tree)
+            self._refute(found.refuted)
             found = self.solve(rows)
         return found
+
+    def _refute(self, guesses: Collection[Edge]) -> None:
+        """Puts the next pairs in the place of guesses."""
+        self._refuted |= set(guesses)
+        before = self._skeleton
+        self._skeleton = find_skeleton(self._evidence, self._places, self._given, self._refuted)
+        self._evidence = self._thicker(self._evidence, self._skeleton.tree - before.tree)
 
     def _part(self, rows: Collection[int], cut: bool) -> Solution | None:
         """The reconstruction of the most of these panoramas that agree.
@@ -246,22 +250,36 @@ class Solver:
 
     def solve(self, rows: Collection[int]) -> Solution | None:
         """The reconstruction of these panoramas by the pairs that agree; None if there is none."""
-        evidence, skeleton = self._evidence.among(rows), self._skeleton.among(rows)
-        kept: Kept = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.tree}
-        best, reached = None, False
-        for turn in range(_ROUNDS + 1):
-            new = self._mapped(evidence, skeleton, kept, self._mapper if turn else "incremental")
-            if new is None:
-                break
-            if new.settled and not reached:
+        new, best, turn, reached = self._of_tree(rows), None, 0, False
+        while new is not None:
+            refuted = turn > 0 and not new.closing and bool(new.refuted)
+            if new.settled and not refuted and not reached:
                 new, reached = self._reaching(new), True
             # The tree alone is not judged by all that its poses decide.
             if best is None or turn == 1 or new.rank >= best.rank:
                 best = new
-            if new.settled or (turn and not new.closing and new.refuted):
+            if new.settled or refuted or turn == _ROUNDS:
                 break
-            kept = new.agreeing
+            new = self._mapped(new.evidence, new.skeleton, new.agreeing, self._mapper)
+            turn += 1
         return best
+
+    def _of_tree(self, rows: Collection[int]) -> Solution | None:
+        """The reconstruction of these panoramas by the tree alone.
+
+        A guess beyond which it finds no poses makes room for the next one, as long as that leads further.
+        """
+        found = None
+        while True:
+            evidence, skeleton = self._evidence.among(rows), self._skeleton.among(rows)
+            tree = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.tree}
+            new = self._mapped(evidence, skeleton, tree, "incremental")
+            if new is None or (found is not None and len(new.found.poses) <= len(found.found.poses)):
+                return found
+            found = new
+            if not (vain := {it for it in skeleton.guessed if len(found.found.poses.keys() & it) == 1}):
+                return found
+            self._refute(vain)
 
     def _reaching(self, base: Solution) -> Solution:
         """A reconstruction with panoramas that what agrees has not reached, by all their pairs.

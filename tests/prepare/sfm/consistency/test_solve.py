@@ -69,6 +69,30 @@ def test_a_guess_where_the_walk_jumps_is_refuted_and_another_pair_joins_the_part
     assert len(mapped) == 4  # twice with the wrong guess, and twice with the right one
 
 
+def test_a_guess_beyond_which_no_poses_are_found_is_replaced_before_others_are_mapped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it leads to, nothing contradicts, as it has no poses."""
+    jump, posed = (5, 6), list[int]()
+
+    def without_jump(work: Workspace, *others: Any) -> pycolmap.Reconstruction | None:
+        one, other = (work.ids()[row] for row in jump)
+        with pycolmap.Database.open(work.database) as database:
+            if database.exists_two_view_geometry(one, other):
+                database.delete_two_view_geometry(one, other)
+        model = map_pairs(work, *others)
+        posed.append(model.num_reg_images() if model else 0)
+        return model
+
+    monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.map_pairs", without_jump)
+    order = np.array([0, 1, 2, 3, 4, 5, 13, 12, 11, 10, 9, 8, 7, 6, 14, 15])
+    place = square(tmp_path, count=COUNT, order=order, ground=0.5)
+    found = _solve(place)
+    assert found.trusted and _error(place, found) < 0.1
+    assert jump not in found.skeleton.tree
+    assert posed[0] < COUNT == posed[1]
+
+
 @pytest.mark.parametrize("ordered", [True, False])
 def test_a_jump_to_a_look_alike_with_what_lies_between_missing_is_not_trusted(
     tmp_path: Path, ordered: bool
