@@ -5,15 +5,16 @@ import json
 import shutil
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.sketch import Sketcher
@@ -108,6 +109,37 @@ class Workspace:
             else:
                 (self.images / number).symlink_to(panorama.path.resolve())
         write_bytes(note, json.dumps(digest).encode())
+
+    def with_pairs(
+        self, kept: Mapping[tuple[int, int], NDArray[np.int64]], name: str, given: Collection[int] = ()
+    ) -> "Workspace":
+        """A workspace whose database has these verified pairs alone.
+
+        Args: kept, matches (M, 2) of the pairs, by the rows of their panoramas; name, of the new database in
+            the folder; given, rows of panoramas whose features it has as well: it always has those of the
+            pairs.
+        """
+        part = replace(self, name=name)
+        part.database.unlink(missing_ok=True)
+        ids = self.ids()
+        used = {ids[row] for rows in (*kept, given) for row in rows}
+        with pycolmap.Database.open(self.database) as all_, pycolmap.Database.open(part.database) as some:
+            for camera in all_.read_all_cameras():
+                some.write_camera(camera, True)
+            for rig in all_.read_all_rigs():
+                some.write_rig(rig, True)
+            for frame in all_.read_all_frames():
+                some.write_frame(frame, True)
+            for image in all_.read_all_images():
+                some.write_image(image, True)
+                if image.image_id in used:
+                    some.write_keypoints(image.image_id, all_.read_keypoints(image.image_id))
+            for (one, other), matches in sorted(kept.items()):
+                a, b = ids[one], ids[other]
+                geometry = all_.read_two_view_geometry(a, b)
+                geometry.inlier_matches = matches.astype(np.uint32)
+                some.write_two_view_geometry(a, b, geometry)
+        return part
 
 
 def file_state(path: Path) -> tuple[int, int]:

@@ -29,7 +29,14 @@ from panolog.prepare.sfm.consistency.contradictions import (
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, best_coverage, read_evidence
 from panolog.prepare.sfm.consistency.guided import Guide
 from panolog.prepare.sfm.consistency.motion import Geometries, look_again
-from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, components, find_skeleton, hops
+from panolog.prepare.sfm.consistency.skeleton import (
+    Edge,
+    Skeleton,
+    components,
+    find_skeleton,
+    hops,
+    tree_paths,
+)
 from panolog.prepare.sfm.links import Link, links_of
 from panolog.prepare.sfm.mapping import Mapper, map_pairs
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
@@ -111,6 +118,18 @@ class Solution:
         return refuted_guesses(self.contradictions, self.skeleton, self.kept)
 
     @cached_property
+    def vain(self) -> set[Edge]:
+        """The guesses that lead to no poses, or to poses that contradict themselves."""
+        edges, poses = {it.between for it in self.contradictions}, self.found.poses.keys()
+        return {it for it in self.skeleton.guessed if it in edges or len(poses & it) == 1}
+
+    def without(self, guesses: Collection[Edge]) -> Kept:
+        """The pairs that agree, and are not on different sides of any of these guesses."""
+        ways = tree_paths(self.skeleton.edges, list(self.agreeing))
+        kept = zip(self.agreeing.items(), ways, strict=True)
+        return {edge: matches for (edge, matches), way in kept if not set(way) & set(guesses)}
+
+    @cached_property
     def sparse(self) -> SparseModel:
         """The poses and points in our convention."""
         return from_colmap(self.model, self.numbers, self.size)
@@ -182,14 +201,15 @@ class Solver:
         found = self._part(range(len(self._ids)), cut=True)
         return found if found is not None and found.found.poses.keys() > self._given else None
 
-    def _guessed(self, rows: Collection[int]) -> Solution | None:
+    def _guessed(self, rows: Collection[int], begun: Kept | None = None) -> Solution | None:
         """The reconstruction of these panoramas: a guess that it refutes makes room for the next one."""
-        found = self.solve(rows)
+        found = self.solve(rows, begun)
         for _ in range(_GUESSES):
             if found is None or not found.refuted:
                 break
+            begun = found.without(found.refuted)
             self._refute(found.refuted)
-            found = self.solve(rows)
+            found = self.solve(rows, begun)
         return found
 
     def _refute(self, guesses: Collection[Edge]) -> None:
@@ -223,7 +243,8 @@ class Solver:
             self.cuts += [it for it in found.contradictions if not set(it.between) <= set(rows)]
         if found is not None and (loose := _unconfirmed(found)):
             self.unconfirmed |= loose
-            found = self._guessed(found.found.poses.keys() - loose)
+            rows = found.found.poses.keys() - loose
+            found = self._guessed(rows, {it: found.agreeing[it] for it in found.agreeing if rows >= {*it}})
         return found if found is not None and found.trusted else None
 
     def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
@@ -248,13 +269,16 @@ class Solver:
         of = components(skeleton.edges - (set() if skeleton.given else self._doubted), len(self._ids))
         return [{row for row in rows if of[row] == side} for side in sorted({int(of[row]) for row in rows})]
 
-    def solve(self, rows: Collection[int]) -> Solution | None:
-        """The reconstruction of these panoramas by the pairs that agree; None if there is none."""
-        new, best, turn, reached = self._of_tree(rows), None, 0, False
+    def solve(self, rows: Collection[int], begun: Kept | None = None) -> Solution | None:
+        """The reconstruction of these panoramas by the pairs that agree; None if there is none.
+
+        Args: begun, pairs that are known to agree.
+        """
+        new, best, turn, reached = self._begun(rows, begun or {}), None, 0, False
         while new is not None:
             refuted = turn > 0 and not new.closing and bool(new.refuted)
             if new.settled and not refuted and not reached:
-                new, reached = self._reaching(new), True
+                new, reached = max(new, self._reaching(new), key=lambda it: it.rank), True
             # The tree alone is not judged by all that its poses decide.
             if best is None or turn == 1 or new.rank >= best.rank:
                 best = new
@@ -264,22 +288,23 @@ class Solver:
             turn += 1
         return best
 
-    def _of_tree(self, rows: Collection[int]) -> Solution | None:
-        """The reconstruction of these panoramas by the tree alone.
+    def _begun(self, rows: Collection[int], begun: Kept) -> Solution | None:
+        """The reconstruction of these panoramas by the tree, and by what is known to agree.
 
-        A guess beyond which it finds no poses makes room for the next one, as long as that leads further.
+        Vain guesses make room for the next ones, as long as these lead further.
         """
-        found = None
+        best, most = None, (0, 0)
         while True:
             evidence, skeleton = self._evidence.among(rows), self._skeleton.among(rows)
             tree = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.tree}
-            new = self._mapped(evidence, skeleton, tree, "incremental")
-            if new is None or (found is not None and len(new.found.poses) <= len(found.found.poses)):
-                return found
-            found = new
-            if not (vain := {it for it in skeleton.guessed if len(found.found.poses.keys() & it) == 1}):
-                return found
-            self._refute(vain)
+            new = self._mapped(evidence, skeleton, begun | tree, "incremental")
+            if new is None or (worth := (len(new.found.poses), -len(new.vain))) <= most:
+                return best
+            best, most = new, worth
+            if not new.vain:
+                return best
+            begun = new.without(new.vain) if begun else {}
+            self._refute(new.vain)
 
     def _reaching(self, base: Solution) -> Solution:
         """A reconstruction with panoramas that what agrees has not reached, by all their pairs.
@@ -307,7 +332,7 @@ class Solver:
     ) -> Solution | None:
         """The reconstruction by these pairs; None if there is none. Args: base, whose poses stay."""
         known, given = (base.model, base.found.poses) if base else (self._known, self._given)
-        part = write_pairs(self._work, kept, "pairs.db", given)
+        part = self._work.with_pairs(kept, "pairs.db", given)
         model = map_pairs(part, mapper, self._max_error, self._progress, known)
         if model is None:
             return None
@@ -360,32 +385,3 @@ def _fitting(evidence: Evidence, pair: Pair, off: NDArray[np.float64], bound: fl
     if fit.sum() >= _PURE * known.sum():
         fit |= ~known
     return pair.matches[fit]
-
-
-def write_pairs(work: Workspace, kept: Kept, name: str, given: Collection[int] = ()) -> Workspace:
-    """A workspace whose database has these verified pairs alone.
-
-    Args: name, of the new database in the folder of `work`; given, rows of panoramas whose features it has
-        as well; it always has those of the pairs.
-    """
-    part = replace(work, name=name)
-    part.database.unlink(missing_ok=True)
-    ids = work.ids()
-    used = {ids[row] for rows in (*kept, given) for row in rows}
-    with pycolmap.Database.open(work.database) as all_, pycolmap.Database.open(part.database) as some:
-        for camera in all_.read_all_cameras():
-            some.write_camera(camera, True)
-        for rig in all_.read_all_rigs():
-            some.write_rig(rig, True)
-        for frame in all_.read_all_frames():
-            some.write_frame(frame, True)
-        for image in all_.read_all_images():
-            some.write_image(image, True)
-            if image.image_id in used:
-                some.write_keypoints(image.image_id, all_.read_keypoints(image.image_id))
-        for (one, other), matches in sorted(kept.items()):
-            a, b = ids[one], ids[other]
-            geometry = all_.read_two_view_geometry(a, b)
-            geometry.inlier_matches = matches.astype(np.uint32)
-            some.write_two_view_geometry(a, b, geometry)
-    return part

@@ -13,7 +13,7 @@ from panolog.prepare.sfm.consistency.agreement import Posed, motion_between
 from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.consistency.evidence import read_evidence
 from panolog.prepare.sfm.consistency.guided import Guide
-from panolog.prepare.sfm.consistency.solve import Solver, write_pairs
+from panolog.prepare.sfm.consistency.solve import Solver
 from panolog.prepare.sfm.features import MEMORY
 from panolog.prepare.sfm.joining.known import KnownScene, read_known, with_new
 from panolog.prepare.sfm.links import links_of
@@ -150,7 +150,7 @@ def _points(work: Workspace, known: KnownScene, size: tuple[int, int]) -> pycolm
     motions = {edge: motion_between(poses, edge) for edge in edges}
     kept = {edge: guide.along(edge, motion) for edge, motion in motions.items() if motion is not None}
     try:
-        return points_of(write_pairs(work, kept, "known.db"), known.images, size)
+        return points_of(work.with_pairs(kept, "known.db"), known.images, size)
     except (RuntimeError, ValueError) as error:
         raise SceneError(
             f"{known.scene.root}: its panoramas near the new ones show no points ({in_one_line(error, 120)})"
