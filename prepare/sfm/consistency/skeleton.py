@@ -18,7 +18,7 @@ from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair
 
 Edge = tuple[int, int]  # rows of two panoramas, ascending
 _ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
-_WEAK = 0.3, 0.33  # of coverage and share of neighbours: they come before what covers more, but are doubted
+_WEAK = 0.3, 0.5  # of coverage and share of neighbours: they come before what covers more, but are doubted
 _FEEBLE = 0.5  # of coverage of neighbours: they connect what nothing else does
 _AMONG_BEST = 0.75  # of the best coverage of either panorama
 _AT_ONCE = 256  # panoramas whose ways to all others are found together

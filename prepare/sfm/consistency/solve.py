@@ -291,20 +291,22 @@ class Solver:
     def _begun(self, rows: Collection[int], begun: Kept) -> Solution | None:
         """The reconstruction of these panoramas by the tree, and by what is known to agree.
 
-        Vain guesses make room for the next ones, as long as these lead further.
+        Vain guesses make room for the next ones. Of these attempts that with most poses is taken.
         """
         best, most = None, (0, 0)
-        while True:
+        for _ in range(_GUESSES):
             evidence, skeleton = self._evidence.among(rows), self._skeleton.among(rows)
             tree = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.tree}
             new = self._mapped(evidence, skeleton, begun | tree, "incremental")
-            if new is None or (worth := (len(new.found.poses), -len(new.vain))) <= most:
-                return best
-            best, most = new, worth
+            if new is None:
+                break
+            if (worth := (len(new.found.poses), -len(new.vain))) > most:
+                best, most = new, worth
             if not new.vain:
-                return best
+                break
             begun = new.without(new.vain) if begun else {}
             self._refute(new.vain)
+        return best
 
     def _reaching(self, base: Solution) -> Solution:
         """A reconstruction with panoramas that what agrees has not reached, by all their pairs.
