@@ -51,6 +51,7 @@ _SETTLED = 0.03  # of the pairs that are mapped: if no more change, another time
 _PURE = 0.8  # share of the matches of a pair that fit, for those to count that cannot be judged
 _ROUNDS = 8  # of mapping with the pairs that fit
 _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
+_MANY = 4  # panoramas beyond a guess: fewer may have no pose for want of points, and are added last
 _GUESSES = 4  # of what connects panoramas with a scene that they are added to
 _LOOSE = 100.0  # relative error of the scale across a link: one side is a point for the other
 _RIM = 0.1  # share of the panoramas that may be left out without an order: all others agree
@@ -119,9 +120,16 @@ class Solution:
 
     @cached_property
     def vain(self) -> set[Edge]:
-        """The guesses that lead to no poses, or to poses that contradict themselves."""
-        edges, poses = {it.between for it in self.contradictions}, self.found.poses.keys()
-        return {it for it in self.skeleton.guessed if it in edges or len(poses & it) == 1}
+        """The guesses that contradict themselves, or that lead to many panoramas and no pose."""
+        poses, edges = self.found.poses.keys(), self.skeleton.edges
+        of = components([it for it in edges if not poses & it], len(self.evidence.rays))
+        many = {side for side, rows in Counter(of.tolist()).items() if rows >= _MANY}
+        against = {it.between for it in self.contradictions}
+        return {
+            it
+            for it in self.skeleton.guessed
+            if it in against or (len(poses & it) == 1 and any(of[row] in many for row in {*it} - poses))
+        }
 
     def without(self, guesses: Collection[Edge]) -> Kept:
         """The pairs that agree, and are not on different sides of any of these guesses."""
@@ -278,7 +286,7 @@ class Solver:
         while new is not None:
             refuted = turn > 0 and not new.closing and bool(new.refuted)
             if new.settled and not refuted and not reached:
-                new, reached = max(new, self._reaching(new), key=lambda it: it.rank), True
+                new, reached = self._reaching(new), True
             # The tree alone is not judged by all that its poses decide.
             if best is None or turn == 1 or new.rank >= best.rank:
                 best = new

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from panolog.prepare.sfm.consistency.agreement import Posed
 from panolog.prepare.sfm.consistency.contradictions import Contradiction
+from panolog.prepare.sfm.consistency.skeleton import Skeleton
 from panolog.prepare.sfm.consistency.solve import Solution, Solver
 from panolog.prepare.sfm.links import Link
 from panolog.prepare.sfm.mapping import map_pairs
@@ -91,6 +92,11 @@ def test_a_guess_beyond_which_no_poses_are_found_is_replaced_before_others_are_m
     assert found.trusted and _error(place, found) < 0.1
     assert jump not in found.skeleton.tree
     assert posed[0] < COUNT == posed[1]
+    walk = frozenset((row, row + 1) for row in range(COUNT - 1))
+    skeleton = Skeleton(True, walk, guessed=frozenset({(9, 10), (13, 14)}))
+    for last, vain in ((9, {(9, 10)}), (13, set())):  # the few after the other are added last
+        poses = {row: found.found.poses[row] for row in range(last + 1)}
+        assert replace(found, found=Posed(poses, {}), skeleton=skeleton, contradictions=[]).vain == vain
 
 
 @pytest.mark.parametrize("ordered", [True, False])
