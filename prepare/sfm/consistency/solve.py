@@ -52,7 +52,7 @@ _PURE = 0.8  # share of the matches of a pair that fit, for those to count that 
 _ROUNDS = 8  # of mapping with the pairs that fit
 _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
 _MANY = 4  # panoramas beyond a guess: fewer may have no pose for want of points, and are added last
-_GUESSES = 4  # of what connects panoramas with a scene that they are added to
+_GUESSES = 4  # times that the next pairs take the place of guesses, before loops are closed and after
 _LOOSE = 100.0  # relative error of the scale across a link: one side is a point for the other
 _RIM = 0.1  # share of the panoramas that may be left out without an order: all others agree
 
