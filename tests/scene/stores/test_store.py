@@ -28,6 +28,7 @@ def credentials(server: ObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyP
     """They lead to the server. What fails is tried again by our code alone, not by the provider's before."""
     server.faults.clear()
     server.down = False
+    S3FileSystem.clear_instance_cache()  # those of the last test may lead to another server
     monkeypatch.setattr(S3FileSystem, "retries", 1)
     for name, value in (server.environment | {"AWS_MAX_ATTEMPTS": "1"}).items():
         monkeypatch.setenv(name, value)
@@ -67,7 +68,6 @@ def test_a_server_that_cannot_be_reached_is_named(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{port}")
         for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
             monkeypatch.setenv(name, "x")
-        S3FileSystem.clear_instance_cache()  # those of before lead to the server
         with pytest.raises(
             StoreLostError, match=rf"127\.0\.0\.1:{port} cannot be reached; check the address of"
         ):
