@@ -51,6 +51,7 @@ _CLOSE = 0.5  # of the median step: who stands closer shares more than a front, 
 DRIFTED = 20.0  # degrees that a walk may be off where it returns
 _RIVALLED = 0.3  # of the edges of the tree that may have a rival
 _FEW = 0.25  # of the matches of a guess: what has fewer looks alike, whatever the guess does
+_EQUAL = 3  # guesses that are refuted together, as nothing says which is wrong
 _MOST = 0.02  # contradictions for each panorama, but for those of the tree, of which there may be none
 
 MotionOf = Callable[[Pair], Motion | None]
@@ -214,8 +215,8 @@ def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton,
 
     Each is the one that most lead across that none explains yet, of several that which fewest of the pairs
     that agree do. A large walk has many guesses, and few are wrong: where those of a whole way are refuted,
-    what takes their place is wrong. A guess with more matches than what contradicts it is no look-alike,
-    unless its own do.
+    what takes their place is wrong. So none is where more than a few are as likely. A guess with more
+    matches than what contradicts it is no look-alike, unless it contradicts itself.
 
     Args: kept, the pairs that agree.
     """
@@ -224,10 +225,12 @@ def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton,
         return set()
     agreeing = Counter(edge for way in _guesses(list(kept), skeleton) for edge in way)
     left, refuted, doubt = ways, set[Edge](), Counter[Edge]()
-    while left := [way for way in left if way and not way & refuted]:
+    while left := [way for way in left if way]:
         against = Counter(edge for way in left for edge in way)
         first = min((-count, agreeing[edge]) for edge, count in against.items())
-        refuted |= {edge for edge, count in against.items() if (-count, agreeing[edge]) == first}
+        likely = {edge for edge, count in against.items() if (-count, agreeing[edge]) == first}
+        refuted |= likely if len(likely) <= _EQUAL else set()
+        left = [way for way in left if not way & likely]
     for it, way in zip(contradictions, ways, strict=True):
         doubt.update(dict.fromkeys(way, it.matches))
     own = {it.between for it in contradictions}

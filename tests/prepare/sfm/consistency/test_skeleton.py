@@ -180,5 +180,7 @@ def test_of_many_guesses_those_are_refuted_that_most_contradictions_lead_across(
     strong = Contradiction((0, 9), 101, 0)
     assert refuted_guesses([strong], skeleton, kept) == {(4, 5)}  # fewest pairs agree across it
     assert refuted_guesses([strong], skeleton, {}) == skeleton.guessed  # any of them
+    many = replace(skeleton, guessed=frozenset(walk[:4]))
+    assert refuted_guesses([strong], many, {}) == set()  # nothing says which of so many
     both = [*across, Contradiction((6, 9), 101, 0)]
     assert refuted_guesses(both, skeleton, kept) == {(4, 5), (7, 8)}
