@@ -229,7 +229,8 @@ def refuted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton,
         against = Counter(edge for way in left for edge in way)
         first = min((-count, agreeing[edge]) for edge, count in against.items())
         likely = {edge for edge, count in against.items() if (-count, agreeing[edge]) == first}
-        refuted |= likely if len(likely) <= _EQUAL else set()
+        if len(likely) <= _EQUAL:
+            refuted |= likely
         left = [way for way in left if not way & likely]
     for it, way in zip(contradictions, ways, strict=True):
         doubt.update(dict.fromkeys(way, it.matches))

@@ -77,8 +77,13 @@ class Solution:
 
     @property
     def rank(self) -> tuple[bool, int]:
-        """Of two reconstructions by the same skeleton, the better one has the higher."""
+        """Trust, then the number of poses: the better of two reconstructions has the greater value."""
         return self.trusted, len(self.found.poses)
+
+    @cached_property
+    def against(self) -> set[Edge]:
+        """The pairs that contradict it."""
+        return {it.between for it in self.contradictions}
 
     @cached_property
     def agreeing(self) -> Kept:
@@ -89,9 +94,9 @@ class Solution:
         evidence, tree = self.evidence, self.skeleton.tree
         off = {pair.between: deviations(self.found, evidence, pair) for pair in evidence.pairs}
         close = {it.between for it in evidence.pairs if agrees(evidence, it, off[it.between], _CLOSE)}
-        against, count = {it.between for it in self.contradictions}, len(evidence.rays)
+        count = len(evidence.rays)
         way = hops(self.skeleton.edges | close, count, off, _FARTHEST / _DRIFT)
-        walk = hops(self.skeleton.edges, count, against, DRIFTED / _RETURNS)
+        walk = hops(self.skeleton.edges, count, self.against, DRIFTED / _RETURNS)
         most = {edge: min(_CLOSE + _DRIFT * steps, _FARTHEST) for edge, steps in way.items()}
         most |= {edge: min(_CLOSE + _RETURNS * steps, DRIFTED) for edge, steps in walk.items()}
         kept: Kept = {}
@@ -105,7 +110,7 @@ class Solution:
     @property
     def closing(self) -> bool:
         """Whether what contradicts it may close a loop: it agrees but for drift, and was not mapped."""
-        return not self.kept.keys() >= self.agreeing.keys() & {it.between for it in self.contradictions}
+        return not self.kept.keys() >= self.agreeing.keys() & self.against
 
     @property
     def settled(self) -> bool:
@@ -121,14 +126,13 @@ class Solution:
     @cached_property
     def vain(self) -> set[Edge]:
         """The guesses that contradict themselves, or that lead to many panoramas and no pose."""
-        poses, edges = self.found.poses.keys(), self.skeleton.edges
-        of = components([it for it in edges if not poses & it], len(self.evidence.rays))
-        many = {side for side, rows in Counter(of.tolist()).items() if rows >= _MANY}
-        against = {it.between for it in self.contradictions}
+        poses = self.found.poses.keys()
+        of = components([it for it in self.skeleton.edges if not poses & it], len(self.evidence.rays))
+        beyond = np.bincount(of)[of]  # panoramas without a pose that are connected with each
         return {
             it
             for it in self.skeleton.guessed
-            if it in against or (len(poses & it) == 1 and any(of[row] in many for row in {*it} - poses))
+            if it in self.against or (len(poses & it) == 1 and beyond[list(it)].max() >= _MANY)
         }
 
     def without(self, guesses: Collection[Edge]) -> Kept:
@@ -209,15 +213,14 @@ class Solver:
         found = self._part(range(len(self._ids)), cut=True)
         return found if found is not None and found.found.poses.keys() > self._given else None
 
-    def _guessed(self, rows: Collection[int], begun: Kept | None = None) -> Solution | None:
+    def _guessed(self, rows: Collection[int], begun: Kept) -> Solution | None:
         """The reconstruction of these panoramas: a guess that it refutes makes room for the next one."""
         found = self.solve(rows, begun)
         for _ in range(_GUESSES):
             if found is None or not found.refuted:
                 break
-            begun = found.without(found.refuted)
             self._refute(found.refuted)
-            found = self.solve(rows, begun)
+            found = self.solve(rows, found.without(found.refuted))
         return found
 
     def _refute(self, guesses: Collection[Edge]) -> None:
@@ -234,14 +237,14 @@ class Solver:
         more than `_RIM` of the panoramas would be left out.
         """
         first = 0  # panoramas that had a pose before anything was cut
-        while (found := self._guessed(rows)) is not None and not found.trusted:
+        while (found := self._guessed(rows, {})) is not None and not found.trusted:
             before = sorted(found.found.poses)
             first = first or len(before)
             self._doubted |= doubted_guesses(found.contradictions, found.skeleton)
             agreed = consistent_part(before, found.contradictions, found.skeleton, found.evidence)
             sides = [(side >= self._given, len(side), side) for side in self._sides(agreed)]
             *_, rows = max(sides, key=lambda it: it[:2], default=(False, 0, set[int]()))
-            carried = (*found.skeleton.edges, *(it.between for it in found.contradictions))
+            carried = (*found.skeleton.edges, *found.against)
             rows |= set(before).difference(*carried)
             if not cut and len(rows) < (1 - _RIM) * first:
                 self.cuts += found.contradictions
@@ -277,12 +280,12 @@ class Solver:
         of = components(skeleton.edges - (set() if skeleton.given else self._doubted), len(self._ids))
         return [{row for row in rows if of[row] == side} for side in sorted({int(of[row]) for row in rows})]
 
-    def solve(self, rows: Collection[int], begun: Kept | None = None) -> Solution | None:
+    def solve(self, rows: Collection[int], begun: Kept) -> Solution | None:
         """The reconstruction of these panoramas by the pairs that agree; None if there is none.
 
         Args: begun, pairs that are known to agree.
         """
-        new, best, turn, reached = self._begun(rows, begun or {}), None, 0, False
+        new, best, turn, reached = self._begun(rows, begun), None, 0, False
         while new is not None:
             refuted = turn > 0 and not new.closing and bool(new.refuted)
             if new.settled and not refuted and not reached:

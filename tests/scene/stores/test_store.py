@@ -25,7 +25,7 @@ def server() -> Iterator[ObjectStore]:
 
 @pytest.fixture(autouse=True)
 def credentials(server: ObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They lead to the server. What fails is tried again by our code alone, not by the provider's before."""
+    """Credentials lead to the server. Our code alone tries again what fails, not the provider's before."""
     server.faults.clear()
     server.down = False
     S3FileSystem.clear_instance_cache()  # those of the last test may lead to another server

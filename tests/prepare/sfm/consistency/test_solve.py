@@ -73,7 +73,7 @@ def test_a_guess_where_the_walk_jumps_is_refuted_and_another_pair_joins_the_part
 def test_a_guess_beyond_which_no_poses_are_found_is_replaced_before_others_are_mapped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it leads to, nothing contradicts, as it has no poses."""
+    """Nothing contradicts what such a guess leads to, as that has no poses."""
     jump, posed = (5, 6), list[int]()
 
     def without_jump(work: Workspace, *others: Any) -> pycolmap.Reconstruction | None:
