@@ -22,50 +22,38 @@ namespace {
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
 
 struct Sixteen {  // Gaussians, or the gradients of as many
-  F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2], absolute[2], motion[kMotion];
+  F mean[3], quat[4], scale[3], opacity[1], sh0[3], shN[45], screen[2], absolute[2], motion[kMotion];
 };
 
-constexpr int64_t kNext = 4 * kLanes;  // rows: those that are fetched while others are computed with
-
-// Fetches the sixteen rows of `stride` floats from `row` on.
-void fetch(const float* from, int64_t row, int stride) {
-  const char* first = reinterpret_cast<const char*>(from + stride * row);
-  for (int i = 0; i < stride * kLanes * int(sizeof(float)); i += 64) __builtin_prefetch(first + i);
-}
-
-// Whether each lane has a row of its own.
-bool whole(const Rows& rows) { return rows.row[kLanes - 1] - rows.row[0] == kLanes - 1; }
-
 // Sixteen rows in turn from `out` on, which is aligned to 64 bytes, past the caches.
-void stream_rows(const F* columns, int stride, float* out) {
-  alignas(64) float block[45 * kLanes];
-  scatter(columns, rows_from(0, kLanes), stride, stride, block);
-  for (int i = 0; i < stride * kLanes; i += kLanes) stream(out + i, load(block + i));
+template <int kStride>
+void stream_rows(const F* columns, float* out) {
+  alignas(64) float block[kStride * kLanes];
+  scatter<kStride>(columns, rows_from(0, kLanes), block);
+  for (int i = 0; i < kStride * kLanes; i += kLanes) stream(out + i, load(block + i));
 }
 
 Parameters<F> parameters(const GaussianArrays& g, const Rows& rows, int sh_count, Sixteen& to) {
-  if (const int64_t next = rows.row[0] + kNext; next + kLanes <= g.count) {
-    fetch(g.means, next, 3), fetch(g.quats, next, 4), fetch(g.scales, next, 3), fetch(g.sh0, next, 3);
-    if (sh_count > 1) fetch(g.shN, next, 45);
-  }
-  gather(g.means, rows, 3, 3, to.mean), gather(g.quats, rows, 4, 4, to.quat);
-  gather(g.scales, rows, 3, 3, to.scale), gather(g.opacities, rows, 1, 1, &to.opacity);
-  gather(g.sh0, rows, 3, 3, to.sh0), gather(g.shN, rows, 45, 3 * (sh_count - 1), to.shN);
-  return {to.mean, to.quat, to.scale, to.opacity, to.sh0, to.shN};
+  fetch<3>(g.means, rows), fetch<4>(g.quats, rows), fetch<3>(g.scales, rows), fetch<3>(g.sh0, rows);
+  if (sh_count > 1) fetch<45>(g.shN, rows);
+  gather<3>(g.means, rows, 3, to.mean), gather<4>(g.quats, rows, 4, to.quat);
+  gather<3>(g.scales, rows, 3, to.scale), gather<1>(g.opacities, rows, 1, to.opacity);
+  gather<3>(g.sh0, rows, 3, to.sh0), gather<45>(g.shN, rows, 3 * (sh_count - 1), to.shN);
+  return {to.mean, to.quat, to.scale, to.opacity[0], to.sh0, to.shN};
 }
 
 void write(const Sixteen& from, const Rows& rows, const GradientArrays& out) {
-  const auto put = [&](const F* columns, int stride, float* to) {
-    float* const first = to + stride * rows.row[0];
-    if (out.streaming && whole(rows) && uintptr_t(first) % 64 == 0)
-      stream_rows(columns, stride, first);
+  const auto put = [&]<int kStride>(const F(&columns)[kStride], float* to) {
+    float* const first = to + kStride * rows.first;
+    if (out.streaming && rows.whole() && uintptr_t(first) % 64 == 0)
+      stream_rows<kStride>(columns, first);
     else
-      scatter(columns, rows, stride, stride, to);
+      scatter<kStride>(columns, rows, to);
   };
-  put(from.mean, 3, out.means), put(from.quat, 4, out.quats), put(from.scale, 3, out.scales);
-  put(&from.opacity, 1, out.opacities), put(from.sh0, 3, out.sh0), put(from.shN, 45, out.shN);
-  if (out.screen) put(from.screen, 2, out.screen);
-  if (out.absolute) put(from.absolute, 2, out.absolute);
+  put(from.mean, out.means), put(from.quat, out.quats), put(from.scale, out.scales);
+  put(from.opacity, out.opacities), put(from.sh0, out.sh0), put(from.shN, out.shN);
+  if (out.screen) put(from.screen, out.screen);
+  if (out.absolute) put(from.absolute, out.absolute);
 }
 
 void keep_all(Mask drawn, Sixteen& values) {
@@ -76,7 +64,7 @@ void keep_all(Mask drawn, Sixteen& values) {
   for (F& x : values.shN) x = keep(drawn, x);
   for (F& x : values.screen) x = keep(drawn, x);
   for (F& x : values.absolute) x = keep(drawn, x);
-  values.opacity = keep(drawn, values.opacity);
+  values.opacity[0] = keep(drawn, values.opacity[0]);
 }
 
 // Sums of motion, apart by lanes so that the order is fixed.
@@ -108,16 +96,16 @@ void note_states(const Visibility<F>& seen, const Rows& rows, const SplatOf<F>& 
   const uint32_t visible = bits(seen.visible), invalid = bits(seen.invalid);
   const Mask beyond = s.v + s.reach<0.5f, below = s.v - s.reach> F(camera.height - 0.5f);  // as above_or_below
   const uint32_t drawn = visible & ~bits(beyond | below);
-  for (int lane = 0; lane < kLanes; ++lane)
-    state[rows.row[lane]] = drawn >> lane & 1 ? kVisible : invalid >> lane & 1 ? kInvalid : kHidden;
+  for (int lane = 0; lane < rows.count; ++lane)
+    state[rows.first + lane] = drawn >> lane & 1 ? kVisible : invalid >> lane & 1 ? kInvalid : kHidden;
 }
 
 // Sixteen rows of a cache line each, past the caches: they are read when all are there.
 void write_lines(const F* columns, const Rows& rows, float* to) {
-  if (whole(rows))
-    stream_rows(columns, kSplatFloats, to + kSplatFloats * rows.row[0]);
+  if (rows.whole())
+    stream_rows<kSplatFloats>(columns, to + kSplatFloats * rows.first);
   else
-    scatter(columns, rows, kSplatFloats, kSplatFloats, to);
+    scatter<kSplatFloats>(columns, rows, to);
 }
 
 void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
@@ -127,7 +115,7 @@ void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, i
   for (int64_t at = begin; at < end; at += kLanes) {
     const Rows rows = rows_from(at, end);
     const Parameters<F> p = parameters(g, rows, sh_count, from);
-    gather(g.screen, rows, 2, 2, from.screen);
+    gather<2>(g.screen, rows, 2, from.screen);
     const Visibility<F> seen = project(p, camera, sh_count, from.screen, s);
     note_states(seen, rows, s, camera, state);
     write_lines(&s.u, rows, reinterpret_cast<float*>(splats));
@@ -174,24 +162,23 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
   SplatOf<F> s;
   SumsOf<F> sums;
   MotionSums motion;
-  const ParameterGradients<F> gradients = {to.mean,     to.quat,     to.scale,
-                                           &to.opacity, to.sh0,      to.shN,
-                                           to.screen,   to.absolute, out.motion ? to.motion : nullptr};
+  const ParameterGradients<F> gradients = {
+      to.mean, to.quat, to.scale, to.opacity, to.sh0, to.shN, to.screen, to.absolute, out.motion ? to.motion : nullptr};
   for (int64_t at = 0; at < count; at += kLanes) {
     const Rows rows = rows_from(at, count);
     alignas(64) float met[kLanes];
     SumsOf<float> totals[kLanes];
-    Rows own;
     for (int lane = 0; lane < kLanes; ++lane) {
-      const uint32_t first = slots[rows.row[lane]], last = slots[rows.row[lane] + 1];
+      const int64_t row = at + (lane < rows.count ? lane : rows.count - 1);
+      const uint32_t first = slots[row], last = slots[row + 1];
       totals[lane] = sum_of_parts(parts + first, last - first);
-      met[lane] = float(last - first), own.row[lane] = lane;
+      met[lane] = float(last - first);
     }
-    if (at + kNext + kLanes <= g.count) fetch(reinterpret_cast<const float*>(splats), at + kNext, kSplatFloats);
+    fetch<kSplatFloats>(reinterpret_cast<const float*>(splats), rows);
     const Mask drawn = load(met) > 0;
     if (bits(drawn)) {
-      gather(reinterpret_cast<const float*>(splats), rows, kSplatFloats, kSplatFloats, &s.u);
-      gather(&totals[0].power, own, kFloats, kFloats, &sums.power);
+      gather<kSplatFloats>(reinterpret_cast<const float*>(splats), rows, kSplatFloats, &s.u);
+      gather<kFloats>(&totals[0].power, rows_from(0, kLanes), kFloats, &sums.power);
       project_backward(parameters(g, rows, sh_count, from), camera, sh_count, s, sums, gradients);
     }
     keep_all(drawn, to);
@@ -318,25 +305,46 @@ void gradient_row(const float* const by[3], const float* x, const float* y, cons
     for (int i = 0; i < count; ++i) out[i] = counts[i] ? out[i] : 0.0f;
 }
 
-bool adam(const AdamStep& s, int64_t count, const float* __restrict gradient, float* __restrict parameter,
-          float* __restrict exp_avg, float* __restrict exp_avg_sq) {
-  const float rate = s.lr / s.correction1, root = 1 / sqrtf(s.correction2);
-  uint32_t carry = 0;  // of infinite and NaN all bits of the exponent are set, and one more is a carry
-  const auto step = [&](int64_t i, float unit) {
-    const float g = gradient[i];
-    uint32_t bits;
-    __builtin_memcpy(&bits, &g, sizeof bits);
-    carry |= (bits & 0x7f800000u) + 0x00800000u;
-    exp_avg[i] = s.beta1 * exp_avg[i] + (1 - s.beta1) * g;
-    exp_avg_sq[i] = s.beta2 * exp_avg_sq[i] + (1 - s.beta2) * g * g;
-    parameter[i] -= unit * rate * exp_avg[i] / (sqrtf(exp_avg_sq[i]) * root + s.eps);
-  };
-  const int64_t values = s.units ? s.values : count;
-  for (int64_t i = 0; i < count;) {
-    const int64_t row = i / values, next = (row + 1) * values, last = next < count ? next : count;
-    for (const float unit = s.units ? s.units[row] : 1; i < last; ++i) step(i, unit);
+// Of values in turn from `first` on, the rate of each: in units of its row.
+void rates_of(const AdamStep& s, int64_t first, int count, float* rates) {
+  const float rate = s.lr / s.correction1;
+  for (int64_t row = first / s.values, at = first; at < first + count; ++row) {
+    const int64_t next = (row + 1) * s.values, last = next < first + count ? next : first + count;
+    for (const float unit = s.units[row] * rate; at < last; ++at) rates[at - first] = unit;
   }
-  return !(carry & 0x80000000u);
+}
+
+bool adam(const AdamStep& s, int64_t count, const float* gradient, float* parameter, float* exp_avg,
+          float* exp_avg_sq) {
+  constexpr int kAtOnce = 45 * kLanes, kAhead = 512;
+  alignas(64) float rates[kAtOnce];
+  if (!s.units)
+    for (float& rate : rates) rate = s.lr / s.correction1;
+  const F root = 1 / sqrtf(s.correction2), eps = s.eps;
+  const F beta1 = s.beta1, beta2 = s.beta2, rest1 = 1 - s.beta1, rest2 = 1 - s.beta2;
+  F broken = 0;  // NaN where a gradient was not finite
+  const auto step = [&](const float* rate, const float* by, float* value, float* first, float* second) {
+    fetch_line(first + kAhead), fetch_line(second + kAhead);
+    const F g = load(by), m = fma(beta1, load(first), rest1 * g), v = fma(beta2, load(second), rest2 * g * g);
+    broken = fma(g, F(0), broken);
+    store(first, m), store(second, v);
+    store(value, load(value) - load(rate) * m / fma(sqrt(v), root, eps));
+  };
+  for (int64_t at = 0; at < count; at += kAtOnce) {
+    const int some = count - at < kAtOnce ? int(count - at) : kAtOnce, whole = some / kLanes * kLanes;
+    if (s.units) rates_of(s, at, some, rates);
+    for (int i = 0; i < whole; i += kLanes)
+      step(rates + i, gradient + at + i, parameter + at + i, exp_avg + at + i, exp_avg_sq + at + i);
+    if (whole == some) continue;
+    float last[4][kLanes] = {};
+    const size_t bytes = (some - whole) * sizeof(float);
+    const float* const from[4] = {gradient + at + whole, parameter + at + whole, exp_avg + at + whole,
+                                  exp_avg_sq + at + whole};
+    for (int k = 0; k < 4; ++k) __builtin_memcpy(last[k], from[k], bytes);
+    step(rates + whole, last[0], last[1], last[2], last[3]);
+    for (int k = 1; k < 4; ++k) __builtin_memcpy(const_cast<float*>(from[k]), last[k], bytes);
+  }
+  return bits(broken >= 0) == 0xffff;
 }
 
 }  // namespace

@@ -114,8 +114,9 @@ constexpr int kRowsAtOnce = 4;  // of tiles: a splat with more is treated alone
 uint32_t tiles_of(const Splat* splats, const uint8_t* state, int count, const Camera& camera, uint32_t* tiles,
                   uint32_t* many) {
   const Rows rows = rows_from(0, count);
+  fetch<kSplatFloats>(&splats->u, rows);
   F center[4], shape[4];
-  gather(&splats->u, rows, kSplatFloats, 4, center), gather(&splats->reach, rows, kSplatFloats, 4, shape);
+  gather<kSplatFloats>(&splats->u, rows, 4, center), gather<kSplatFloats>(&splats->reach, rows, 4, shape);
   const Ellipses s = {center[0], center[1], center[3], shape[0], shape[1], shape[2]};
   const Heights heights = heights_of(s.v, s.reach, drawn_of(state, count), camera.height);
   alignas(64) int32_t top[kLanes], down[kLanes];
@@ -176,8 +177,8 @@ uint32_t ray_tiles_of(const Splat* splats, const RaySplat* rays, const uint8_t* 
   const Rows rows = rows_from(0, count);
   F center[4], shape[4];
   Cones s;
-  gather(&splats->u, rows, kSplatFloats, 4, center), gather(&splats->reach, rows, kSplatFloats, 4, shape);
-  gather(rays->x, rows, kSplatFloats, 11, s.x);
+  gather<kSplatFloats>(&splats->u, rows, 4, center), gather<kSplatFloats>(&splats->reach, rows, 4, shape);
+  gather<kSplatFloats>(rays->x, rows, 11, s.x);
   const Mask drawn = drawn_of(state, count);
   const Heights heights = heights_of(center[1], shape[0], drawn, camera.height);
   const Widths run = widths_between(center[0] - shape[3], center[0] + shape[3], camera.width);
