@@ -6,6 +6,64 @@
 namespace panolog::PANOLOG_ISA {
 namespace {
 
+// Sixteen rows of one to three floats in turn, columns becoming vectors; and back.
+template <int kColumns>
+inline void split_columns(const float* rows, F out[kColumns]) {
+  static_assert(kColumns < 4, "three vectors have all");
+#if defined(__AVX512F__)
+  const __m512i lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  __m512 in[3];
+  for (int i = 0; i < 3; ++i) in[i] = _mm512_loadu_ps(rows + kLanes * (i < kColumns ? i : 0));
+  for (int k = 0; k < kColumns; ++k) {
+    const __m512i at = _mm512_add_epi32(_mm512_mullo_epi32(lane, _mm512_set1_epi32(kColumns)), _mm512_set1_epi32(k));
+    const __mmask16 last = _mm512_cmpge_epi32_mask(at, _mm512_set1_epi32(2 * kLanes));
+    const __m512 low = _mm512_permutex2var_ps(in[0], at, in[1]);
+    out[k] = _mm512_mask_permutexvar_ps(low, last, at, in[2]);
+  }
+#else
+  for (int k = 0; k < kColumns; ++k) {
+    alignas(64) float column[kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) column[lane] = rows[kColumns * lane + k];
+    out[k] = load(column);
+  }
+#endif
+}
+#if defined(__AVX512F__)
+// Of each float of the rows its row, its place in the first two columns, and whether it is of the third.
+template <int kColumns>
+struct JoinedColumns {
+  alignas(64) int32_t row[kColumns][kLanes] = {}, of_two[kColumns][kLanes] = {};
+  __mmask16 third[kColumns] = {};
+  constexpr JoinedColumns() {
+    for (int i = 0; i < kColumns; ++i)
+      for (int lane = 0; lane < kLanes; ++lane) {
+        const int at = kLanes * i + lane, column = at % kColumns;
+        row[i][lane] = at / kColumns, of_two[i][lane] = row[i][lane] + kLanes * (column == 1);
+        third[i] |= __mmask16((column == 2) << lane);
+      }
+  }
+};
+#endif
+template <int kColumns>
+inline void join_columns(const F columns[kColumns], float* rows) {
+  static_assert(kColumns < 4, "three vectors have all");
+#if defined(__AVX512F__)
+  static constexpr JoinedColumns<kColumns> kAt;
+  for (int i = 0; i < kColumns; ++i) {
+    const __m512i row = _mm512_load_si512(kAt.row[i]), of_two = _mm512_load_si512(kAt.of_two[i]);
+    const __m512 two = _mm512_permutex2var_ps(columns[0].v, of_two, columns[kColumns > 1].v);
+    const __m512 third = columns[kColumns > 2 ? 2 : 0].v;
+    _mm512_storeu_ps(rows + kLanes * i, _mm512_mask_permutexvar_ps(two, kAt.third[i], row, third));
+  }
+#else
+  for (int k = 0; k < kColumns; ++k) {
+    alignas(64) float column[kLanes];
+    store(column, columns[k]);
+    for (int lane = 0; lane < kLanes; ++lane) rows[kColumns * lane + k] = column[lane];
+  }
+#endif
+}
+
 // Sixteen rows in turn, one for each lane. If fewer are left, the last one fills the remaining lanes.
 struct Rows {
   int64_t first;
