@@ -305,44 +305,43 @@ void gradient_row(const float* const by[3], const float* x, const float* y, cons
     for (int i = 0; i < count; ++i) out[i] = counts[i] ? out[i] : 0.0f;
 }
 
-// Of values in turn from `first` on, the rate of each: in units of its row.
-void rates_of(const AdamStep& s, int64_t first, int count, float* rates) {
-  const float rate = s.lr / s.correction1;
+// Of values in turn from `first` on, what the rate of each is a multiple of: the unit of its row.
+void units_of(const AdamStep& s, int64_t first, int count, float* units) {
   for (int64_t row = first / s.values, at = first; at < first + count; ++row) {
     const int64_t next = (row + 1) * s.values, last = next < first + count ? next : first + count;
-    for (const float unit = s.units[row] * rate; at < last; ++at) rates[at - first] = unit;
+    for (const float unit = s.units[row]; at < last; ++at) units[at - first] = unit;
   }
 }
 
 bool adam(const AdamStep& s, int64_t count, const float* gradient, float* parameter, float* exp_avg,
           float* exp_avg_sq) {
   constexpr int kAtOnce = 45 * kLanes, kAhead = 512;
-  alignas(64) float rates[kAtOnce];
+  alignas(64) float units[kAtOnce];
   if (!s.units)
-    for (float& rate : rates) rate = s.lr / s.correction1;
-  const F root = 1 / sqrtf(s.correction2), eps = s.eps;
+    for (float& unit : units) unit = 1;
+  const F rate = s.lr / s.correction1, root = 1 / sqrtf(s.correction2), eps = s.eps;
   const F beta1 = s.beta1, beta2 = s.beta2, rest1 = 1 - s.beta1, rest2 = 1 - s.beta2;
   F broken = 0;  // NaN where a gradient was not finite
-  const auto step = [&](const float* rate, const float* by, float* value, float* first, float* second) {
+  const auto step = [&](const float* unit, const float* by, float* value, float* first, float* second) {
     fetch_line(first + kAhead), fetch_line(second + kAhead);
     const F g = load(by), m = fma(beta1, load(first), rest1 * g), v = fma(beta2, load(second), rest2 * g * g);
     broken = fma(g, F(0), broken);
     store(first, m), store(second, v);
-    store(value, load(value) - load(rate) * m / fma(sqrt(v), root, eps));
+    store(value, load(value) - load(unit) * rate * m / fma(sqrt(v), root, eps));
   };
   for (int64_t at = 0; at < count; at += kAtOnce) {
     const int some = count - at < kAtOnce ? int(count - at) : kAtOnce, whole = some / kLanes * kLanes;
-    if (s.units) rates_of(s, at, some, rates);
+    if (s.units) units_of(s, at, some, units);
     for (int i = 0; i < whole; i += kLanes)
-      step(rates + i, gradient + at + i, parameter + at + i, exp_avg + at + i, exp_avg_sq + at + i);
+      step(units + i, gradient + at + i, parameter + at + i, exp_avg + at + i, exp_avg_sq + at + i);
     if (whole == some) continue;
     float last[4][kLanes] = {};
     const size_t bytes = (some - whole) * sizeof(float);
-    const float* const from[4] = {gradient + at + whole, parameter + at + whole, exp_avg + at + whole,
-                                  exp_avg_sq + at + whole};
-    for (int k = 0; k < 4; ++k) __builtin_memcpy(last[k], from[k], bytes);
-    step(rates + whole, last[0], last[1], last[2], last[3]);
-    for (int k = 1; k < 4; ++k) __builtin_memcpy(const_cast<float*>(from[k]), last[k], bytes);
+    float* const moved[3] = {parameter + at + whole, exp_avg + at + whole, exp_avg_sq + at + whole};
+    for (int k = 0; k < 3; ++k) __builtin_memcpy(last[k], moved[k], bytes);
+    __builtin_memcpy(last[3], gradient + at + whole, bytes);
+    step(units + whole, last[3], last[0], last[1], last[2]);
+    for (int k = 0; k < 3; ++k) __builtin_memcpy(moved[k], last[k], bytes);
   }
   return bits(broken >= 0) == 0xffff;
 }

@@ -175,6 +175,7 @@ inline void meet(const Cones& s, const Heights& heights, const Widths& run, cons
 uint32_t ray_tiles_of(const Splat* splats, const RaySplat* rays, const uint8_t* state, int count, const Camera& camera,
                       const Grid& grid, uint32_t* tiles, uint32_t* many) {
   const Rows rows = rows_from(0, count);
+  fetch<kSplatFloats>(&splats->u, rows), fetch<kSplatFloats>(rays->x, rows);
   F center[4], shape[4];
   Cones s;
   gather<kSplatFloats>(&splats->u, rows, 4, center), gather<kSplatFloats>(&splats->reach, rows, 4, shape);
