@@ -61,7 +61,7 @@ def test_a_run_whose_driver_is_killed_and_loses_ray_ends_with_the_same_bytes(tmp
     head.kill()
     _, stderr = process.communicate(timeout=480)
     assert process.returncode == 0, stderr
-    assert "Traceback" not in stderr
+    assert "Traceback" not in stderr, stderr
     records = [item.record for item in read_records(RunFolder(root).database, limit=10**6)]
     assert [record.pid for record in records if isinstance(record, RunBegan)][:2] == seen
     notices = [record.message for record in records if isinstance(record, Noticed)]
