@@ -1,12 +1,15 @@
 """Which panoramas look alike, by a few of their features: a fraction of what matching all of them takes.
 
 The largest features of a panorama are few and return most often (C. Wu, Towards Linear-Time Incremental
-Structure from Motion, 3DV 2013: preemptive matching).
+Structure from Motion, 3DV 2013: preemptive matching). Of many panoramas, those are compared that share most
+hashes of these features (M. Charikar, Similarity Estimation Techniques from Rounding Algorithms, STOC 2002:
+signs of random projections): the time grows with their number, not with its square.
 """
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
@@ -15,33 +18,67 @@ _LARGEST = 256  # features of each panorama
 _AT_ONCE = 32  # panoramas that one is compared with
 _RATIO = 0.8  # of the distance to the second nearest, as COLMAP has it
 _SQUARE = 512.0  # length of COLMAP's descriptors
+_CANDIDATES = 96  # panoramas that share most hashes, for each
+_HASHES, _BITS = 32, 16  # of each feature
+_WEIGHT = 16.0  # of a hash that half of the panoramas have: weights are whole, and sums the same everywhere
+
+Words = list[NDArray[np.float32]]  # (N, 128) of each panorama
 
 
 def look_alikes(work: Workspace, most: int, progress: StageProgress) -> list[tuple[int, int]]:
     """Pairs of rows, ascending: each panorama with the `most` that share most of its largest features."""
     ids = work.ids()
     with pycolmap.Database.open(work.database) as database:
-        # (N, 128) of each. Products of descriptors are whole and below 2^24: exact in any order.
+        # Products of descriptors are whole and below 2^24: exact in any order.
         words = [np.asarray(database.read_descriptors(it).data[:_LARGEST], np.float32) for it in ids]
-    shared = np.zeros((len(ids), len(ids)), np.int16)
-    for row, own in enumerate(words):
+    shared: list[dict[int, int]] = [{} for _ in ids]
+    for row, earlier in enumerate(_compared(words)):
         progress("look-alikes", row, len(ids))
-        for start in range(0, row, _AT_ONCE):
-            others = words[start : min(row, start + _AT_ONCE)]
-            close = (
-                own @ np.concatenate(others).T
-            )  # many at once: BLAS's threads cost more than small products
-            parts = np.split(close, np.cumsum([len(other) for other in others])[:-1], axis=1)
-            for other, part in enumerate(parts, start=start):
-                shared[row, other] = shared[other, row] = _matches(part)
+        for start in range(0, len(earlier), _AT_ONCE):
+            others = earlier[start : start + _AT_ONCE]
+            # many at once: BLAS's threads cost more than small products
+            close = words[row] @ np.concatenate([words[other] for other in others]).T
+            parts = np.split(close, np.cumsum([len(words[other]) for other in others])[:-1], axis=1)
+            for other, part in zip(others, parts, strict=True):
+                shared[row][other] = shared[other][row] = _matches(part)
     progress("look-alikes", len(ids), len(ids))
     pairs = {
         (min(row, other), max(row, other))
         for row, counts in enumerate(shared)
-        for other in np.argsort(-counts, kind="stable")[:most].tolist()
+        for other in sorted(counts, key=lambda it: (-counts[it], it))[:most]
         if counts[other] > 0
     }
     return sorted(pairs)
+
+
+def _compared(words: Words) -> list[list[int]]:
+    """For each panorama the earlier ones that it is compared with: all, or of many those with equal hashes.
+
+    A hash counts for more, the fewer panoramas have it.
+    """
+    count = len(words)
+    if count <= _CANDIDATES + 1:
+        return [list(range(row)) for row in range(count)]
+    every = np.concatenate(words)
+    signs = np.random.default_rng(0).choice(np.array([-1, 1], np.float32), (every.shape[1], _HASHES * _BITS))
+    above = (every - np.rint(every.mean(axis=0, dtype=np.float64)).astype(np.float32)) @ signs > 0
+    hashes = above.reshape(len(every), _HASHES, _BITS) @ (1 << np.arange(_BITS))
+    columns = (hashes + (np.arange(_HASHES) << _BITS)).ravel()
+    rows = np.repeat(np.arange(count), [_HASHES * len(own) for own in words])
+    own = csr_array((np.ones(len(rows), np.int32), (rows, columns)), shape=(count, _HASHES << _BITS))
+    own.data[:] = 1  # those that a panorama has several times
+    having = np.bincount(own.indices, minlength=own.shape[1])
+    weights = np.rint(_WEIGHT * np.log2(count / np.maximum(having, 1))).astype(np.int32)
+    weighted, others, pairs = csr_array(own * weights), csr_array(own.T), set[tuple[int, int]]()
+    for row in range(count):
+        score = (weighted[[row]] @ others).toarray()[0]
+        score[row] = -1
+        likely = np.argsort(-score, kind="stable")[:_CANDIDATES].tolist()
+        pairs.update((max(row, other), min(row, other)) for other in likely)
+    earlier: list[list[int]] = [[] for _ in range(count)]
+    for row, other in sorted(pairs):
+        earlier[row].append(other)
+    return earlier
 
 
 def _matches(close: NDArray[np.float32]) -> int:

@@ -3,7 +3,9 @@
 import numpy as np
 import pycolmap
 import pytest
+from numpy.typing import NDArray
 
+from panolog.prepare.sfm import looks
 from panolog.prepare.sfm.looks import look_alikes
 from panolog.prepare.sfm.pairs import Pairing, choose_pairs
 from panolog.prepare.sfm.workspace import Workspace, silence_colmap
@@ -46,3 +48,20 @@ def test_features_that_repeat_do_not_count(work: Workspace) -> None:
     assert TWIN in found
     assert (REPEATED, 50) not in found
     assert not any(EMPTY in pair for pair in found)
+
+
+def test_many_are_compared_with_those_that_share_hashes(
+    work: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compared = list[int]()
+
+    def counted(close: NDArray[np.float32]) -> int:
+        compared.append(1)
+        return matches_of(close)
+
+    matches_of = looks._matches
+    monkeypatch.setattr(looks, "_matches", counted)
+    monkeypatch.setattr(looks, "_CANDIDATES", 6)
+    found = look_alikes(work, 3, no_progress)
+    assert TWIN in found and (REPEATED, 50) not in found
+    assert len(compared) <= 6 * COUNT
