@@ -1,18 +1,22 @@
 """From matches to poses and points, by COLMAP's incremental or global mapper."""
 
 import shutil
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
 
 Mapper = Literal["incremental", "global"]
+Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
 _GROWTH = 1.2  # of what is adjusted as a whole: COLMAP's 1.1 takes a third longer and ends in the same poses
+_WIDER = 4.0, 1.0, 1.0  # times the bound of errors, one adjustment after the other
 _LEAST = (
     12  # points that a pose is found by: the pairs are known to agree, and COLMAP's 30 break a thin chain
 )
@@ -36,11 +40,52 @@ def map_pairs(
     return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 
-def _incremental(
-    work: Workspace, progress: StageProgress, max_error: float, known: pycolmap.Reconstruction | None
-) -> list[pycolmap.Reconstruction]:
+def adjust_poses(
+    work: Workspace, model: pycolmap.Reconstruction, poses: Mapping[int, Pose], max_error: float
+) -> pycolmap.Reconstruction | None:
+    """A model adjusted to the verified pairs of a database; None if these give no points with its poses.
+
+    Its poses may be off by what drifts between neighbours: points are found with a wider bound first.
+    Args: model, of panoramas of the database; poses, of its rows, in place of those of the model: world to
+    camera (3, 3) and (3,), others are left out; max_error, pixels that an observation may be away from its
+    point.
+    """
+    model, ids = pycolmap.Reconstruction(model), work.ids()
+    for number in set(model.reg_image_ids()) - {ids[row] for row in poses}:
+        model.deregister_frame(model.image(number).frame_id)
+    for row, pose in poses.items():
+        image = model.image(ids[row])
+        moved = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[0]), pose[1])
+        model.frame(image.frame_id).set_cam_from_world(image.camera_id, moved)
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.print_summary = adjustment.refine_focal_length = adjustment.refine_extra_params = False
+    adjustment.ceres.solver_options.num_threads = 1
+    for wider in _WIDER:
+        options = _options(wider * max_error)
+        options.triangulation.create_max_angle_error *= wider
+        options.triangulation.continue_max_angle_error *= wider
+        shutil.rmtree(work.models, ignore_errors=True)
+        work.models.mkdir(parents=True)
+        try:
+            model = pycolmap.triangulate_points(
+                model, work.database, work.images, work.models, options=options
+            )
+        except (RuntimeError, ValueError):
+            return None
+        if not model.num_points3D():
+            return None
+        config = pycolmap.BundleAdjustmentConfig()
+        for number in model.reg_image_ids():
+            config.add_image(number)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        # `pycolmap.bundle_adjustment` does the same, but turns COLMAP's log on.
+        pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
+    return model
+
+
+def _options(max_error: float) -> pycolmap.IncrementalPipelineOptions:
+    """Options of the mapper; max_error, pixels that an observation may be away from its point."""
     options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = 2
     options.extract_colors = False
     options.random_seed = 0
     # Ceres sums in the order in which its threads end: with several, equal matches give other poses.
@@ -48,6 +93,14 @@ def _incremental(
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.mapper.filter_max_reproj_error = max_error
     options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = max_error
+    return options
+
+
+def _incremental(
+    work: Workspace, progress: StageProgress, max_error: float, known: pycolmap.Reconstruction | None
+) -> list[pycolmap.Reconstruction]:
+    options = _options(max_error)
+    options.min_model_size = 2
     # By default COLMAP starts from no pair that moves along the optical axis, nor from one below 16 degrees.
     # A panorama has no such axis: of a walk along its z, only pairs misled by repetition would be left.
     options.mapper.init_max_forward_motion = 1.0

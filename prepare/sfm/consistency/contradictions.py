@@ -48,11 +48,12 @@ _AS_NEIGHBOURS = 0.9  # of the median coverage of the pairs that carry the recon
 _MARGIN = 0.85  # of the least coverage on the way between two without an order: with less they look alike
 _SHARED = 0.75  # of the median share of features of the pairs that carry: copies of houses stand apart
 _CLOSE = 0.5  # of the median step: who stands closer shares more than a front, or is a look-alike
-DRIFTED = 20.0  # degrees that a walk may be off where it returns
+_DRIFTED = 20.0  # degrees that a walk may be off where it returns
 _RIVALLED = 0.3  # of the edges of the tree that may have a rival
 _FEW = 0.25  # of the matches of a guess: what has fewer looks alike, whatever the guess does
 _EQUAL = 3  # guesses that are refuted together, as nothing says which is wrong
 _MOST = 0.02  # contradictions for each panorama, but for those of the tree, of which there may be none
+_MOST_GUESSED = 0.005  # the same where the order was followed by a guess: a wrong one leads to more
 
 MotionOf = Callable[[Pair], Motion | None]
 Kept = dict[Edge, NDArray[np.int64]]  # matches (M, 2) of the pairs that are mapped
@@ -111,7 +112,7 @@ def find_contradictions(
     for pair, fit, median in against:
         guessed = sides[pair.between[0]] != sides[pair.between[1]]
         if skeleton.ordered:
-            counts = pair.coverage >= _AS_NEIGHBOURS * covered and (guessed or median < DRIFTED)
+            counts = pair.coverage >= _AS_NEIGHBOURS * covered and (guessed or median < _DRIFTED)
             usual_share = share
         else:
             path = tree_path(way, pair.between)
@@ -192,8 +193,8 @@ def is_repetitive(skeleton: Skeleton, rows: Collection[int]) -> bool:
 def is_trusted(contradictions: Sequence[Contradiction], skeleton: Skeleton, rows: Collection[int]) -> bool:
     """Whether poses of panoramas can be used in spite of contradictions and of geometries that have rivals.
 
-    Where the order was followed by a guess, or the tree does not connect them, there may be no contradiction;
-    it has to connect them with poses that are known.
+    Where the order was followed by a guess, or the tree does not connect them, there may be no contradiction
+    in a walk of less than 200; the tree has to connect them with poses that are known.
     """
     sides = components(skeleton.among(rows).edges, max(rows) + 1)
     guessed = len({int(sides[row]) for row in rows}) > 1
@@ -201,8 +202,8 @@ def is_trusted(contradictions: Sequence[Contradiction], skeleton: Skeleton, rows
         return False
     broken = any(it.between in skeleton.tree for it in contradictions)
     guessed |= any(edge in skeleton.tree and set(edge) <= set(rows) for edge in skeleton.guessed)
-    few = len(contradictions) <= (0 if guessed else max(1, _MOST * len(rows)))
-    return few and not broken and not is_repetitive(skeleton, rows)
+    most = _MOST_GUESSED * len(rows) if guessed else max(1, _MOST * len(rows))
+    return len(contradictions) <= most and not broken and not is_repetitive(skeleton, rows)
 
 
 def doubted_guesses(contradictions: Sequence[Contradiction], skeleton: Skeleton) -> set[Edge]:

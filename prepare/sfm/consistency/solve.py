@@ -1,30 +1,26 @@
 """From verified pairs to a reconstruction that look-alikes cannot mislead.
 
-The skeleton alone is mapped first. It has no loops, so no look-alike can bend it. All other pairs are then
-judged by it: their points must be where they are seen, but for its drift. With those that are, the mapper
-starts again, and closes wider loops each time, until no more pairs agree. Panoramas that this does not reach
-are added last.
+The skeleton alone is mapped first. It has no loops, so no look-alike can bend it. Loops that its drift has
+left open are closed, and all other pairs judged by that: their points must be where they are seen. With those
+that are, panoramas are mapped again, or adjusted where the mapper drifts, until no more pairs agree.
+Panoramas that this does not reach are added last.
 """
 
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from panolog.prepare.sfm.consistency.agreement import Posed, agrees, deviations, posed
+from panolog.prepare.sfm.consistency.agreement import agrees, deviations, posed
 from panolog.prepare.sfm.consistency.contradictions import (
-    DRIFTED,
     Contradiction,
     Kept,
     consistent_part,
     doubted_guesses,
     find_contradictions,
-    is_trusted,
-    refuted_guesses,
 )
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, best_coverage, read_evidence
 from panolog.prepare.sfm.consistency.guided import Guide
@@ -34,122 +30,17 @@ from panolog.prepare.sfm.consistency.skeleton import (
     Skeleton,
     components,
     find_skeleton,
-    hops,
-    tree_paths,
 )
-from panolog.prepare.sfm.links import Link, links_of
-from panolog.prepare.sfm.mapping import Mapper, map_pairs
-from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
+from panolog.prepare.sfm.consistency.solution import CLOSE, SETTLED, Solution
+from panolog.prepare.sfm.mapping import Mapper, adjust_poses, map_pairs
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
 
-_CLOSE = 2.0  # degrees between where points are and where they are seen, for a pair that fits
-_DRIFT = 0.05  # degrees more for each panorama on the way between the two along pairs that fit
-_FARTHEST = 6.0  # degrees at most: a window further on is farther off
-_RETURNS = 0.2  # degrees instead, up to DRIFTED, for what shares as much as neighbours: thin walks drift so
-_SETTLED = 0.03  # of the pairs that are mapped: if no more change, another time changes no pose by much
-_PURE = 0.8  # share of the matches of a pair that fit, for those to count that cannot be judged
 _ROUNDS = 8  # of mapping with the pairs that fit
 _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
-_MANY = 4  # panoramas beyond a guess: fewer may have no pose for want of points, and are added last
 _GUESSES = 4  # times that the next pairs take the place of guesses, before loops are closed and after
 _LOOSE = 100.0  # relative error of the scale across a link: one side is a point for the other
 _RIM = 0.1  # share of the panoramas that may be left out without an order: all others agree
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """A reconstruction and what it was made of."""
-
-    model: pycolmap.Reconstruction
-    contradictions: list[Contradiction]
-    evidence: Evidence
-    skeleton: Skeleton
-    found: Posed
-    kept: Kept
-    numbers: Sequence[str]  # the name of each panorama in the database
-    size: tuple[int, int]  # (width, height) of the panoramas
-
-    @property
-    def trusted(self) -> bool:
-        """Whether its poses can be used as they are."""
-        return is_trusted(self.contradictions, self.skeleton, self.found.poses)
-
-    @property
-    def rank(self) -> tuple[bool, int]:
-        """Trust, then the number of poses: the better of two reconstructions has the greater value."""
-        return self.trusted, len(self.found.poses)
-
-    @cached_property
-    def against(self) -> set[Edge]:
-        """The pairs that contradict it."""
-        return {it.between for it in self.contradictions}
-
-    @cached_property
-    def agreeing(self) -> Kept:
-        """The tree, and the pairs that fit the poses and points, but for drift.
-
-        What contradicts may have drifted as far as a walk does where it returns.
-        """
-        evidence, tree = self.evidence, self.skeleton.tree
-        off = {pair.between: deviations(self.found, evidence, pair) for pair in evidence.pairs}
-        close = {it.between for it in evidence.pairs if agrees(evidence, it, off[it.between], _CLOSE)}
-        count = len(evidence.rays)
-        way = hops(self.skeleton.edges | close, count, off, _FARTHEST / _DRIFT)
-        walk = hops(self.skeleton.edges, count, self.against, DRIFTED / _RETURNS)
-        most = {edge: min(_CLOSE + _DRIFT * steps, _FARTHEST) for edge, steps in way.items()}
-        most |= {edge: min(_CLOSE + _RETURNS * steps, DRIFTED) for edge, steps in walk.items()}
-        kept: Kept = {}
-        for pair in evidence.pairs:
-            edge = pair.between
-            matches = pair.matches if edge in tree else _fitting(evidence, pair, off[edge], most[edge])
-            if len(matches):
-                kept[edge] = matches
-        return kept
-
-    @property
-    def closing(self) -> bool:
-        """Whether what contradicts it may close a loop: it agrees but for drift, and was not mapped."""
-        return not self.kept.keys() >= self.agreeing.keys() & self.against
-
-    @property
-    def settled(self) -> bool:
-        """Whether mapping what agrees would change no pose by much."""
-        change = self.agreeing.keys() ^ self.kept.keys()
-        return not self.closing and len(change) <= _SETTLED * len(self.kept)
-
-    @cached_property
-    def refuted(self) -> set[Edge]:
-        """The guesses that its contradictions refute."""
-        return refuted_guesses(self.contradictions, self.skeleton, self.kept)
-
-    @cached_property
-    def vain(self) -> set[Edge]:
-        """The guesses that contradict themselves, or that lead to many panoramas and no pose."""
-        poses = self.found.poses.keys()
-        of = components([it for it in self.skeleton.edges if not poses & it], len(self.evidence.rays))
-        beyond = np.bincount(of)[of]  # panoramas without a pose that are connected with each
-        return {
-            it
-            for it in self.skeleton.guessed
-            if it in self.against or (len(poses & it) == 1 and beyond[list(it)].max() >= _MANY)
-        }
-
-    def without(self, guesses: Collection[Edge]) -> Kept:
-        """The pairs that agree, and are not on different sides of any of these guesses."""
-        ways = tree_paths(self.skeleton.edges, list(self.agreeing))
-        kept = zip(self.agreeing.items(), ways, strict=True)
-        return {edge: matches for (edge, matches), way in kept if not set(way) & set(guesses)}
-
-    @cached_property
-    def sparse(self) -> SparseModel:
-        """The poses and points in our convention."""
-        return from_colmap(self.model, self.numbers, self.size)
-
-    @cached_property
-    def links(self) -> list[Link]:
-        """Between parts of it, the weakest first."""
-        return links_of(self.sparse, self.size[0])
 
 
 class Solver:
@@ -174,6 +65,7 @@ class Solver:
         self._geometries = Geometries(work, size, max_error, evidence)
         evidence = look_again(self._geometries.marked(evidence), self._geometries)
         self._known, self._given, self._refuted, self._places = known, set[int](), set[Edge](), places
+        self._drift: float | None = None  # that the last tree has shown
         self._doubted = set[Edge]()  # guesses that contradictions have led across
         if known is not None:
             self._given = set(posed(known, self._ids).poses)
@@ -244,7 +136,7 @@ class Solver:
             agreed = consistent_part(before, found.contradictions, found.skeleton, found.evidence)
             sides = [(side >= self._given, len(side), side) for side in self._sides(agreed)]
             *_, rows = max(sides, key=lambda it: it[:2], default=(False, 0, set[int]()))
-            carried = (*found.skeleton.edges, *found.against)
+            carried = (*found.skeleton.edges, *(it.between for it in found.contradictions))
             rows |= set(before).difference(*carried)
             if not cut and len(rows) < (1 - _RIM) * first:
                 self.cuts += found.contradictions
@@ -254,9 +146,15 @@ class Solver:
             self.cuts += [it for it in found.contradictions if not set(it.between) <= set(rows)]
         if found is not None and (loose := _unconfirmed(found)):
             self.unconfirmed |= loose
-            rows = found.found.poses.keys() - loose
-            found = self._guessed(rows, {it: found.agreeing[it] for it in found.agreeing if rows >= {*it}})
+            found = self._without(found, loose)
         return found if found is not None and found.trusted else None
+
+    def _without(self, base: Solution, loose: Collection[int]) -> Solution | None:
+        """The reconstruction of the other panoramas of one by their pairs that agree with it."""
+        rows = base.found.poses.keys() - loose
+        if base.adjusted and (adjusted := self._adjusted(base, rows)):
+            return adjusted
+        return self._guessed(rows, {it: base.agreeing[it] for it in base.agreeing if rows >= {*it}})
 
     def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
         """The pairs of these edges with what matches along their motion."""
@@ -285,9 +183,10 @@ class Solver:
 
         Args: begun, pairs that are known to agree.
         """
-        new, best, turn, reached = self._begun(rows, begun), None, 0, False
+        new, best, turn = self._begun(rows, begun), None, 0
+        reached = False
         while new is not None:
-            refuted = turn > 0 and not new.closing and bool(new.refuted)
+            refuted = turn > 0 and bool(new.refuted)
             if new.settled and not refuted and not reached:
                 new, reached = self._reaching(new), True
             # The tree alone is not judged by all that its poses decide.
@@ -295,7 +194,8 @@ class Solver:
                 best = new
             if new.settled or refuted or turn == _ROUNDS:
                 break
-            new = self._mapped(new.evidence, new.skeleton, new.agreeing, self._mapper)
+            adjusted = self._adjusted(new, range(len(self._ids))) if new.adjusted or new.drifted else None
+            new = adjusted or self._mapped(new.evidence, new.skeleton, new.agreeing, self._mapper)
             turn += 1
         return best
 
@@ -305,6 +205,7 @@ class Solver:
         Vain guesses make room for the next ones. Of these attempts that with most poses is taken.
         """
         best, most = None, (0, 0)
+        self._drift = self._drift if begun else None
         for _ in range(_GUESSES):
             evidence, skeleton = self._evidence.among(rows), self._skeleton.among(rows)
             tree = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.tree}
@@ -317,6 +218,7 @@ class Solver:
                 break
             begun = new.without(new.vain) if begun else {}
             self._refute(new.vain)
+        self._drift = best.drift if best else None
         return best
 
     def _reaching(self, base: Solution) -> Solution:
@@ -349,9 +251,37 @@ class Solver:
         model = map_pairs(part, mapper, self._max_error, self._progress, known)
         if model is None:
             return None
-        found = posed(model, self._ids)
-        against = find_contradictions(evidence, skeleton, found, _CLOSE, self._geometries.motion)
-        return Solution(model, against, evidence, skeleton, found, kept, self._work.numbers, self._size)
+        return self._solution(model, evidence, skeleton, kept, base is not None and base.adjusted)
+
+    def _adjusted(self, base: Solution, rows: Collection[int]) -> Solution | None:
+        """The reconstruction of these panoramas by what agrees, from the poses once loops are closed.
+
+        None where many that the tree carries have no pose yet, poses stay, or another mapper is wanted.
+        """
+        poses = {row: pose for row, pose in base.closed.poses.items() if row in rows}
+        evidence, skeleton = base.evidence.among(rows), base.skeleton.among(rows)
+        carried = {row for edge in skeleton.tree for row in edge}
+        missing = len(carried - poses.keys())
+        if self._given or self._mapper == "global" or missing > SETTLED * len(carried):
+            return None
+        kept = {edge: own for edge, own in base.agreeing.items() if poses.keys() >= {*edge}}
+        part = self._work.with_pairs(kept, "pairs.db", range(len(self._ids)))
+        new = adjust_poses(part, base.model, poses, self._max_error)
+        return None if new is None else self._solution(new, evidence, skeleton, kept, adjusted=True)
+
+    def _solution(
+        self,
+        model: pycolmap.Reconstruction,
+        evidence: Evidence,
+        skeleton: Skeleton,
+        kept: Kept,
+        adjusted: bool,
+    ) -> Solution:
+        """A reconstruction by these pairs, with what contradicts it."""
+        found, motion = posed(model, self._ids), self._geometries.motion
+        against = find_contradictions(evidence, skeleton, found, CLOSE, motion)
+        rest = self._work.numbers, self._size, motion, adjusted, self._drift
+        return Solution(model, against, evidence, skeleton, found, kept, *rest)
 
 
 def _looking_alike(pairs: Sequence[Pair], known: Sequence[Pair], given: Collection[int]) -> set[Edge]:
@@ -384,17 +314,6 @@ def _unconfirmed(solution: Solution) -> set[int]:
     held = Counter[int]()
     for pair in solution.evidence.pairs:
         off = deviations(found, solution.evidence, pair)
-        if pair.between in skeleton.tree or agrees(solution.evidence, pair, off, _CLOSE):
+        if pair.between in skeleton.tree or agrees(solution.evidence, pair, off, CLOSE):
             held.update(pair.between)
     return {row for row in found.poses if held[row] < 2}.difference(*firm)
-
-
-def _fitting(evidence: Evidence, pair: Pair, off: NDArray[np.float64], bound: float) -> NDArray[np.int64]:
-    """The matches (M, 2) of a pair that fit, none where most do not, or where it cannot be judged."""
-    known = np.isfinite(off)
-    if not agrees(evidence, pair, off, bound):
-        return pair.matches[:0]
-    fit = known & (off <= bound)
-    if fit.sum() >= _PURE * known.sum():
-        fit |= ~known
-    return pair.matches[fit]

@@ -23,8 +23,8 @@ _ANY_LIGHT = 0.25  # of the points, those that look the same in another light
 
 
 @dataclass(frozen=True, eq=False)
-class Square:
-    """Panoramas on a way around a square, and what they share."""
+class Place:
+    """Panoramas on a way, and what they share."""
 
     centers: Array  # (K, 3)
     work: Workspace
@@ -39,7 +39,7 @@ def square(
     again: float = 0.0,
     dusk: int | None = None,
     points: float = 1.0,
-) -> Square:
+) -> Place:
     """Args: count, places on the way; points and ground, how many in all, and of the ground, which does not
     repeat, in parts of the usual number; order, (K,) which of these places panoramas have, in the order of
     their names; again, metres from a place to where a later panorama of it stands; dusk, the first of the
@@ -59,32 +59,48 @@ def square(
         pixels = project_to_fractions((where[seen] - center) @ rotation.T) * SIZE
         keypoints.append(pixels + random.normal(0, _NOISE, pixels.shape))
         rows.append(seen)
-    work = database_of(folder, keypoints)
-    ids = work.ids()
-    words = random.integers(0, 90, (len(where), 128)).astype(np.float64)
-    words = (512 * words / np.linalg.norm(words, axis=1, keepdims=True)).round().astype(np.uint8)
     look = np.where(copy_of >= 0, copy_of, len(where)).min(axis=0)  # of a point and of what looks like it
     same = np.random.default_rng(2).random(len(where))[look] < _ANY_LIGHT
+    pairs = {}
+    for a in range(len(centers)):
+        for b in range(a + 1, len(centers)):
+            for turn in range(4):
+                turned = Rotation.from_euler("z", 90 * turn, degrees=True).apply(centers[a])
+                if np.linalg.norm(turned - centers[b]) < (_ALIKE if turn else _NEAR):
+                    matches = _matches(rows[a], rows[b], copy_of[turn])
+                    pairs[a, b] = matches[(late[a] == late[b]) | same[rows[a][matches[:, 0]]]]
+                    break
+    changed = [late_ & ~same[seen] for late_, seen in zip(late, rows, strict=True)]
+    return write_place(folder, centers, keypoints, [look[seen] for seen in rows], pairs, changed, random)
+
+
+def write_place(
+    folder: Path,
+    centers: Array,
+    keypoints: list[Array],
+    looks: list[NDArray[np.int64]],
+    pairs: dict[tuple[int, int], NDArray[np.int64]],
+    changed: list[NDArray[np.bool_]],
+    random: np.random.Generator,
+) -> Place:
+    """Args: keypoints (N, 2) of each panorama in pixels; looks (N,) of each, equal numbers look the same;
+    pairs, their verified matches (M, 2); changed (N,), which keypoints are seen in another light.
+    """
+    work = database_of(folder, keypoints)
+    ids = work.ids()
+    words = random.integers(0, 90, (1 + max(int(it.max()) for it in looks), 128)).astype(np.float64)
+    words = (512 * words / np.linalg.norm(words, axis=1, keepdims=True)).round().astype(np.uint8)
     with pycolmap.Database.open(work.database) as database:
-        for number, seen, changed in zip(ids, rows, late, strict=True):
-            seen_words = np.where(
-                (same[seen] | ~changed)[:, None], words[look[seen]], 255 - words[look[seen]]
-            )
-            own = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, seen_words)
-            database.write_descriptors(number, own)
-        for a in range(len(centers)):
-            for b in range(a + 1, len(centers)):
-                for turn in range(4):
-                    turned = Rotation.from_euler("z", 90 * turn, degrees=True).apply(centers[a])
-                    if np.linalg.norm(turned - centers[b]) < (_ALIKE if turn else _NEAR):
-                        matches = _matches(rows[a], rows[b], copy_of[turn])
-                        matches = matches[(late[a] == late[b]) | same[rows[a][matches[:, 0]]]]
-                        geometry = pycolmap.TwoViewGeometry()
-                        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-                        geometry.inlier_matches = matches.astype(np.uint32)
-                        database.write_two_view_geometry(ids[a], ids[b], geometry)
-                        break
-    return Square(centers, work)
+        for number, look, other in zip(ids, looks, changed, strict=True):
+            own = np.where(other[:, None], 255 - words[look], words[look])
+            features = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, own)
+            database.write_descriptors(number, features)
+        for (a, b), matches in pairs.items():
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = matches.astype(np.uint32)
+            database.write_two_view_geometry(ids[a], ids[b], geometry)
+    return Place(centers, work)
 
 
 def _points(random: np.random.Generator, front: int, ground: int) -> tuple[Array, NDArray[np.int64]]:
@@ -109,9 +125,14 @@ def _way(random: np.random.Generator, count: int) -> tuple[Array, Array]:
     reach = _ROUND / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle))) ** 0.6
     centers = np.column_stack([reach * np.cos(angle), reach * np.sin(angle), np.full(count, 1.6)])
     centers += random.normal(0, 0.06, centers.shape)
-    upright = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-    turns = Rotation.from_euler("z", (angle + np.pi / 2 + random.normal(0, 0.05, count))[:, None])
-    return centers, upright @ turns.inv().as_matrix()
+    return centers, upright(angle + np.pi / 2 + random.normal(0, 0.05, count))
+
+
+def upright(heading: Array) -> Array:
+    """World-to-camera (K, 3, 3) of upright cameras, heading (K,) radians from x."""
+    level = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    rotations: Array = level @ Rotation.from_euler("z", heading[:, None]).inv().as_matrix()
+    return rotations
 
 
 def _matches(one: NDArray[np.int64], other: NDArray[np.int64], copy: NDArray[np.int64]) -> NDArray[np.int64]:

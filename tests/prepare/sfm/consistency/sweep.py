@@ -1,7 +1,7 @@
 """Walks around a square whose sides look alike: `python -m tests.prepare.sfm.consistency.sweep`.
 
 A rule of `consistency` that helps one walk may ruin another: a change of one is judged by how many walks are
-whole, in parts, refused and wrong.
+whole, in parts, refused and wrong. With `--streets` they are along all streets of a grid, with long loops.
 """
 
 import argparse
@@ -14,13 +14,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.sfm.consistency.solve import Solution, Solver
+from panolog.prepare.sfm.consistency.solution import Solution
+from panolog.prepare.sfm.consistency.solve import Solver
 from panolog.prepare.sfm.workspace import silence_colmap
 from panolog.scene.write import no_progress
 from tests.prepare.sfm.accuracy import drift
-from tests.prepare.sfm.consistency.simulated import SIZE, square
+from tests.prepare.sfm.consistency.simulated import SIZE, Place, square
+from tests.prepare.sfm.consistency.streets import Grid, town
 
 _RIGHT = 0.1  # metres rms, where the next side of the square is 12 off
+_RIGHT_IN_STREETS = 1.0  # metres rms, where the next street is 56 off
 _SHORTEST = 3  # panoramas of a walk between two jumps
 
 
@@ -53,13 +56,34 @@ class Walk:
     def outcome(self, folder: Path) -> str:
         """One of "whole", "parts", "refused" and "WRONG"."""
         place = square(folder, count=self.count, order=self.order, points=self.points, ground=self.ground)
-        with silence_colmap():
-            parts = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
-        if not parts:
-            return "refused"
-        if any(off(part, place.centers) > _RIGHT for part in parts):
-            return "WRONG"
-        return "whole" if len(parts[0].found.poses) == len(place.centers) else "parts"
+        return _outcome(place, _RIGHT)
+
+
+@dataclass(frozen=True)
+class Streets(Grid):
+    """A walk along all streets of a grid."""
+
+    def outcome(self, folder: Path) -> str:
+        """One of "whole", "parts", "refused" and "WRONG"."""
+        return _outcome(town(folder, self), _RIGHT_IN_STREETS)
+
+
+def _outcome(place: Place, right: float) -> str:
+    with silence_colmap():
+        parts = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    if not parts:
+        return "refused"
+    if any(off(part, place.centers) > right for part in parts):
+        return "WRONG"
+    return "whole" if len(parts[0].found.poses) == len(place.centers) else "parts"
+
+
+def streets() -> Iterator[Streets]:
+    """Of 76 and 168 panoramas, with and without copies."""
+    for seed in range(3):
+        for streets_each_way in (2, 3):
+            for copies in (0.0, 0.15):
+                yield Streets(streets_each_way, streets_each_way, copies, seed=seed)
 
 
 def walks() -> Iterator[Walk]:
@@ -83,8 +107,10 @@ def main() -> None:
     """Prints the outcome of each walk, and how many have each."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--every", type=int, default=1, help="of so many walks one")
-    outcomes = Counter[str]()
-    for walk in list(walks())[:: parser.parse_args().every]:
+    parser.add_argument("--streets", action="store_true")
+    options, outcomes = parser.parse_args(), Counter[str]()
+    chosen: list[Streets | Walk] = [*streets()] if options.streets else [*walks()]
+    for walk in chosen[:: options.every]:
         with tempfile.TemporaryDirectory() as folder:
             outcome = walk.outcome(Path(folder))
         outcomes[outcome] += 1

@@ -138,6 +138,7 @@ def test_trust() -> None:
     assert is_trusted([], split, range(3)) and not is_trusted(other, split, range(3))
     guess = replace(skeleton, guessed=frozenset({(1, 2)}))  # believed only without a contradiction
     assert is_trusted([], guess, range(3)) and not is_trusted(other, guess, range(3))
+    assert is_trusted(other, guess, range(200)) and not is_trusted(other, guess, range(199))
 
 
 def test_the_part_that_agrees_is_cut_where_the_tree_is_weakest() -> None:
