@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from panolog.prepare.sfm.consistency.agreement import agrees, deviations, posed
+from panolog.prepare.sfm.consistency.agreement import Posed, agrees, deviations, posed
 from panolog.prepare.sfm.consistency.contradictions import (
     Contradiction,
     Kept,
@@ -40,6 +40,7 @@ _ROUNDS = 8  # of mapping with the pairs that fit
 _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
 _GUESSES = 4  # times that the next pairs take the place of guesses, before loops are closed and after
 _LOOSE = 100.0  # relative error of the scale across a link: one side is a point for the other
+_STRAY = 6.0  # usual steps that a panorama is from those before and after it
 _RIM = 0.1  # share of the panoramas that may be left out without an order: all others agree
 
 
@@ -305,7 +306,7 @@ def _shrunk(solution: Solution) -> set[int]:
 
 
 def _unconfirmed(solution: Solution) -> set[int]:
-    """The panoramas with a pose that a single pair holds, unless the order of capture confirms it.
+    """The panoramas with a pose that one pair holds, or apart from an order, unless the order confirms it.
 
     A pair that looks alike gives a pose, too: only a second one shows that it is right.
     """
@@ -316,4 +317,19 @@ def _unconfirmed(solution: Solution) -> set[int]:
         off = deviations(found, solution.evidence, pair)
         if pair.between in skeleton.tree or agrees(solution.evidence, pair, off, CLOSE):
             held.update(pair.between)
-    return {row for row in found.poses if held[row] < 2}.difference(*firm)
+    alone = {row for row in found.poses if held[row] < 2}
+    return (alone | _strays(found) if skeleton.ordered else alone).difference(*firm)
+
+
+def _strays(found: Posed) -> set[int]:
+    """The panoramas that are far from the one before and the one after, which are near each other.
+
+    Of places that look alike, as crossings do, several may stand on one, and confirm each other there.
+    """
+    rows = sorted(found.poses)
+    centers = np.array([-found.poses[row][0].T @ found.poses[row][1] for row in rows])
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    past = np.linalg.norm(centers[2:] - centers[:-2], axis=1)
+    least = np.minimum(steps[:-1], steps[1:])
+    stray = (least > _STRAY * np.median(steps)) & (past < least / 2) if len(least) else []
+    return {rows[place + 1] for place in np.flatnonzero(stray)}
