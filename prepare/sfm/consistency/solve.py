@@ -184,8 +184,7 @@ class Solver:
 
         Args: begun, pairs that are known to agree.
         """
-        new, best, turn = self._begun(rows, begun), None, 0
-        reached = False
+        new, best, turn, reached = self._begun(rows, begun), None, 0, False
         while new is not None:
             refuted = turn > 0 and bool(new.refuted)
             if new.settled and not refuted and not reached:
@@ -306,7 +305,7 @@ def _shrunk(solution: Solution) -> set[int]:
 
 
 def _unconfirmed(solution: Solution) -> set[int]:
-    """The panoramas with a pose that one pair holds, or apart from an order, unless the order confirms it.
+    """The panoramas whose pose a single pair holds, or that stray from the order, unless that confirms it.
 
     A pair that looks alike gives a pose, too: only a second one shows that it is right.
     """
