@@ -18,6 +18,7 @@ _LARGEST = 256  # features of each panorama
 _AT_ONCE = 32  # panoramas that one is compared with
 _RATIO = 0.8  # of the distance to the second nearest, as COLMAP has it
 _SQUARE = 512.0  # length of COLMAP's descriptors
+_FEW = 300  # panoramas of which each is compared with each, in 15 s
 _CANDIDATES = 96  # panoramas that share most hashes, for each
 _HASHES, _BITS = 32, 16  # of each feature
 _WEIGHT = 16.0  # of a hash that half of the panoramas have: weights are whole, and sums the same everywhere
@@ -57,7 +58,7 @@ def _compared(words: Words) -> list[list[int]]:
     A hash counts for more, the fewer panoramas have it.
     """
     count = len(words)
-    if count <= _CANDIDATES + 1:
+    if count <= _FEW:
         return [list(range(row)) for row in range(count)]
     every = np.concatenate(words)
     signs = np.random.default_rng(0).choice(np.array([-1, 1], np.float32), (every.shape[1], _HASHES * _BITS))

@@ -61,6 +61,7 @@ def test_many_are_compared_with_those_that_share_hashes(
 
     matches_of = looks._matches
     monkeypatch.setattr(looks, "_matches", counted)
+    monkeypatch.setattr(looks, "_FEW", COUNT - 1)
     monkeypatch.setattr(looks, "_CANDIDATES", 6)
     found = look_alikes(work, 3, no_progress)
     assert TWIN in found and (REPEATED, 50) not in found
