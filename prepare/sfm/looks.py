@@ -3,7 +3,7 @@
 The largest features of a panorama are few and return most often (C. Wu, Towards Linear-Time Incremental
 Structure from Motion, 3DV 2013: preemptive matching). Of many panoramas, those are compared that share most
 hashes of these features (M. Charikar, Similarity Estimation Techniques from Rounding Algorithms, STOC 2002:
-signs of random projections): the time grows with their number, not with its square.
+signs of random projections): only products of few numbers are left for all pairs of panoramas.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Whether the matches of a pair agree with poses and points that were found without it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,10 @@ class Posed:
 
     poses: dict[int, tuple[Array, Array]]  # of rows with a pose: world-to-camera (3, 3) and (3,)
     points: dict[int, Array]  # of these rows (N, 3) the point of each feature, NaN without one
+
+    def centers(self, rows: Iterable[int]) -> Array:
+        """(K, 3) where the panoramas of these rows stand."""
+        return np.array([-turn.T @ shift for turn, shift in map(self.poses.__getitem__, rows)])
 
 
 def posed(model: pycolmap.Reconstruction, ids: Sequence[int]) -> Posed:
@@ -95,5 +99,5 @@ def motion_between(found: Posed, between: tuple[int, int]) -> Motion | None:
 
 def apart(found: Posed, between: tuple[int, int]) -> float:
     """How far two panoramas of a reconstruction are from each other, in its units."""
-    one, other = (-turn.T @ shift for turn, shift in (found.poses[row] for row in between))
+    one, other = found.centers(between)
     return float(np.linalg.norm(one - other))

@@ -44,10 +44,8 @@ _NEAR = 6.0  # usual steps between the ends of two loops that may say the same
 _SAME = 1.5, 7.5, 0.2  # usual steps, degrees, logarithm of the scale that they differ at most, together
 _LEVELS = (0.5, False), (1.0, False), (2.0, False), (2.0, True)  # of what a loop is expected to be open, and
 # whether none must confirm it: those below are closed before the others
-_USUAL = (
-    25,
-    10.0,
-)  # percent of the loops that show how much is drift, and how many times as open others may be
+_LEAST_OPEN = 25  # percent of the loops: they show how much a walk drifts
+_TIMES = 10.0  # as far as these, others may be open
 _FARTHER, _SHORT = 1.5, 5  # times the shortest way, and steps: loops below both are closed together
 _TURNS = 60  # of closing loops
 _FIXED = 1e6  # weight of a relation between panoramas whose poses stay
@@ -128,27 +126,28 @@ def closed(
     usual = max(1.0, float(np.median(list(held.values()) or [0.0])))
     rest = [measured(found, evidence, pair, motion(pair)) for edge, pair in pairs.items() if edge not in held]
     loops = relations_of(rest, place, usual)
+    unchanged = found, 1.0 if drift is None else drift
     if not held or not len(loops.ends):
-        return found, 1.0 if drift is None else drift
+        return unchanged
     held |= dict.fromkeys([edge for edge in fixed if found.poses.keys() >= set(edge)], _FIXED * usual)
     carried = relations_of([as_posed(found, edge, held[edge]) for edge in sorted(held)], place, usual)
     graph = _Graph(
         np.array([found.poses[row][0].T for row in rows]),
-        np.array([-found.poses[row][0].T @ found.poses[row][1] for row in rows]),
+        found.centers(rows),
         np.zeros(len(rows)),
         float(np.median(np.linalg.norm(carried.centers, axis=1))),
     )
     if graph.step == 0:
-        return found, 1.0 if drift is None else drift
+        return unchanged
     drift = _drift(graph, carried, loops) if drift is None else drift
     _close(graph, carried, loops, drift)
     return _moved(found, rows, graph), drift
 
 
 def _drift(graph: _Graph, carried: Relations, loops: Relations) -> float:
-    """How far loops may be open, by those that are least."""
+    """How far loops may be open, as those show that are least open."""
     far = _far(_ways(carried, loops.ends, len(graph.axes)), *graph.open(loops))
-    return min(1.0, _USUAL[1] * float(np.percentile(far, _USUAL[0])))
+    return min(1.0, _TIMES * float(np.percentile(far, _LEAST_OPEN)))
 
 
 def _close(graph: _Graph, carried: Relations, loops: Relations, drift: float) -> None:

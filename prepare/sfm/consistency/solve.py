@@ -326,7 +326,7 @@ def _strays(found: Posed) -> set[int]:
     Of places that look alike, as crossings do, several may stand on one, and confirm each other there.
     """
     rows = sorted(found.poses)
-    centers = np.array([-found.poses[row][0].T @ found.poses[row][1] for row in rows])
+    centers = found.centers(rows)
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     past = np.linalg.norm(centers[2:] - centers[:-2], axis=1)
     least = np.minimum(steps[:-1], steps[1:])

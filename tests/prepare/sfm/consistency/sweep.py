@@ -79,7 +79,7 @@ def _outcome(place: Place, right: float) -> str:
 
 
 def streets() -> Iterator[Streets]:
-    """Of 76 and 168 panoramas, with and without copies."""
+    """Walks of 76 and of 168 panoramas, with copies among the houses and without."""
     for seed in range(3):
         for streets_each_way in (2, 3):
             for copies in (0.0, 0.15):
