@@ -12,6 +12,7 @@ from panolog.prepare.sfm.consistency.motion import Motion
 
 Array = NDArray[np.float64]
 FEW = 10  # directions that can be compared: below them a pair is not judged
+_SHRUNK = 0.01  # of the usual distance of points: what one captures differs by less than 10 times
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +25,17 @@ class Posed:
     def centers(self, rows: Iterable[int]) -> Array:
         """(K, 3) where the panoramas of these rows stand."""
         return np.array([-turn.T @ shift for turn, shift in map(self.poses.__getitem__, rows)])
+
+    def shrunk(self) -> set[int]:
+        """The rows whose points are so near that all around them is one point for the others.
+
+        Nothing contradicts that: where a step seems to lead back, what follows fits if it is small enough.
+        """
+        rows = [row for row, points in self.points.items() if np.isfinite(points).any()]
+        away = [self.points[row] - center for row, center in zip(rows, self.centers(rows), strict=True)]
+        distances = np.array([np.nanmedian(np.linalg.norm(it, axis=1)) for it in away])
+        near = distances < _SHRUNK * np.median(distances) if rows else []
+        return {rows[place] for place in np.flatnonzero(near)}
 
 
 def posed(model: pycolmap.Reconstruction, ids: Sequence[int]) -> Posed:

@@ -13,9 +13,7 @@ from panolog.prepare.sfm.consistency.agreement import Posed, deviations, posed
 from panolog.prepare.sfm.consistency.skeleton import Skeleton
 from panolog.prepare.sfm.consistency.solution import Solution
 from panolog.prepare.sfm.consistency.solve import Solver, _strays
-from panolog.prepare.sfm.links import Link
 from panolog.prepare.sfm.mapping import adjust_poses, map_pairs
-from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.write import no_progress
 from tests.prepare.sfm.accuracy import drift, length
@@ -202,18 +200,43 @@ def test_a_panorama_that_what_agrees_does_not_reach_is_added_last(
 
 
 def test_what_has_shrunk_to_a_point_is_another_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Links that no points hold are known to be weak, but need not be wrong."""
-    weak = [Link((2, 3), (0, 1, 2), 0, np.inf), Link((1, 2), (0, 1), 3, 9.0)]
+    """Where a step seems to lead back, what follows fits if it is small enough, and nothing contradicts."""
+    place, behind, tiny = square(tmp_path, count=COUNT), 10, 1e-6
+    ids = place.work.ids()
 
-    def links(model: SparseModel, width: int) -> list[Link]:
-        loose = Link((9, 10), tuple(range(10, COUNT)), 3, 1e8)
-        return [weak[0], loose, weak[1]] if len(model.rows) == COUNT else weak
+    def shrinking(*arguments: Any) -> pycolmap.Reconstruction | None:
+        model = map_pairs(*arguments)
+        if model is None or model.num_reg_images() < COUNT:
+            return model
+        center = model.image(ids[behind]).projection_center()
+        for image in map(model.image, ids[behind:]):
+            turn = image.cam_from_world().rotation
+            shift = -turn.matrix() @ (center + tiny * (image.projection_center() - center))
+            model.frame(image.frame_id).set_cam_from_world(image.camera_id, pycolmap.Rigid3d(turn, shift))
+        for number in model.point3D_ids():
+            point = model.point3D(number)
+            sides = {ids.index(it.image_id) >= behind for it in point.track.elements}
+            if sides == {True}:
+                point.xyz = center + tiny * (point.xyz - center)
+            elif len(sides) == 2:
+                model.delete_point3D(number)
+        return model
 
-    monkeypatch.setattr("panolog.prepare.sfm.consistency.solution.links_of", links)
-    place = square(tmp_path, count=COUNT)
+    monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.map_pairs", shrinking)
     with silence_colmap():
         found = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
-    assert [sorted(part.found.poses) for part in found] == [[*range(10)], [*range(10, COUNT)]]
+    assert [sorted(part.found.poses) for part in found] == [[*range(behind)], [*range(behind, COUNT)]]
+    assert max(off(part, place.centers) for part in found) < 0.1
+
+
+@pytest.mark.parametrize("near", [0.5, 0.005])
+def test_panoramas_all_around_which_is_near_have_shrunk(near: float) -> None:
+    """A room and a square differ by less than a hundred times; a step that seems to lead back shrinks all."""
+    around = np.random.default_rng(3).normal(size=(50, 3))
+    points = {row: (near if row == 2 else 1.0) * around + [row, 0.0, 0.0] for row in range(5)}
+    points |= {3: np.concatenate([points[3], np.full((9, 3), np.nan)]), 4: np.full((9, 3), np.nan)}
+    poses = {row: (np.eye(3), np.array([-row, 0.0, 0.0])) for row in range(5)}
+    assert Posed(poses, points).shrunk() == (set() if near > 0.01 else {2})
 
 
 def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
