@@ -82,14 +82,18 @@ def judged(pair: Pair, off: Array) -> NDArray[np.bool_]:
 def agrees(evidence: Evidence, pair: Pair, off: Array, bound: float) -> bool | None:
     """Whether deviations (M,) of the matches of a pair, in degrees, are below a bound; None if few are known.
 
-    Most of them, or those all around: copies of houses may be more, but are not everywhere.
+    Most of them, or those all around: copies of houses may be more, but are not everywhere. Where most are
+    not, but these are few, neither is known.
     """
     known = judged(pair, off)
     if known.sum() < FEW:
         return None
     fit, rays = known & (off <= bound), evidence.rays[pair.between[0]][pair.matches[:, 0]]
-    most = 2 * fit.sum() >= known.sum()
-    return bool(most or (fit.sum() >= FEW and directions(rays[fit]) >= directions(rays[known & ~fit])))
+    if 2 * fit.sum() >= known.sum():
+        return True
+    if (known & ~fit).sum() < FEW:
+        return None
+    return bool(fit.sum() >= FEW and directions(rays[fit]) >= directions(rays[known & ~fit]))
 
 
 def has_moved(found: Posed, between: tuple[int, int], motion: Motion | None) -> bool:

@@ -37,6 +37,15 @@ def test_those_all_around_outweigh_more_on_one_side(fitting: slice, verdict: boo
     assert agrees(evidence, pair, off, 2.0) is None  # too few are known
 
 
+@pytest.mark.parametrize(("known", "verdict"), [(12, True), (13, None), (15, None), (16, False)])
+def test_a_few_that_do_not_fit_contradict_nothing(known: int, verdict: bool | None) -> None:
+    rays = _around(0, 40)
+    pair = Pair((0, 1), np.repeat(np.arange(40)[:, None], 2, axis=1))
+    off = np.where(np.arange(40) < known, 30.0, np.nan)
+    off[:6] = 0.1
+    assert agrees(Evidence((rays, rays), (pair,)), pair, off, 2.0) is verdict
+
+
 def test_what_is_far_away_says_nothing_of_where_a_pair_stands() -> None:
     random = np.random.default_rng(1)
     near, far = (random.normal(size=(150, 3)) * size for size in (5.0, 5e4))
