@@ -5,7 +5,7 @@ A variant whose iterations depend on what others have taken states these, so tha
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from benchmarks.paper.results import Result
@@ -57,6 +57,7 @@ class Variant:
     guess: float = 1.0  # the same in iterations of the command, before anything is measured
     curve: bool = False  # its states on the way are evaluated
     spread: bool = False  # it is repeated for every seed
+    usual: Mapping[str, Any] = field(default_factory=dict)  # settings over which those of a command win
 
     def length(self, settings: Settings, measured: Measured) -> int:
         """The iterations of Stage I and of each block."""
@@ -66,7 +67,7 @@ class Variant:
 
     def sets(self, settings: Settings, seed: int, length: int) -> list[str]:
         """All settings that are not defaults, as KEY=VALUE; the later win."""
-        base = {"width": settings.width, "blocks": settings.blocks, "device": settings.device}
+        base = {"width": settings.width, "blocks": settings.blocks, "device": settings.device, **self.usual}
         own = {"iterations": length, "seed": seed, **self.settings}
         saving = {"checkpoint.every": max(1, length // POINTS), "checkpoint.share": 1.0}
         return [
@@ -178,8 +179,8 @@ def groups() -> tuple[Group, ...]:
             "memory",
             "One budget of memory for every task",
             ("memory-1", *(f"memory-{count}" for count in _GRIDS if count > 1)),
-            note=f"No task may have more than {BUDGET:,} Gaussians, the sky not counted. `memory-1` is one"
-            " model that trains for as many iterations as Stage I and four blocks together.",
+            note=f"No task may have more than {BUDGET:,} Gaussians, or what the command sets, the sky not"
+            " counted. `memory-1` is one model, for as many iterations as Stage I and four blocks together.",
         ),
     )
 
@@ -257,7 +258,7 @@ def _blocks() -> list[Variant]:
 
 def _memory() -> list[Variant]:
     """Each task grows as far as its memory goes: one model has one budget, blocks have one each."""
-    full = {"recipe": "panolog", "densify.max_gaussians": BUDGET, "densify.growth": 10.0}
+    full, usual = {"recipe": "panolog", "densify.growth": 10.0}, {"densify.max_gaussians": BUDGET}
 
     def in_all(length: int, measured: Measured) -> int:
         return length * (1 + measured["memory-4"].blocks)
@@ -265,13 +266,11 @@ def _memory() -> list[Variant]:
     alone = full | {"refine": False}
     return [
         *(
-            Variant(
-                f"memory-{count}", f"{BUDGET:,} Gaussians in each of {count} blocks", full | {"blocks": grid}
-            )
+            Variant(f"memory-{count}", f"{count} blocks", full | {"blocks": grid}, usual=usual)
             for count, grid in _GRIDS.items()
             if count > 1
         ),
-        Variant("memory-1", f"{BUDGET:,} Gaussians", alone, in_all, ("memory-4",), guess=5.0),
+        Variant("memory-1", "one model", alone, in_all, ("memory-4",), guess=5.0, usual=usual),
     ]
 
 
