@@ -60,10 +60,12 @@ def _compared(words: Words) -> list[list[int]]:
     count = len(words)
     if count <= _FEW:
         return [list(range(row)) for row in range(count)]
-    every = np.concatenate(words)
-    signs = np.random.default_rng(0).choice(np.array([-1, 1], np.float32), (every.shape[1], _HASHES * _BITS))
-    above = (every - np.rint(every.mean(axis=0, dtype=np.float64)).astype(np.float32)) @ signs > 0
-    hashes = above.reshape(len(every), _HASHES, _BITS) @ (1 << np.arange(_BITS))
+    sums = [own.sum(axis=0, dtype=np.float64) for own in words]
+    middle = np.rint(np.sum(sums, axis=0) / sum(map(len, words))).astype(np.float32)
+    signs = np.random.default_rng(0).choice(np.array([-1, 1], np.float32), (len(middle), _HASHES * _BITS))
+    # those of one panorama at a time: all of 3,000 would take 4 GB
+    above = (((own - middle) @ signs > 0).reshape(len(own), _HASHES, _BITS) for own in words)
+    hashes = np.concatenate([it @ (1 << np.arange(_BITS)) for it in above])
     columns = (hashes + (np.arange(_HASHES) << _BITS)).ravel()
     rows = np.repeat(np.arange(count), [_HASHES * len(own) for own in words])
     own = csr_array((np.ones(len(rows), np.int32), (rows, columns)), shape=(count, _HASHES << _BITS))

@@ -16,6 +16,7 @@ _SOURCES = (_BLUE, "#309c9c", "#b400c0", "#849048", "#6c3cfc", "#786c60")  # the
 _NAMED = 12  # sources in the legend
 _POINTS = 60_000  # drawn at most
 _MARGINS = (0.15, 1.2)  # of the trajectory's extent that is shown around it, at least and at most
+_LABEL = (0.08, 0.02)  # of the plan's width and height: of labels that are nearer, the weaker link has one
 
 
 def write_sfm_plot(path: Path, found: Reconstruction, weak: float) -> None:
@@ -96,15 +97,20 @@ def _draw_links(axes: Axes, places: NDArray[np.float64], found: Reconstruction, 
     if inside:
         names = " and ".join(found.panoramas[row].name for row in inside[0].between)
         axes.set_title(f"{names} contradict each other", loc="right", color=_RED, fontsize=8)
-    for link in found.links:
-        if link.scale_error < weak:
-            break
+    weakest = [link for link in found.links if link.scale_error >= weak]
+    room = np.abs(np.subtract(*np.transpose([axes.get_xlim(), axes.get_ylim()]))) * _LABEL
+    labelled = list[NDArray[np.float64]]()
+    for link in weakest:
         ends = places[list(link.between)]
         axes.plot(ends[:, 0], ends[:, 1], color=_RED, lw=3, zorder=5, solid_capstyle="round")
-        text = f"weak link: scale ±{link.scale_error:.1%}" if np.isfinite(link.scale_error) else "weak link"
-        axes.annotate(
-            text, ends.mean(axis=0), xytext=(8, -12), textcoords="offset points", color=_RED, fontsize=8
-        )
+        middle = ends.mean(axis=0)
+        if all((np.abs(middle - other) > room).any() for other in labelled):
+            text = f"±{link.scale_error:.1%}" if np.isfinite(link.scale_error) else "±?"
+            axes.annotate(text, middle, xytext=(8, -12), textcoords="offset points", color=_RED, fontsize=8)
+            labelled.append(middle)
+    if weakest:
+        what = "Weak links, and by how much the scale may jump there"
+        axes.text(0.01, 0.01, what, transform=axes.transAxes, color=_RED, fontsize=8)
 
 
 def _draw_bars(axes: Axes, found: Reconstruction) -> None:
