@@ -17,6 +17,7 @@ Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
 _GROWTH = 1.2  # of what is adjusted as a whole: COLMAP's 1.1 takes a third longer and ends in the same poses
 _WIDER = 4.0, 1.0, 1.0  # times the bound of errors, one adjustment after the other
+_LOOSE = 0.25  # of the bound of errors: Cauchy's scale
 _LEAST = (
     12  # points that a pose is found by: the pairs are known to agree, and COLMAP's 30 break a thin chain
 )
@@ -41,14 +42,19 @@ def map_pairs(
 
 
 def adjust_poses(
-    work: Workspace, model: pycolmap.Reconstruction, poses: Mapping[int, Pose], max_error: float
+    work: Workspace,
+    model: pycolmap.Reconstruction,
+    poses: Mapping[int, Pose],
+    max_error: float,
+    *,
+    last: bool = False,
 ) -> pycolmap.Reconstruction | None:
     """A model adjusted to the verified pairs of a database; None if these give no points with its poses.
 
     Its poses may be off by what drifts between neighbours: points are found with a wider bound first.
     Args: model, of panoramas of the database; poses, of its rows, in place of those of the model: world to
     camera (3, 3) and (3,), others are left out; max_error, pixels that an observation may be away from its
-    point.
+    point; last, the poses are right but for drift: what fits badly counts for less.
     """
     model, ids = pycolmap.Reconstruction(model), work.ids()
     for number in set(model.reg_image_ids()) - {ids[row] for row in poses}:
@@ -60,7 +66,10 @@ def adjust_poses(
     adjustment = pycolmap.BundleAdjustmentOptions()
     adjustment.print_summary = adjustment.refine_focal_length = adjustment.refine_extra_params = False
     adjustment.ceres.solver_options.num_threads = 1
-    for wider in _WIDER:
+    if last:
+        adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        adjustment.ceres.loss_function_scale = _LOOSE * max_error
+    for wider in _WIDER[last:]:
         options = _options(wider * max_error)
         options.triangulation.create_max_angle_error *= wider
         options.triangulation.continue_max_angle_error *= wider

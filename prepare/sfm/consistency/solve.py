@@ -14,7 +14,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from panolog.prepare.sfm.consistency.agreement import Posed, agrees, deviations, posed
+from panolog.prepare.sfm.consistency.agreement import (
+    Posed,
+    agrees,
+    deviations,
+    motion_between,
+    posed,
+)
 from panolog.prepare.sfm.consistency.contradictions import (
     Contradiction,
     Kept,
@@ -90,7 +96,7 @@ class Solver:
             rows = todo.pop()
             part = self._part(rows, doubtful or self._skeleton.ordered) if len(rows) >= least else None
             if part is not None and len(part.found.poses) >= least:
-                found.append(part)
+                found.append(self._refined(part))
                 todo += self._sides(rows - part.found.poses.keys())
         return sorted(found, key=lambda part: -len(part.found.poses))
 
@@ -264,6 +270,20 @@ class Solver:
         part = self._work.with_pairs(kept, "pairs.db", range(len(self._ids)))
         new = adjust_poses(part, base.model, poses, self._max_error)
         return None if new is None else self._solution(new, evidence, skeleton, kept, adjusted=True)
+
+    def _refined(self, base: Solution) -> Solution:
+        """A reconstruction with all that matches along the motions between its poses: that drifts less."""
+        poses, kept = base.found.poses, dict(base.agreeing)
+        for edge in [edge for edge in kept if poses.keys() >= {*edge}]:
+            if (motion := motion_between(base.found, edge)) is not None:
+                both = np.concatenate([kept[edge], self._guide.along(edge, motion)])
+                kept[edge] = np.unique(both, axis=0)
+        part = self._work.with_pairs(kept, "pairs.db", range(len(self._ids)))
+        model = adjust_poses(part, base.model, poses, self._max_error, last=True)
+        if model is None:
+            return base
+        new = self._solution(model, base.evidence, base.skeleton, kept, base.adjusted)
+        return new if new.rank >= base.rank else base
 
     def _solution(
         self,

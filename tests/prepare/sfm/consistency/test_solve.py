@@ -1,6 +1,7 @@
 """A square with four equal sides: in order, in any order, and where the sides cannot be distinguished."""
 
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -237,6 +238,22 @@ def test_panoramas_all_around_which_is_near_have_shrunk(near: float) -> None:
     points |= {3: np.concatenate([points[3], np.full((9, 3), np.nan)]), 4: np.full((9, 3), np.nan)}
     poses = {row: (np.eye(3), np.array([-row, 0.0, 0.0])) for row in range(5)}
     assert Posed(poses, points).shrunk() == (set() if near > 0.01 else {2})
+
+
+def test_at_last_all_pairs_that_agree_are_matched_along_their_motions(tmp_path: Path) -> None:
+    """Before that only those of the tree are, and a thin chain drifts."""
+    place, few = square(tmp_path, count=COUNT), 60
+    ids, random = place.work.ids(), np.random.default_rng(5)
+    with pycolmap.Database.open(place.work.database) as database:
+        for one, other in combinations(ids, 2):
+            geometry = database.read_two_view_geometry(one, other)
+            geometry.inlier_matches = random.permutation(geometry.inlier_matches)[:few]
+            database.delete_two_view_geometry(one, other)
+            database.write_two_view_geometry(one, other, geometry)
+    found = _solve(place)
+    assert found.trusted and _error(place, found) < 0.01
+    others = [len(matches) for edge, matches in found.kept.items() if edge not in found.skeleton.tree]
+    assert others and np.median(others) > 1.5 * few
 
 
 def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
