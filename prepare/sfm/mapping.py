@@ -16,6 +16,10 @@ Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
 _GROWTH = 1.2  # of what is adjusted as a whole: COLMAP's 1.1 takes a third longer and ends in the same poses
+_DIRECT = (
+    1000  # panoramas that COLMAP's mapper adjusts by a direct solver: of more it takes hours for a chain
+)
+_NEVER = 10**9
 _WIDER = 4.0, 1.0, 1.0  # times the bound of errors, one adjustment after the other
 _LOOSE = 0.25  # of the bound of errors: Cauchy's scale
 _LEAST = (
@@ -66,6 +70,7 @@ def adjust_poses(
     adjustment = pycolmap.BundleAdjustmentOptions()
     adjustment.print_summary = adjustment.refine_focal_length = adjustment.refine_extra_params = False
     adjustment.ceres.solver_options.num_threads = 1
+    adjustment.ceres.max_num_images_direct_sparse_cpu_solver = len(poses)
     if last:
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = _LOOSE * max_error
@@ -115,7 +120,11 @@ def _incremental(
     options.mapper.init_max_forward_motion = 1.0
     options.mapper.init_min_tri_angle = _FIRST_ANGLE
     options.mapper.abs_pose_min_num_inliers = _LEAST
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
+    large = len(work.numbers) > _DIRECT  # then as a whole at the end alone, and not until nothing changes
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = _NEVER if large else _GROWTH
+    if large:
+        options.ba_global_frames_freq = options.ba_global_points_freq = _NEVER
+        options.ba_global_max_refinements, options.ba_global_max_num_iterations = 1, 10
     models, done = pycolmap.ReconstructionManager(), 2
     if known is not None:
         known.write(work.models)
