@@ -16,9 +16,7 @@ Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
 _GROWTH = 1.2  # of what is adjusted as a whole: COLMAP's 1.1 takes a third longer and ends in the same poses
-_DIRECT = (
-    1000  # panoramas that COLMAP's mapper adjusts by a direct solver: of more it takes hours for a chain
-)
+_DIRECT = 1000  # panoramas up to which COLMAP's mapper has a direct solver: the other is slow on a chain
 _NEVER = 10**9
 _WIDER = 4.0, 1.0, 1.0  # times the bound of errors, one adjustment after the other
 _LOOSE = 0.25  # of the bound of errors: Cauchy's scale
@@ -70,7 +68,7 @@ def adjust_poses(
     adjustment = pycolmap.BundleAdjustmentOptions()
     adjustment.print_summary = adjustment.refine_focal_length = adjustment.refine_extra_params = False
     adjustment.ceres.solver_options.num_threads = 1
-    adjustment.ceres.max_num_images_direct_sparse_cpu_solver = len(poses)
+    adjustment.ceres.max_num_images_direct_sparse_cpu_solver = _NEVER
     if last:
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = _LOOSE * max_error

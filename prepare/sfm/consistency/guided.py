@@ -17,7 +17,7 @@ from panolog.prepare.sfm.workspace import Workspace
 Array = NDArray[np.float64]
 _RATIO, _FARTHEST = 0.8, 0.7  # of the second nearest; radians between descriptors: COLMAP's own bounds
 _SQUARE = 512.0**2  # of the length of COLMAP's descriptors
-_AT_ONCE = 1024  # features of the first panorama: what bounds the memory
+_AT_ONCE = 1024  # features of the first panorama, or pairs of features: what bounds the memory
 
 
 class Guide:
@@ -46,27 +46,50 @@ def match_along(
     """
     if min(map(len, words)) == 0:
         return np.empty((0, 2), np.int64)
-    sides = [side.astype(np.float32) for side in _arcs(rays[0] @ motion.rotation.T, motion.direction)]
-    bound, other = np.float32(np.sin(error)), np.ascontiguousarray(rays[1].T, np.float32)
-    best = np.zeros((2, len(words[0])), np.float32)  # of each feature, and the second
-    there = np.zeros(len(words[0]), np.int64)
-    back, backed = np.zeros(len(words[1]), np.float32), np.full(len(words[1]), -1)
-    for start in range(0, len(words[0]), _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
-        close = words[0][part] @ words[1].T / np.float32(_SQUARE)
-        across, beyond, behind = (side[part] @ other for side in sides)
-        close[(np.abs(across) > bound) | (beyond < -bound) | (behind < -bound)] = 0
-        rows = np.arange(len(close))
-        there[part] = close.argmax(axis=1)
-        best[0, part] = close[rows, there[part]]
-        nearest = close.max(axis=0)
-        better = nearest > back
-        back[better], backed[better] = nearest[better], start + close.argmax(axis=0)[better]
-        close[rows, there[part]] = 0
-        best[1, part] = close.max(axis=1)
-    first, second = np.arccos(np.minimum(best, 1))
-    clear = (first < _FARTHEST) & (first < _RATIO * second) & (backed[there] == np.arange(len(there)))
-    return np.column_stack([np.flatnonzero(clear), there[clear]])
+    near = _on_arcs(rays[0] @ motion.rotation.T, motion.direction, rays[1], np.sin(error))
+    close = np.concatenate(
+        [
+            # sums of whole numbers below 2^24: exact in any order
+            np.einsum("ij,ij->i", words[0][part[:, 0]], words[1][part[:, 1]])
+            for part in np.split(near, range(_AT_ONCE, len(near), _AT_ONCE))
+        ]
+    )
+    (first, second), there = _nearest(near, close, len(words[0]))
+    _, back = _nearest(near[:, ::-1], close, len(words[1]))
+    first, second = (np.arccos(np.minimum(side / _SQUARE, 1)) for side in (first, second))
+    clear = (first < _FARTHEST) & (first < _RATIO * second)
+    rows = np.flatnonzero(clear)
+    rows = rows[back[there[rows]] == rows]
+    return np.column_stack([rows, there[rows]])
+
+
+def _on_arcs(far: Array, epipole: Array, rays: Array, bound: float) -> NDArray[np.int64]:
+    """(P, 2) rows of the arcs from directions `far` (N, 3) to `epipole`, and of the rays (M, 3) on them."""
+    plane, after, before = (side.astype(np.float32) for side in _arcs(far, epipole))
+    rays, found = rays.astype(np.float32), [np.empty((0, 2), np.int64)]
+    for start in range(0, len(far), _AT_ONCE):
+        rows, there = np.nonzero(np.abs(plane[start : start + _AT_ONCE] @ rays.T) <= bound)
+        rows += start
+        least = [np.einsum("ij,ij->i", side[rows], rays[there]) >= -bound for side in (after, before)]
+        found.append(np.column_stack([rows, there])[np.logical_and(*least)])
+    return np.concatenate(found)
+
+
+def _nearest(
+    near: NDArray[np.int64], close: NDArray[np.float32], count: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """How close (2, N) the two closest of `count` features are, 0 without, and which (N,) is closest, or -1.
+
+    Args: near (P, 2), pairs of features, by the rows of those and of their counterparts; close (P,).
+    """
+    order = np.lexsort((near[:, 1], -close, near[:, 0]))
+    rows, there = near[order].T
+    best, which = np.zeros((2, count), np.float32), np.full(count, -1)
+    begin = np.flatnonzero(np.diff(rows, prepend=-1))
+    best[0, rows[begin]], which[rows[begin]] = close[order][begin], there[begin]
+    again = begin[np.diff(begin, append=len(rows)) > 1] + 1
+    best[1, rows[again]] = close[order][again]
+    return best, which
 
 
 def _arcs(far: Array, epipole: Array) -> tuple[Array, Array, Array]:
