@@ -14,9 +14,9 @@ from panolog.scene.write import StageProgress
 Mapper = Literal["incremental", "global"]
 Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 
+DIRECT = 1000  # panoramas up to which COLMAP's mapper has a direct solver: the other is slow on a chain
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
 _GROWTH = 1.2  # of what is adjusted as a whole: COLMAP's 1.1 takes a third longer and ends in the same poses
-_DIRECT = 1000  # panoramas up to which COLMAP's mapper has a direct solver: the other is slow on a chain
 _NEVER = 10**9
 _WIDER = 4.0, 1.0, 1.0  # times the bound of errors, one adjustment after the other
 _LOOSE = 0.25  # of the bound of errors: Cauchy's scale
@@ -118,7 +118,7 @@ def _incremental(
     options.mapper.init_max_forward_motion = 1.0
     options.mapper.init_min_tri_angle = _FIRST_ANGLE
     options.mapper.abs_pose_min_num_inliers = _LEAST
-    large = len(work.numbers) > _DIRECT  # then as a whole at the end alone, and not until nothing changes
+    large = len(work.numbers) > DIRECT  # then as a whole at the end alone, and not until nothing changes
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _NEVER if large else _GROWTH
     if large:
         options.ba_global_frames_freq = options.ba_global_points_freq = _NEVER

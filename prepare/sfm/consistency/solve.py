@@ -38,7 +38,7 @@ from panolog.prepare.sfm.consistency.skeleton import (
     find_skeleton,
 )
 from panolog.prepare.sfm.consistency.solution import CLOSE, SETTLED, Solution
-from panolog.prepare.sfm.mapping import Mapper, adjust_poses, map_pairs
+from panolog.prepare.sfm.mapping import DIRECT, Mapper, adjust_poses, map_pairs
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
 
@@ -196,7 +196,8 @@ class Solver:
                 best = new
             if new.settled or refuted or turn == _ROUNDS:
                 break
-            adjusted = self._adjusted(new, range(len(self._ids))) if new.adjusted or new.drifted else None
+            drifts = new.adjusted or new.drifted or len(self._ids) > DIRECT
+            adjusted = self._adjusted(new, range(len(self._ids))) if drifts else None
             new = adjusted or self._mapped(new.evidence, new.skeleton, new.agreeing, self._mapper)
             turn += 1
         return best
