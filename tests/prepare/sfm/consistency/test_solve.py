@@ -256,6 +256,25 @@ def test_at_last_all_pairs_that_agree_are_matched_along_their_motions(tmp_path: 
     assert others and np.median(others) > 1.5 * few
 
 
+def test_more_than_the_mapper_adjusts_are_adjusted_in_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it maps of them drifts, and a second time it would drift again."""
+    mapped = list[bool]()
+
+    def counted(*arguments: Any) -> pycolmap.Reconstruction | None:
+        mapped.append(True)
+        return map_pairs(*arguments)
+
+    for module in ("mapping", "consistency.solve"):
+        monkeypatch.setattr(f"panolog.prepare.sfm.{module}.DIRECT", COUNT - 1)
+    monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.map_pairs", counted)
+    place = square(tmp_path, count=COUNT)
+    found = _solve(place)
+    assert found.trusted and _error(place, found) < 0.01
+    assert found.adjusted and len(mapped) == 1
+
+
 def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
     place = square(tmp_path, count=COUNT, ground=0.0, order=np.random.default_rng(4).permutation(COUNT))
     with silence_colmap():
