@@ -12,7 +12,7 @@ from panolog.prepare.sfm.consistency.motion import Motion
 
 Array = NDArray[np.float64]
 FEW = 10  # directions that can be compared: below them a pair is not judged
-_SHRUNK = 0.01  # of the usual distance of points: what one captures differs by less than 10 times
+_SHRUNK = 0.001  # of the usual distance of points: a flight and a room differ by a hundred times
 
 
 @dataclass(frozen=True, eq=False)

@@ -230,14 +230,14 @@ def test_what_has_shrunk_to_a_point_is_another_part(tmp_path: Path, monkeypatch:
     assert max(off(part, place.centers) for part in found) < 0.1
 
 
-@pytest.mark.parametrize("near", [0.5, 0.005])
+@pytest.mark.parametrize("near", [0.005, 0.0005])
 def test_panoramas_all_around_which_is_near_have_shrunk(near: float) -> None:
-    """A room and a square differ by less than a hundred times; a step that seems to lead back shrinks all."""
+    """A flight and a room differ by a hundred times; a step that seems to lead back shrinks all."""
     around = np.random.default_rng(3).normal(size=(50, 3))
     points = {row: (near if row == 2 else 1.0) * around + [row, 0.0, 0.0] for row in range(5)}
     points |= {3: np.concatenate([points[3], np.full((9, 3), np.nan)]), 4: np.full((9, 3), np.nan)}
     poses = {row: (np.eye(3), np.array([-row, 0.0, 0.0])) for row in range(5)}
-    assert Posed(poses, points).shrunk() == (set() if near > 0.01 else {2})
+    assert Posed(poses, points).shrunk() == (set() if near > 0.001 else {2})
 
 
 def test_at_last_all_pairs_that_agree_are_matched_along_their_motions(tmp_path: Path) -> None:
