@@ -284,7 +284,10 @@ class Solver:
         if model is None:
             return base
         new = self._solution(model, base.evidence, base.skeleton, kept, base.adjusted)
-        return new if new.rank >= base.rank else base
+        # More points show more look-alikes, but no more of whether poses are right: what agreed still must.
+        fits = not any(it.between in base.agreeing for it in new.contradictions)
+        same = new.found.poses.keys() == poses.keys()
+        return replace(new, contradictions=base.contradictions) if fits and same else base
 
     def _solution(
         self,
