@@ -196,8 +196,7 @@ class Solver:
                 best = new
             if new.settled or refuted or turn == _ROUNDS:
                 break
-            drifts = new.adjusted or new.drifted or len(self._ids) > DIRECT
-            adjusted = self._adjusted(new, range(len(self._ids))) if drifts else None
+            adjusted = self._adjusted(new, range(len(self._ids))) if new.adjusted or new.drifted else None
             new = adjusted or self._mapped(new.evidence, new.skeleton, new.agreeing, self._mapper)
             turn += 1
         return best
@@ -304,7 +303,8 @@ class Solver:
                 model.deregister_frame(model.image(self._ids[row]).frame_id)
             found = posed(model, self._ids)
         against = find_contradictions(evidence, skeleton, found, CLOSE, motion)
-        rest = self._work.numbers, self._size, motion, adjusted, self._drift
+        rough = not adjusted and not self._given and self._mapper == "incremental" and len(self._ids) > DIRECT
+        rest = self._work.numbers, self._size, motion, adjusted, rough, self._drift
         return Solution(model, against, evidence, skeleton, found, kept, *rest)
 
 
