@@ -274,11 +274,13 @@ class Solver:
     def _refined(self, base: Solution) -> Solution:
         """A reconstruction with all that matches along the motions between its poses: that drifts less."""
         poses, kept = base.found.poses, dict(base.agreeing)
-        for edge in [edge for edge in kept if poses.keys() >= {*edge}]:
-            if (motion := motion_between(base.found, edge)) is not None:
-                both = np.concatenate([kept[edge], self._guide.along(edge, motion)])
-                kept[edge] = np.unique(both, axis=0)
+        for done, edge in enumerate(base.agreeing):
+            self._progress("poses", done, len(kept))
+            motion = motion_between(base.found, edge) if poses.keys() >= {*edge} else None
+            if motion is not None:
+                kept[edge] = np.unique(np.concatenate([kept[edge], self._guide.along(edge, motion)]), axis=0)
         part = self._work.with_pairs(kept, "pairs.db", range(len(self._ids)))
+        self._progress("poses", len(kept), len(kept))
         model = adjust_poses(part, base.model, poses, self._max_error, last=True)
         if model is None:
             return base
