@@ -45,6 +45,7 @@ from panolog.scene.write import StageProgress
 _ROUNDS = 8  # of mapping with the pairs that fit
 _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
 _GUESSES = 4  # times that the next pairs take the place of guesses, before loops are closed and after
+_LOOSE = 100.0  # relative error of the scale across a link: either side may be a point for the other
 _STRAY = 6.0  # usual steps that a panorama is from those before and after it
 _RIM = 0.1  # share of the panoramas that may be left out without an order: all others agree
 
@@ -87,7 +88,8 @@ class Solver:
     def parts(self, least: int, doubtful: bool = False) -> list[Solution]:
         """Reconstructions of different panoramas, each without a contradiction, the largest first.
 
-        What contradicts itself is cut where it is weakest, and each side is reconstructed again.
+        What contradicts itself is cut where it is weakest, what nothing holds the scale of is cut off, and
+        each side is reconstructed again.
         Args: least, panoramas of a part; doubtful, also without an order where the cut does not only leave
             out a few: nothing says then which of the pairs within a side that agree are wrong together.
         """
@@ -95,7 +97,9 @@ class Solver:
         while todo:
             rows = todo.pop()
             part = self._part(rows, doubtful or self._skeleton.ordered) if len(rows) >= least else None
-            if part is not None and len(part.found.poses) >= least:
+            if part is not None and (loose := _loose(part)):
+                todo += [rows - loose, loose]
+            elif part is not None and len(part.found.poses) >= least:
                 found.append(self._refined(part))
                 todo += self._sides(rows - part.found.poses.keys())
         return sorted(found, key=lambda part: -len(part.found.poses))
@@ -300,7 +304,8 @@ class Solver:
     ) -> Solution:
         """A reconstruction by these pairs, with what contradicts it."""
         found, motion = posed(model, self._ids), self._geometries.motion
-        if shrunk := found.shrunk() - self._given:
+        # Without an order it shows that the tree is wrong elsewhere, too, and has to contradict.
+        if skeleton.ordered and (shrunk := found.shrunk() - self._given):
             for row in shrunk:
                 model.deregister_frame(model.image(self._ids[row]).frame_id)
             found = posed(model, self._ids)
@@ -319,6 +324,15 @@ def _looking_alike(pairs: Sequence[Pair], known: Sequence[Pair], given: Collecti
     best = best_coverage(known)
     least = _AS_NEIGHBOURS * float(np.median(list(best.values()))) if best else 0.0
     return {it.between for it in pairs if it.coverage < least and not set(it.between).isdisjoint(given)}
+
+
+def _loose(solution: Solution) -> set[int]:
+    """The panoramas on the smaller side of a link that holds no scale, though points hold it; none without.
+
+    No pair contradicts that: where a step seems to lead back, what follows fits in any size.
+    """
+    loose = next((it.smaller for it in solution.links if _LOOSE <= it.scale_error < np.inf), ())
+    return {solution.sparse.rows[place] for place in loose}
 
 
 def _unconfirmed(solution: Solution) -> set[int]:

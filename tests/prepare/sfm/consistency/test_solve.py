@@ -14,7 +14,9 @@ from panolog.prepare.sfm.consistency.agreement import Posed, deviations, posed
 from panolog.prepare.sfm.consistency.skeleton import Skeleton
 from panolog.prepare.sfm.consistency.solution import Solution
 from panolog.prepare.sfm.consistency.solve import Solver, _strays
+from panolog.prepare.sfm.links import Link
 from panolog.prepare.sfm.mapping import adjust_poses, map_pairs
+from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.write import no_progress
 from tests.prepare.sfm.accuracy import drift, length
@@ -228,6 +230,23 @@ def test_what_has_shrunk_to_a_point_is_another_part(tmp_path: Path, monkeypatch:
         found = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
     assert [sorted(part.found.poses) for part in found] == [[*range(behind)], [*range(behind, COUNT)]]
     assert max(off(part, place.centers) for part in found) < 0.1
+
+
+def test_what_nothing_holds_the_scale_of_is_another_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Links that no points hold are known to be weak, but need not be wrong."""
+    weak = [Link((2, 3), (0, 1, 2), 0, np.inf), Link((1, 2), (0, 1), 3, 9.0)]
+
+    def links(model: SparseModel, width: int) -> list[Link]:
+        loose = Link((9, 10), tuple(range(10, COUNT)), 3, 1e8)
+        return [weak[0], loose, weak[1]] if len(model.rows) == COUNT else weak
+
+    monkeypatch.setattr("panolog.prepare.sfm.consistency.solution.links_of", links)
+    place = square(tmp_path, count=COUNT)
+    with silence_colmap():
+        found = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    assert [sorted(part.found.poses) for part in found] == [[*range(10)], [*range(10, COUNT)]]
 
 
 @pytest.mark.parametrize("near", [0.005, 0.0005])
