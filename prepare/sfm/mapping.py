@@ -53,10 +53,11 @@ def adjust_poses(
 ) -> pycolmap.Reconstruction | None:
     """A model adjusted to the verified pairs of a database; None if these give no points with its poses.
 
-    Its poses may be off by what drifts between neighbours: points are found with a wider bound first.
+    Its poses may be off by what drifts between neighbours: points are found with a wider bound first, but
+    not the last time.
     Args: model, of panoramas of the database; poses, of its rows, in place of those of the model: world to
     camera (3, 3) and (3,), others are left out; max_error, pixels that an observation may be away from its
-    point; last, the poses are right but for drift: what fits badly counts for less.
+    point; last, loops are closed and poses right: what fits badly counts for less.
     """
     model, ids = pycolmap.Reconstruction(model), work.ids()
     for number in set(model.reg_image_ids()) - {ids[row] for row in poses}:

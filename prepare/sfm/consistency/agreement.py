@@ -89,11 +89,12 @@ def agrees(evidence: Evidence, pair: Pair, off: Array, bound: float) -> bool | N
     if known.sum() < FEW:
         return None
     fit, rays = known & (off <= bound), evidence.rays[pair.between[0]][pair.matches[:, 0]]
-    if 2 * fit.sum() >= known.sum():
+    rest = known & ~fit
+    if fit.sum() >= rest.sum():
         return True
-    if (known & ~fit).sum() < FEW:
+    if rest.sum() < FEW:
         return None
-    return bool(fit.sum() >= FEW and directions(rays[fit]) >= directions(rays[known & ~fit]))
+    return bool(fit.sum() >= FEW and directions(rays[fit]) >= directions(rays[rest]))
 
 
 def has_moved(found: Posed, between: tuple[int, int], motion: Motion | None) -> bool:

@@ -14,13 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from panolog.prepare.sfm.consistency.agreement import (
-    Posed,
-    agrees,
-    deviations,
-    motion_between,
-    posed,
-)
+from panolog.prepare.sfm.consistency.agreement import Posed, agrees, deviations, motion_between, posed
 from panolog.prepare.sfm.consistency.contradictions import (
     Contradiction,
     Kept,
