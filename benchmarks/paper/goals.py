@@ -29,7 +29,7 @@ class Goal:
 
 def goals(results: Results, kinds: Mapping[str, str]) -> list[Goal]:
     """Those for which there are results. Args: kinds, of KINDS by scene, where it is not a street."""
-    by_scene = [*_blocks(results, kinds), *_memory(results), *_g2ps(results), *_haze(results)]
+    by_scene = [*_blocks(results, kinds), *_memory(results), *_g2ps(results)]
     return [*_recipes(results), *_sooner(results), *_lasting(results), *by_scene]
 
 
@@ -192,15 +192,3 @@ def _g2ps(results: Results) -> Iterator[Goal]:
                     f"{gain.signed} dB, {overlap} blocks per camera",
                     gain.mean > (gain.deviation or 0.0),
                 )
-
-
-def _haze(results: Results) -> Iterator[Goal]:
-    for scene in results.scenes:
-        run = results.first(scene, "panolog")
-        if run is not None and run.haze is not None:
-            yield Goal(
-                f"{scene}: share of Gaussians with opacity under 0.02",
-                "at most 1 %",
-                f"{100 * run.haze:.2f} %",
-                run.haze <= 0.01,
-            )

@@ -1,4 +1,4 @@
-"""The quality of a model on the held-out panoramas of its scene, and what else a PLY says."""
+"""The quality of a model on the held-out panoramas of its scene."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,7 +6,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from panolog.orchestrator.engine.driver.job import Job
@@ -16,12 +15,11 @@ from panolog.orchestrator.runs.info import read_info
 from panolog.orchestrator.runs.units import means
 from panolog.renderer.process import choose_device
 from panolog.renderer.render import render_panorama
-from panolog.scene.gaussians import Gaussians, logit
+from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import View, load_view
 from panolog.scene.model import Scene
 from panolog.workers.metrics import measure
 
-HAZE = 0.02  # opacity under which a Gaussian shows little more than a veil
 Picture = NDArray[np.uint8]  # (H, W, 3) RGB
 
 
@@ -69,9 +67,3 @@ class Gallery:
             image = self.render(model, row)
             found.append(measure(image, view.image, view.mask, crop_bottom=self.crop_bottom))
         return means(found)
-
-
-def haze(model: Gaussians) -> float | None:
-    """The share of the scene Gaussians whose opacity is under HAZE; None where there are none."""
-    opacities = model.opacities[model.scene]
-    return float((opacities < logit(HAZE)).to(torch.float64).mean()) if len(opacities) else None

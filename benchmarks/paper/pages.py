@@ -96,10 +96,12 @@ def studies_of(path: Path) -> list[Study]:
 def check_settings(studies: Sequence[Study]) -> None:
     """Raises InputError if a result is of other settings than its variant has now."""
     for study in studies:
+        settings = {Path(scene).name: study.settings.of(Path(scene)) for scene in study.scenes}
         for result in study.results.all:
             if result.failed:
                 continue
-            now = variants()[result.variant].config(study.settings, result.seed, result.iterations)
+            own = settings[result.scene], result.seed, result.iterations
+            now = variants()[result.variant].config(*own)
             if changes := other_settings(result.settings, now):
                 where = f"{result.variant} of {result.scene} in {study.name}"
                 raise InputError(f"{where} has {changes}: measure it again, or remove its results")

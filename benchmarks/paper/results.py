@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -36,7 +36,6 @@ class Result:
     metrics: dict[str, float | None] = field(default_factory=dict)  # those of METRICS
     gaussians: int = 0  # sky included
     bytes: int = 0  # of the PLY
-    haze: float | None = None  # share of the scene Gaussians whose opacity is under 0.02
     seconds: dict[str, float] = field(default_factory=dict)
     longest: float = 0.0  # seconds of the block that trained longest
     threads: int = 0  # of each task on a CPU: tasks run one at a time
@@ -88,12 +87,13 @@ def save(path: Path, result: Result) -> None:
 
 
 def from_json(stored: dict[str, Any]) -> Result:
-    """The inverse of `dataclasses.asdict`."""
+    """The inverse of `dataclasses.asdict`, without what results of earlier versions had besides."""
     curve = tuple(Point(**point) for point in stored["curve"])
     lists: dict[str, Any] = {
         key: tuple(stored[key]) for key in ("notes", "densified", "resets") if key in stored
     }
-    return Result(**{**stored, **lists, "curve": curve})
+    own = {name: value for name, value in stored.items() if name in Result.__dataclass_fields__}
+    return Result(**{**own, **lists, "curve": curve})
 
 
 def load(path: Path) -> Result | None:
@@ -127,6 +127,23 @@ def spread(values: Iterable[float | None]) -> Spread | None:
     return Spread(fmean(found), stdev(found) if len(found) > 1 else None)
 
 
+def _mean(scene: str, found: Sequence[Result]) -> Result:
+    """The means of what a variant has come to on several scenes, as of one scene."""
+    means = {name: spread(result.metric(name) for result in found) for name in METRICS}
+    stages = {stage for result in found for stage in result.seconds}
+    return replace(
+        found[0],
+        scene=scene,
+        metrics={name: None if mean is None else mean.mean for name, mean in means.items()},
+        gaussians=round(fmean(result.gaussians for result in found)),
+        bytes=round(fmean(result.bytes for result in found)),
+        seconds={stage: fmean(result.seconds.get(stage, 0.0) for result in found) for stage in stages},
+        longest=fmean(result.longest for result in found),
+        memory=max((result.memory for result in found if result.memory), default=None),
+        notes=(f"mean over {len(found)} scenes",),
+    )
+
+
 @dataclass(frozen=True)
 class Results:
     """All results of a command, of which tables, goals and pictures are functions."""
@@ -145,6 +162,13 @@ class Results:
     def first(self, scene: str, variant: str) -> Result | None:
         """That of the first seed."""
         return next(iter(self.of(scene, variant)), None)
+
+    def mean(self, name: str, scenes: Sequence[str]) -> "Results":
+        """What all of these scenes have, as of one scene with this name: means over the scenes."""
+        made = dict[tuple[str, int], list[Result]]()
+        for result in (it for it in self.all if it.scene in scenes and not it.failed):
+            made.setdefault((result.variant, result.seed), []).append(result)
+        return Results([_mean(name, found) for found in made.values() if len(found) == len(scenes)])
 
     @property
     def codes(self) -> dict[str, str]:

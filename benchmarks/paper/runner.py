@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks import runs
 from benchmarks.paper import results, snapshots
 from benchmarks.paper.code import Code, present
-from benchmarks.paper.measure import Gallery, haze
+from benchmarks.paper.measure import Gallery
 from benchmarks.paper.results import Point, Result
 from benchmarks.paper.tables import overlap_of
 from benchmarks.paper.variants import (
@@ -71,7 +71,7 @@ class Bench:
         self.folder = folder / scene.name
         self.scene = scene
         self.seed = seed
-        self.settings = settings
+        self.settings = settings.of(scene)
         self.code = code or present()
         self.done: dict[str, Done] = {}
 
@@ -248,7 +248,6 @@ class Bench:
             metrics=means | _closer(root, model, device),
             gaussians=evaluation["gaussians"],
             bytes=evaluation["bytes"],
-            haze=haze(model),
             seconds=seconds | borrowed,
             longest=_longest(records),
             threads=cores(),

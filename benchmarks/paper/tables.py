@@ -15,21 +15,9 @@ from panolog.partition.plan import Plan
 
 TAUS = (1.0, 0.9, 0.8, 0.7, 0.5, 0.3, 0.1, 0.02)
 _FIELDS = (
-    *("scene", "variant", "seed", "iterations", "densified", "resets", "blocks"),
-    *(*METRICS, "gaussians", "bytes", "haze"),
-    *(
-        "total",
-        "on_workers",
-        "longest",
-        "threads",
-        "memory",
-        "overlap",
-        "added",
-        "same_as",
-        "notes",
-        "code",
-        "failed",
-    ),
+    *("scene", "variant", "seed", "iterations", "densified", "resets", "blocks", *METRICS, "gaussians"),
+    *("bytes", "total", "on_workers", "longest", "threads", "memory", "overlap", "added", "same_as"),
+    *("notes", "code", "failed"),
 )
 
 
@@ -59,34 +47,41 @@ class Overlap:
 
 
 def main_tables(results: Results, chosen: Sequence[str], scenes: Sequence[Path]) -> list[Table]:
-    """All tables of variants, scene by scene, with the paper's rows where it has the scene."""
+    """All tables of variants, scene by scene, with the paper's rows where it has the scene.
+
+    Then the means over the scenes of a data set, where the paper has these.
+    """
     made = []
     for group in groups():
         if group.name not in chosen:
             continue
-        for scene in scenes:
-            made.append(_of_group(results, group, scene, first=scene is scenes[0]))
+        table = f"table/{group.source}" if group.source else ""
+        known = [reference.name_of(scene) if group.name == "main" else table for scene in scenes]
+        for scene, name in zip(scenes, known, strict=True):
+            note, shown = group.note if scene is scenes[0] else "", name not in reference.DATA_SETS
+            made.append(_of_group(results, group, scene.name, name if shown else "", note))
+        for name in sorted(reference.DATA_SETS.intersection(known)):
+            own = [scene.name for scene, of in zip(scenes, known, strict=True) if of == name]
+            made.append(_of_group(results.mean(name, own), group, name, name))
     return made
 
 
-def _of_group(results: Results, group: Group, scene: Path, *, first: bool) -> Table:
+def _of_group(results: Results, group: Group, scene: str, known: str, note: str = "") -> Table:
+    """Args: known, the name of the paper's rows in `reference.PUBLISHED`, if it has any."""
     base = group.variants[0]
-    rows = [row for name in group.variants if (row := _row(results, scene.name, name, base))]
-    notes = [group.note] if group.note and first else []
-    found = [reference.PUBLISHED[f"table/{group.source}"]] if group.source else []
-    if group.name == "main" and (known := reference.published(scene)):
-        found.append(known)
-    none = (None,) * 4
-    for published in found:
+    rows = [row for name in group.variants if (row := _row(results, scene, name, base))]
+    notes = [note] if note else []
+    if known:
+        none, published = (None,) * 4, reference.PUBLISHED[known]
         rows += [
             (f"{row.method} [1]", None, row.psnr, row.ssim, None, row.lpips, *none, row.size, *(None,) * 7)
-            for row in published.rows
+            for row in published
         ]
         notes.append(
-            f"[1] {published.source}: printed numbers, at 30,000 iterations on its own machine;"
+            f"[1] {published[0].source}: printed numbers, at 30,000 iterations on its own machine;"
             " it does not say which LPIPS."
         )
-    return _without_empty(Table(f"{group.title}: {scene.name}", HEAD, tuple(rows), tuple(notes)))
+    return _without_empty(Table(f"{group.title}: {scene}", HEAD, tuple(rows), tuple(notes)))
 
 
 def _without_empty(table: Table) -> Table:
@@ -99,7 +94,7 @@ def _without_empty(table: Table) -> Table:
 
 _METRICS = ("PSNR", "SSIM", "LPIPS", "LPIPS of 3DGS", "WS-PSNR", "WS-SSIM", "WS-PSNR 2×")  # as METRICS
 HEAD = (
-    *("variant", "gain dB", *_METRICS, "Gaussians", "MB"),
+    *("variant", "gain dB", *_METRICS, "Gaussians", "MiB"),
     *("minutes", "on workers", "peak GB", "iterations", "densified", "resets", "notes"),
 )
 

@@ -5,9 +5,11 @@ A variant whose iterations depend on what others have taken states these, so tha
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
+from benchmarks.paper.reference import CROPPED, name_of
 from benchmarks.paper.results import Result
 from panolog.orchestrator.runs.config import RunConfig, load_config
 from panolog.orchestrator.runs.folder import flat as settings_in
@@ -42,6 +44,11 @@ class Settings:
     blocks: str
     device: str
     sets: tuple[str, ...]  # KEY=VALUE
+
+    def of(self, scene: Path) -> "Settings":
+        """Those of a scene: the paper leaves out a part of some."""
+        crop = CROPPED.get(name_of(scene))
+        return replace(self, sets=(f"eval.crop_bottom={crop}", *self.sets)) if crop else self
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ def result(variant: str, ws_psnr: float, *, scene: str = "street", seed: int = 0
         "metrics": metrics,
         "gaussians": 20_000,
         "bytes": 5_000_000,
-        "haze": 0.001,
         "seconds": {"coarse": 40.0, "score": 10.0, "block": 50.0, "eval": 7.0},
         "longest": 30.0,
         "threads": 1,

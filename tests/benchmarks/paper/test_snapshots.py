@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.paper.measure import haze
 from benchmarks.paper.snapshots import State, _assembled
 from panolog.partition.cells import Grid
-from panolog.scene.gaussians import Gaussians, concatenate
+from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import write_ply
 from panolog.workers.events import Checkpoint
 from panolog.workers.merge import retained
@@ -48,9 +47,3 @@ def test_a_state_is_what_a_merge_would_give(tmp_path: Path) -> None:
     both = _assembled(coarse, plan, [State(1.0, TaskId.block(1), path), State(2.0, TaskId.block(0), ply)])
     assert float(both.opacities[:180].min()) > 2
     assert torch.equal(both.means[180:], coarse.means[180:])
-
-
-def test_haze_is_the_share_that_hardly_shows() -> None:
-    clear, veil = gaussians(30, 0), gaussians(10, 0, opacity=0.01)
-    assert haze(concatenate(clear, veil)) == 0.25
-    assert haze(gaussians(4, 4)) is None
