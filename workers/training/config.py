@@ -122,7 +122,8 @@ class DensifyConfig(Group):
     max_gaussians: int = Field(
         default=0,
         ge=0,
-        description="cap on scene Gaussians in one task, 0 = none; for machines with little memory",
+        description="cap on scene Gaussians in one task, 0 = none; for machines with little memory: of more"
+        " sparse points, Stage I starts with an even part",
     )
     measure: Literal["image", "angle"] = Field(
         default="image",

@@ -128,6 +128,11 @@ def points_of(
     return np.sort(np.concatenate([observed[inside], observed[~inside][first]]))
 
 
+def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """An even part of these rows (P,) if they are more than `most`; all if that is 0."""
+    return rows[np.arange(most) * len(rows) // most] if 0 < most < len(rows) else rows
+
+
 def first_model(
     scene: Scene,
     config: TrainConfig,

@@ -40,6 +40,7 @@ from panolog.workers.training.densify import Statistics, rate_units
 from panolog.workers.training.exterior import Exterior, Rooms, exterior_last, inside
 from panolog.workers.training.initialise import (
     camera_extent,
+    evenly,
     first_model,
     near_distance,
     points_of,
@@ -171,7 +172,8 @@ class Trainer:
     def _first(self) -> Generator[Progress, None, Gaussians]:
         """What Stage I starts with."""
         scene, spec, pixels = self.scene, self.spec, self.spec.width * (self.spec.width // 2)
-        chosen = points_of(scene, spec.views, spec.district, spec.width)
+        points = points_of(scene, spec.views, spec.district, spec.width)
+        chosen = evenly(points, spec.config.densify.max_gaussians)
         self.start = len(chosen)
         surfaces, missing = Surfaces(scene), self.schedule.first(self.start, pixels) - self.start
         mapped = [row for row in spec.views if missing and scene.panoramas[row].depth]

@@ -297,11 +297,15 @@ class Estimator:
         extent = camera_extent(self.scene, self.scene.train)
         return Schedule(self.config, self.config.iterations, extent, refine=False)
 
+    @property
+    def _points(self) -> int:
+        """Sparse points of these that Stage I takes."""
+        return min(self.parts.points, self.config.densify.max_gaussians or self.parts.points)
+
     @cached_property
     def _start(self) -> int:
         """Scene Gaussians that Stage I starts with; of several districts, that of the one with most."""
-        points = self.parts.points
-        return self._schedule.first(points, self._pixels) if self.parts.mapped else points
+        return self._schedule.first(self._points, self._pixels) if self.parts.mapped else self._points
 
     @cached_property
     def _added(self) -> float:
@@ -309,7 +313,7 @@ class Estimator:
 
     @cached_property
     def _coarse(self) -> list[Period]:
-        return population(self.parts.points, self._added, self._pixels, self._schedule, self._start)
+        return population(self._points, self._added, self._pixels, self._schedule, self._start)
 
     @property
     def _whole(self) -> int:  # scene Gaussians that Stage I comes to

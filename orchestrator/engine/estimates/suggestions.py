@@ -132,10 +132,10 @@ def _smaller_cache(estimator: Estimator) -> Settings:
 
 
 def _caps(estimator: Estimator, estimate: Estimate) -> list[int]:
-    """Values of `densify.max_gaussians` to try, ascending: between the sparse points and what is expected."""
+    """Values of `densify.max_gaussians` to try, ascending: a tenth of the points to what is expected."""
     points, largest = len(estimator.scene.points), max(stage.gaussians for stage in estimate.stages)
-    caps = {_rounded(points + (largest - points) * i // 100) for i in range(1, 100)}
-    return sorted(cap for cap in caps if cap >= points)
+    more = {_rounded(points + (largest - points) * i // 100) for i in range(1, 100)}
+    return sorted({points * i // 10 for i in range(1, 10)} | {cap for cap in more if cap >= points} - {0})
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from panolog.workers.training.initialise import (
     OUTSIDE,
     SCALE_MAX,
     camera_extent,
+    evenly,
     first_model,
     near_distance,
     points_of,
@@ -119,6 +120,13 @@ def test_a_district_begins_coarser_where_it_keeps_nothing(scene: Scene) -> None:
     assert 0.3 * np.median(span) < np.median(apart[:, 1]) < 2 * np.median(span)
     assert len(points_of(cloud, cloud.train, HALF, 8 * WIDTH)) > len(found)
     assert len(scene_gaussians(cloud, found)) == len(found)
+
+
+def test_of_too_many_points_stage_one_starts_with_an_even_part() -> None:
+    rows = np.arange(10, 20)
+    assert evenly(rows, 4).tolist() == [10, 12, 15, 17]
+    for most in (0, 10, 11):
+        assert evenly(rows, most).tolist() == rows.tolist()
 
 
 def test_extent_is_that_of_the_views_trained_on(scene: Scene) -> None:

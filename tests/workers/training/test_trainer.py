@@ -68,6 +68,13 @@ def test_stage_one_reports_its_events(coarse: TrainSpec, events: list[Event]) ->
     assert not notices(events) and end(events).captured is None
 
 
+def test_a_cap_holds_from_the_first_iteration_on(coarse: TrainSpec, scene: Scene) -> None:
+    most = len(scene.points) // 3
+    capped = replace(coarse, config=settings(densify={"max_gaussians": most}))
+    counts = [event.gaussians or 0 for event in progress_of(train(capped))]
+    assert counts[0] == max(counts) == most + capped.config.sky.count
+
+
 def test_the_seed_and_depth_matter(coarse: TrainSpec, events: list[Event]) -> None:
     for other in ({"seed": 4}, {"config": settings(depth={"w0": 0.0})}):
         assert not same(trained(events), trained(replace(coarse, **other)))

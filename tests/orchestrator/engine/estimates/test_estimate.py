@@ -166,6 +166,8 @@ def test_disk_is_taken_by_models_and_checkpoints_that_stay(tmp_path: Path) -> No
     )
     assert stage(free, Stage.BLOCK).gaussians > stage(capped, Stage.BLOCK).gaussians == 250
     assert capped.disk < free.disk
+    few = estimator(tmp_path, sky={"count": 0}, densify={"max_gaussians": 20}).estimate()
+    assert stage(few, Stage.COARSE).gaussians == 20, "of more points it starts with a part"
 
 
 def test_progress_and_previews_of_every_task_take_disk(tmp_path: Path) -> None:

@@ -156,15 +156,15 @@ def test_a_task_grows_to_what_its_memory_takes(scene: Scene, recipe: str, blocks
     assert free.config.densify.max_gaussians == 0 and "max_gaussians" not in free.summary()
     least = growing(scene, **whole, densify={"max_gaussians": 1})
     bare = max(stage.host for stage in least.estimate.stages) / 2**30
-    caps = []
-    for share in (0.4, 0.8):
+    points, caps = 10 * len(scene.points), list[int]()
+    for share in (0.1, 0.4, 0.8):
         memory = bare + share * (need - bare)
         found = growing(scene, **whole, memory=memory)
         found.require()
         assert max(stage.host for stage in found.estimate.stages) <= memory * 2**30
         caps.append(found.config.densify.max_gaussians)
         assert f"at most {caps[-1]:,} scene Gaussians" in found.summary()
-    assert 10 * len(scene.points) <= caps[0] < caps[1]
+    assert caps[0] < caps[1] < caps[2] and caps[0] < points < caps[2]
     assert growing(scene, **whole, memory=2 * need).config == free.config.model_copy(
         update={"memory": 2 * need}
     )
