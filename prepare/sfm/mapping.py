@@ -20,9 +20,7 @@ _GROWTH = 1.2  # of what is adjusted as a whole: COLMAP's 1.1 takes a third long
 _NEVER = 10**9
 _WIDER = 4.0, 1.0, 1.0  # times the bound of errors, one adjustment after the other
 _LOOSE = 0.25  # of the bound of errors: Cauchy's scale
-_LEAST = (
-    12  # points that a pose is found by: the pairs are known to agree, and COLMAP's 30 break a thin chain
-)
+_LEAST = 12  # points of a pose: the pairs are known to agree, and COLMAP's 30 break a thin chain
 
 
 def map_pairs(
@@ -119,11 +117,11 @@ def _incremental(
     options.mapper.init_max_forward_motion = 1.0
     options.mapper.init_min_tri_angle = _FIRST_ANGLE
     options.mapper.abs_pose_min_num_inliers = _LEAST
-    large = len(work.numbers) > DIRECT  # then as a whole at the end alone, and not until nothing changes
+    large = len(work.numbers) > DIRECT  # then not as a whole: 1 iteration is the least that COLMAP takes
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _NEVER if large else _GROWTH
     if large:
         options.ba_global_frames_freq = options.ba_global_points_freq = _NEVER
-        options.ba_global_max_refinements, options.ba_global_max_num_iterations = 1, 10
+        options.ba_global_max_refinements, options.ba_global_max_num_iterations = 1, 1
     models, done = pycolmap.ReconstructionManager(), 2
     if known is not None:
         known.write(work.models)

@@ -45,7 +45,6 @@ class Solution:
     size: tuple[int, int]  # (width, height) of the panoramas
     motion: MotionOf
     adjusted: bool  # from the closed poses of another, not mapped
-    rough: bool  # mapped, but not adjusted as a whole
     given_drift: float | None  # of loops, as `closed` of `closing` has it; None: as these poses show
 
     @property
@@ -106,15 +105,14 @@ class Solution:
     @property
     def drifted(self) -> bool:
         """Whether closed loops explain what contradicts it: the mapper would drift again."""
-        return self.rough or len(self.open) < len(self.contradictions)
+        return len(self.open) < len(self.contradictions)
 
     @property
     def settled(self) -> bool:
         """Whether mapping what agrees would change no pose by much, nor whether it is trusted."""
         change = len(self.agreeing.keys() ^ self.kept.keys())
         would = is_trusted(self.open, self.skeleton, self.found.poses)
-        few = not change or (change <= SETTLED * len(self.kept) and would == self.trusted)
-        return few and not self.rough
+        return not change or (change <= SETTLED * len(self.kept) and would == self.trusted)
 
     @cached_property
     def refuted(self) -> set[Edge]:

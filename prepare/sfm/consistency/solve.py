@@ -251,7 +251,11 @@ class Solver:
         model = map_pairs(part, mapper, self._max_error, self._progress, known)
         if model is None:
             return None
-        return self._solution(model, evidence, skeleton, kept, base is not None and base.adjusted)
+        large = mapper == "incremental" and known is None and len(self._ids) > DIRECT
+        if large:  # which the mapper has not adjusted as a whole
+            model = adjust_poses(part, model, posed(model, self._ids).poses, self._max_error) or model
+        adjusted = large or (base is not None and base.adjusted)
+        return self._solution(model, evidence, skeleton, kept, adjusted)
 
     def _adjusted(self, base: Solution, rows: Collection[int]) -> Solution | None:
         """The reconstruction of these panoramas by what agrees, from the poses once loops are closed.
@@ -304,8 +308,7 @@ class Solver:
                 model.deregister_frame(model.image(self._ids[row]).frame_id)
             found = posed(model, self._ids)
         against = find_contradictions(evidence, skeleton, found, CLOSE, motion)
-        rough = not adjusted and not self._given and self._mapper == "incremental" and len(self._ids) > DIRECT
-        rest = self._work.numbers, self._size, motion, adjusted, rough, self._drift
+        rest = self._work.numbers, self._size, motion, adjusted, self._drift
         return Solution(model, against, evidence, skeleton, found, kept, *rest)
 
 

@@ -1,5 +1,6 @@
 """A square with four equal sides: in order, in any order, and where the sides cannot be distinguished."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -278,20 +279,24 @@ def test_at_last_all_pairs_that_agree_are_matched_along_their_motions(tmp_path: 
 def test_more_than_the_mapper_adjusts_are_adjusted_in_its_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it maps of them drifts, and a second time it would drift again."""
-    mapped = list[bool]()
+    """What it maps of them drifts: it is adjusted before it is judged, and not mapped again."""
+    module, calls = "panolog.prepare.sfm.consistency.solve", list[str]()
 
-    def counted(*arguments: Any) -> pycolmap.Reconstruction | None:
-        mapped.append(True)
-        return map_pairs(*arguments)
+    def noted(call: Callable[..., Any]) -> Callable[..., Any]:
+        def noting(*arguments: Any, **named: Any) -> Any:
+            calls.append(call.__name__)
+            return call(*arguments, **named)
 
-    for module in ("mapping", "consistency.solve"):
-        monkeypatch.setattr(f"panolog.prepare.sfm.{module}.DIRECT", COUNT - 1)
-    monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.map_pairs", counted)
+        return noting
+
+    for name in (f"{module}.DIRECT", "panolog.prepare.sfm.mapping.DIRECT"):
+        monkeypatch.setattr(name, COUNT - 1)
+    for call in (map_pairs, adjust_poses):
+        monkeypatch.setattr(f"{module}.{call.__name__}", noted(call))
     place = square(tmp_path, count=COUNT)
     found = _solve(place)
     assert found.trusted and _error(place, found) < 0.01
-    assert found.adjusted and len(mapped) == 1
+    assert found.adjusted and calls[:2] == ["map_pairs", "adjust_poses"] and calls.count("map_pairs") == 1
 
 
 def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
