@@ -80,6 +80,8 @@ def find_skeleton(
     firm = _chain(own, LIKE_OTHERS, LIKE_OTHERS) if ordered else frozenset()
     weak = _chain(own, *_WEAK) - firm if ordered else frozenset()
     feeble = _chain(own, _FEEBLE, 0.0) if ordered else frozenset()
+    if not ordered and not given:  # a meadow that repeats is all around, but little of what is seen
+        pairs.sort(key=lambda it: -it.coverage * it.share**0.5)
     tree = _strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], sorted(feeble), given)
     return Skeleton(
         ordered,

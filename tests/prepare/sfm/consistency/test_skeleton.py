@@ -44,6 +44,15 @@ def test_without_order_those_that_share_most_of_the_sphere() -> None:
     assert found.tree == {(0, 3), (1, 3), (1, 4), (2, 4)}
 
 
+def test_without_order_what_covers_much_and_shares_little_comes_last() -> None:
+    """A meadow that repeats is all around."""
+    walk = [(0, 3), (1, 3), (1, 4), (2, 4)]
+    pairs = [Pair(it, NOTHING, 0.8, share=0.3) for it in walk]
+    pairs.append(Pair((0, 2), NOTHING, 0.9, share=0.1))
+    found = find_skeleton(Evidence(tuple(np.empty((0, 3)) for _ in range(5)), tuple(pairs)))
+    assert not found.ordered and found.tree == set(walk)
+
+
 @pytest.mark.parametrize(("share", "other", "joined"), [(0.2, 0.7, True), (0.5, 0.9, False)])
 def test_an_interrupted_walk_is_joined_where_most_is_shared(share: float, other: float, joined: bool) -> None:
     """Neighbours that share less come before others, but are guesses."""
