@@ -299,8 +299,15 @@ def test_more_than_the_mapper_adjusts_are_adjusted_in_its_place(
     assert found.adjusted and calls[:2] == ["map_pairs", "adjust_poses"] and calls.count("map_pairs") == 1
 
 
-def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
+def test_without_order_true_neighbours_share_more_than_those_that_look_alike(tmp_path: Path) -> None:
     place = square(tmp_path, count=COUNT, ground=0.0, order=np.random.default_rng(4).permutation(COUNT))
+    found = _solve(place)
+    assert found.trusted and len(found.found.poses) == COUNT and _error(place, found) < 0.01
+
+
+def test_what_nothing_tells_apart_is_refused(tmp_path: Path) -> None:
+    order = np.random.default_rng(4).permutation(COUNT)
+    place = square(tmp_path, count=COUNT, ground=0.0, points=0.3, order=order)
     with silence_colmap():
         solver = Solver(place.work, SIZE, "incremental", 2.0, no_progress)
         assert solver.parts(3) == [] and solver.cuts
