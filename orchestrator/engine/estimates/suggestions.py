@@ -135,7 +135,8 @@ def _caps(estimator: Estimator, estimate: Estimate) -> list[int]:
     """Values of `densify.max_gaussians` to try, ascending: a tenth of the points to what is expected."""
     points, largest = len(estimator.scene.points), max(stage.gaussians for stage in estimate.stages)
     more = {_rounded(points + (largest - points) * i // 100) for i in range(1, 100)}
-    return sorted({points * i // 10 for i in range(1, 10)} | {cap for cap in more if cap >= points} - {0})
+    fewer = {max(1, points * i // 10) for i in range(1, 10)}  # 0 is no cap
+    return sorted(fewer | {cap for cap in more if cap >= points})
 
 
 @dataclass(frozen=True)
