@@ -44,7 +44,6 @@ def population(start: int, added: float, pixels: int, schedule: Schedule, filled
     panorama; filled, how many there are at its begin, if more (`Schedule.first`).
     """
     relocates = schedule.config.densify.method == "relocate"
-    cap = schedule.config.densify.max_gaussians
     first = added * (_REFINED if schedule.refine else 1.0)
     rate = first
     periods: list[Period] = []
@@ -57,7 +56,7 @@ def population(start: int, added: float, pixels: int, schedule: Schedule, filled
                 count = max(count, schedule.budget(iteration, start, pixels))
                 continue
             grown = count + int(min(rate, _MAX_SHARE * count))
-            count = max(count, min(grown, cap)) if cap else grown
+            count = max(count, schedule.capped(grown))
         if schedule.resets(iteration):
             rate = _AFTER_RESET * first
     return [*periods, (schedule.iterations - since, count)]

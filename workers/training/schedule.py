@@ -132,7 +132,11 @@ class Schedule:
         ends = first + densify.filled * (last - first)
         share = min(max((iteration - first) / max(ends - first, 1.0), 0.0), 1.0)
         count = start + int(start * factor * share)
-        return max(start, min(count, densify.max_gaussians)) if densify.max_gaussians else count
+        return max(start, self.capped(count))
+
+    def capped(self, count: int) -> int:
+        """As many Gaussians as the cap on those of a task allows, at most `count`."""
+        return min(count, self.densify.max_gaussians or count)
 
     def first(self, points: int, pixels: int) -> int:
         """How many scene Gaussians Stage I begins with, if depth images have as many points.

@@ -173,7 +173,7 @@ class Trainer:
         """What Stage I starts with."""
         scene, spec, pixels = self.scene, self.spec, self.spec.width * (self.spec.width // 2)
         points = points_of(scene, spec.views, spec.district, spec.width)
-        chosen = evenly(points, spec.config.densify.max_gaussians)
+        chosen = evenly(points, self.schedule.capped(len(points)))
         self.start = len(chosen)
         surfaces, missing = Surfaces(scene), self.schedule.first(self.start, pixels) - self.start
         mapped = [row for row in spec.views if missing and scene.panoramas[row].depth]

@@ -299,8 +299,8 @@ class Estimator:
 
     @property
     def _points(self) -> int:
-        """Sparse points of these that Stage I takes."""
-        return min(self.parts.points, self.config.densify.max_gaussians or self.parts.points)
+        """Sparse points that the cap on Gaussians leaves Stage I."""
+        return self._schedule.capped(self.parts.points)
 
     @cached_property
     def _start(self) -> int:
