@@ -100,8 +100,8 @@ def check_settings(studies: Sequence[Study]) -> None:
         for result in study.results.all:
             if result.failed:
                 continue
-            own = settings[result.scene], result.seed, result.iterations
-            now = variants()[result.variant].config(*own)
+            variant, own = variants()[result.variant], settings[result.scene]
+            now = variant.config(own, result.seed, result.iterations)
             if changes := other_settings(result.settings, now):
                 where = f"{result.variant} of {result.scene} in {study.name}"
                 raise InputError(f"{where} has {changes}: measure it again, or remove its results")

@@ -8,6 +8,7 @@ from statistics import fmean, stdev
 from typing import Any
 
 from panolog.orchestrator.runs.folder import write_json
+from panolog.orchestrator.runs.units import means
 
 METRICS = ("psnr", "ssim", "lpips", "lpips_3dgs", "ws_psnr", "ws_ssim", "twice_ws_psnr")
 _UNTRAINED = ("measure", "eval", "")  # stages that no training needs
@@ -129,12 +130,11 @@ def spread(values: Iterable[float | None]) -> Spread | None:
 
 def _mean(scene: str, found: Sequence[Result]) -> Result:
     """The means of what a variant has come to on several scenes, as of one scene."""
-    means = {name: spread(result.metric(name) for result in found) for name in METRICS}
     stages = {stage for result in found for stage in result.seconds}
     return replace(
         found[0],
         scene=scene,
-        metrics={name: None if mean is None else mean.mean for name, mean in means.items()},
+        metrics=means(result.metrics for result in found),
         gaussians=round(fmean(result.gaussians for result in found)),
         bytes=round(fmean(result.bytes for result in found)),
         seconds={stage: fmean(result.seconds.get(stage, 0.0) for result in found) for stage in stages},

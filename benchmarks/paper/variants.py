@@ -46,7 +46,7 @@ class Settings:
     sets: tuple[str, ...]  # KEY=VALUE
 
     def of(self, scene: Path) -> "Settings":
-        """Those of a scene: the paper leaves out a part of some."""
+        """These settings for one scene: the paper measures some scenes without the bottom of the image."""
         crop = CROPPED.get(name_of(scene))
         return replace(self, sets=(f"eval.crop_bottom={crop}", *self.sets)) if crop else self
 
