@@ -1,9 +1,10 @@
 """The pairs that carry a reconstruction: neighbours of a walk, or the strongest tree of unordered panoramas.
 
 Neighbours in the order of capture show the same place. Where two share much less than others do, in
-directions or in features, the walk may have jumped to where it looks alike. Where panoramas were not taken in
-order, those that share most of the sphere do: `Evidence` measures how much of it they share, not by the
-number of matches.
+directions or in features, the walk may have jumped to where it looks alike: panoramas that share much more,
+as where it crosses its way, come before them. Where panoramas were not taken in order, those that share most
+of the sphere show the same place: `Evidence` measures how much of it they share, not by the number of
+matches.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -18,8 +19,8 @@ from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair
 
 Edge = tuple[int, int]  # rows of two panoramas, ascending
 _ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
-_WEAK = 0.3, 0.5  # of coverage and share of neighbours: they come before what covers more, but are doubted
-_FEEBLE = 0.5  # of coverage of neighbours: they connect what nothing else does
+_WEAK, _FEEBLE = (0.3, 0.5), (0.5, 0.0)  # of coverage and share of neighbours: those with less are left out
+_CLEAR = 0.5  # that is shared at one place: streets that look alike share less, as do doubted neighbours
 _AMONG_BEST = 0.75  # of the best coverage of either panorama
 _AT_ONCE = 256  # panoramas whose ways to all others are found together
 
@@ -78,11 +79,12 @@ def find_skeleton(
     own = [pair for pair in pairs if not set(pair.between) & set(given)]
     ordered = is_ordered(own, count - len(given))
     firm = _chain(own, LIKE_OTHERS, LIKE_OTHERS) if ordered else frozenset()
-    weak = _chain(own, *_WEAK) - firm if ordered else frozenset()
-    feeble = _chain(own, _FEEBLE, 0.0) if ordered else frozenset()
-    if not ordered and not given:  # a meadow that repeats is all around, but little of what is seen
-        pairs.sort(key=lambda it: -it.coverage * it.share**0.5)
-    tree = _strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], sorted(feeble), given)
+    weak = _chain(own, *_WEAK) | _chain(own, *_FEEBLE) if ordered else frozenset()
+    by_share = sorted(pairs, key=lambda it: -_shared(it))
+    clear = [it.between for it in by_share if _shared(it) >= _CLEAR]
+    doubted = [it.between for it in by_share if it.between in weak]
+    rest = pairs if ordered or given else by_share
+    tree = _strongest_tree(rest, count, [*sorted(firm), *clear, *doubted] if ordered else [], given)
     return Skeleton(
         ordered,
         frozenset(tree),
@@ -109,6 +111,11 @@ def _chain(pairs: Sequence[Pair], covered: float, shared: float) -> frozenset[Ed
     )
 
 
+def _shared(pair: Pair) -> float:
+    """How much a pair shares: a meadow that repeats is all around, but little of what is seen."""
+    return pair.coverage * float(np.sqrt(pair.share))
+
+
 def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> dict[Edge, float]:
     """The metres between the panoramas of each pair whose places are known."""
     apart = {it.between: float(np.linalg.norm(np.subtract(*places[list(it.between)]))) for it in pairs}
@@ -119,10 +126,9 @@ def _strongest_tree(
     pairs: Sequence[Pair],
     count: int,
     first: Iterable[Edge] = (),
-    last: Iterable[Edge] = (),
     given: Collection[int] = (),
 ) -> set[Edge]:
-    """Kruskal's tree of the edges `first`, then of the pairs in their order, then of the edges `last`.
+    """Kruskal's tree of the edges `first`, then of the pairs in their order.
 
     Without pairs that share much less than those of the tree: where it falls apart, it is unknown what is
     right. Panoramas that are `given` are connected from the start.
@@ -136,7 +142,7 @@ def _strongest_tree(
 
     usual = [coverage[edge] for edge in tree(*first, *coverage)]
     least = LIKE_OTHERS * float(np.median(usual)) if usual else 0.0
-    return tree(*first, *(edge for edge in coverage if coverage[edge] >= least), *last)
+    return tree(*first, *(edge for edge in coverage if coverage[edge] >= least))
 
 
 def hops(edges: Iterable[Edge], count: int, between: Iterable[Edge], most: float) -> dict[Edge, float]:

@@ -72,17 +72,18 @@ def test_neighbours_that_share_few_features_are_a_guess(share: float, guessed: s
     assert found.guessed == guessed
 
 
-@pytest.mark.parametrize("other", [True, False])
-def test_neighbours_that_share_very_few_features_connect_what_nothing_else_does(other: bool) -> None:
+@pytest.mark.parametrize(("share", "more"), [(0.6, True), (0.2, False), (0.0, False)])
+def test_what_shares_more_than_neighbours_do_comes_before_feeble_ones(share: float, more: bool) -> None:
+    """A street that looks alike covers more than a long step does, but of other features: it comes after."""
     walk = [Pair((row, row + 1), NOTHING, 0.8, share=0.36) for row in range(11)]
     walk[5] = Pair((5, 6), NOTHING, 0.5, share=0.1)
     found = find_skeleton(
         Evidence(
             tuple(np.empty((0, 3)) for _ in range(12)),
-            (*walk, *[Pair((2, 9), NOTHING, 0.7, share=0.2)] * other),
+            (*walk, *[Pair((2, 9), NOTHING, 0.9, share=share)] * (share > 0)),
         )
     )
-    assert found.guessed == {(2, 9) if other else (5, 6)}
+    assert found.guessed == {(2, 9) if more else (5, 6)}
     assert len(found.tree) == 11
 
 
