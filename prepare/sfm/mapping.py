@@ -29,8 +29,8 @@ def map_pairs(
     max_error: float,
     progress: StageProgress,
     known: pycolmap.Reconstruction | None,
-) -> pycolmap.Reconstruction | None:
-    """The reconstruction of most panoramas from the verified pairs of a database; None if there is none.
+) -> list[pycolmap.Reconstruction]:
+    """The reconstructions from the verified pairs of a database, that of most panoramas first.
 
     Args: max_error, pixels that an observation may be away from its point; known, a reconstruction of some of
     them, that of others is added to: its poses stay.
@@ -38,7 +38,7 @@ def map_pairs(
     shutil.rmtree(work.models, ignore_errors=True)
     work.models.mkdir(parents=True)
     models = _global(work, progress) if mapper == "global" else _incremental(work, progress, max_error, known)
-    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+    return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
 def adjust_poses(

@@ -1,6 +1,6 @@
 """A reconstruction of panoramas, and how all pairs are judged by it."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,7 +28,7 @@ SETTLED = 0.03  # of what is mapped: if no more change, another time changes no 
 _DRIFT = 0.05  # degrees more for each panorama on the way between the two along pairs that fit
 _FARTHEST = 6.0  # degrees at most: a window further on is farther off
 _PURE = 0.8  # share of the matches of a pair that fit, for those to count that cannot be judged
-_MANY = 4  # panoramas beyond a guess: fewer may have no pose for want of points, and are added last
+_MANY = 4  # panoramas on each side of a guess: fewer may have no pose for want of points, and come last
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,7 @@ class Solution:
     motion: MotionOf
     adjusted: bool  # from the closed poses of another, not mapped
     given_drift: float | None  # of loops, as `closed` of `closing` has it; None: as these poses show
+    others: Sequence[Set[int]] = ()  # rows that each smaller reconstruction by the same pairs has
 
     @property
     def trusted(self) -> bool:
@@ -121,14 +122,16 @@ class Solution:
 
     @cached_property
     def vain(self) -> set[Edge]:
-        """The guesses that contradict themselves, or that lead to many panoramas and no pose."""
-        poses, against = self.found.poses.keys(), {it.between for it in self.contradictions}
-        of = components([it for it in self.skeleton.edges if not poses & it], len(self.evidence.rays))
-        beyond = np.bincount(of)[of]  # panoramas without a pose that are connected with each
+        """The guesses that contradict themselves, or across which none leads to many panoramas."""
+        against, parts = {it.between for it in self.contradictions}, (self.found.poses.keys(), *self.others)
+        alone = set(range(len(self.evidence.rays))).difference(*parts)
+        joined = [it for it in self.skeleton.edges if any(part >= {*it} for part in (*parts, alone))]
+        of = components(joined, len(self.evidence.rays))
+        beyond = np.bincount(of)[of]  # panoramas on the same side as each
         return {
-            it
-            for it in self.skeleton.guessed
-            if it in against or (len(poses & it) == 1 and beyond[list(it)].max() >= _MANY)
+            (one, other)
+            for one, other in self.skeleton.guessed
+            if (one, other) in against or (of[one] != of[other] and beyond[[one, other]].min() >= _MANY)
         }
 
     def without(self, guesses: Collection[Edge]) -> Kept:

@@ -248,14 +248,17 @@ class Solver:
         """The reconstruction by these pairs; None if there is none. Args: base, whose poses stay."""
         known, given = (base.model, base.found.poses) if base else (self._known, self._given)
         part = self._work.with_pairs(kept, "pairs.db", given)
-        model = map_pairs(part, mapper, self._max_error, self._progress, known)
-        if model is None:
+        models = map_pairs(part, mapper, self._max_error, self._progress, known)
+        if not models:
             return None
+        model, *others = models
         large = mapper == "incremental" and known is None and len(self._ids) > DIRECT
         if large:  # which the mapper has not adjusted as a whole
             model = adjust_poses(part, model, posed(model, self._ids).poses, self._max_error) or model
         adjusted = large or (base is not None and base.adjusted)
-        return self._solution(model, evidence, skeleton, kept, adjusted)
+        solution = self._solution(model, evidence, skeleton, kept, adjusted)
+        rows = {number: row for row, number in enumerate(self._ids)}
+        return replace(solution, others=[{rows[number] for number in it.reg_image_ids()} for it in others])
 
     def _adjusted(self, base: Solution, rows: Collection[int]) -> Solution | None:
         """The reconstruction of these panoramas by what agrees, from the poses once loops are closed.

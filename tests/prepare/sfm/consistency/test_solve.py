@@ -58,7 +58,7 @@ def test_a_guess_where_the_walk_jumps_is_refuted_and_another_pair_joins_the_part
     """
     mapped = list[int]()
 
-    def counted(work: Workspace, *others: Any) -> pycolmap.Reconstruction | None:
+    def counted(work: Workspace, *others: Any) -> list[pycolmap.Reconstruction]:
         with pycolmap.Database.open(work.database) as database:
             mapped.append(len(database.read_two_view_geometries()[0]))
         return map_pairs(work, *others)
@@ -79,14 +79,14 @@ def test_a_guess_beyond_which_no_poses_are_found_is_replaced_before_others_are_m
     """Nothing contradicts what such a guess leads to, as that has no poses."""
     jump, posed = (5, 6), list[int]()
 
-    def without_jump(work: Workspace, *others: Any) -> pycolmap.Reconstruction | None:
+    def without_jump(work: Workspace, *others: Any) -> list[pycolmap.Reconstruction]:
         one, other = (work.ids()[row] for row in jump)
         with pycolmap.Database.open(work.database) as database:
             if database.exists_two_view_geometry(one, other):
                 database.delete_two_view_geometry(one, other)
-        model = map_pairs(work, *others)
-        posed.append(model.num_reg_images() if model else 0)
-        return model
+        models = map_pairs(work, *others)
+        posed.append(max((model.num_reg_images() for model in models), default=0))
+        return models
 
     monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.map_pairs", without_jump)
     monkeypatch.setattr("panolog.prepare.sfm.consistency.skeleton._CLEAR", np.inf)  # the jump is tried first
@@ -101,6 +101,13 @@ def test_a_guess_beyond_which_no_poses_are_found_is_replaced_before_others_are_m
     for last, vain in ((9, {(9, 10)}), (13, set())):  # the few after the other are added last
         poses = {row: found.found.poses[row] for row in range(last + 1)}
         assert replace(found, found=Posed(poses, {}), skeleton=skeleton, contradictions=[]).vain == vain
+    skeleton = replace(skeleton, guessed=frozenset({(5, 6), (8, 9), (10, 11)}))
+    begun = replace(found, found=Posed({row: found.found.poses[row] for row in range(6)}, {}))
+    begun = replace(begun, skeleton=skeleton, contradictions=[])
+    assert begun.vain == {(5, 6)}
+    smaller = [{4, 5, *range(6, 11)}, {9, 10}]  # a smaller reconstruction leads across the first guess
+    assert replace(begun, others=smaller).vain == {(10, 11)}
+    assert replace(begun, others=[set(range(6, 11))]).vain == {(5, 6), (10, 11)}
 
 
 @pytest.mark.parametrize("ordered", [True, False])
@@ -210,10 +217,11 @@ def test_what_has_shrunk_to_a_point_is_another_part(tmp_path: Path, monkeypatch:
     place, behind, tiny = square(tmp_path, count=COUNT), 10, 1e-6
     ids = place.work.ids()
 
-    def shrinking(*arguments: Any) -> pycolmap.Reconstruction | None:
-        model = map_pairs(*arguments)
-        if model is None or model.num_reg_images() < COUNT:
-            return model
+    def shrinking(*arguments: Any) -> list[pycolmap.Reconstruction]:
+        models = map_pairs(*arguments)
+        model = next((it for it in models if it.num_reg_images() == COUNT), None)
+        if model is None:
+            return models
         center = model.image(ids[behind]).projection_center()
         for image in map(model.image, ids[behind:]):
             turn = image.cam_from_world().rotation
@@ -226,7 +234,7 @@ def test_what_has_shrunk_to_a_point_is_another_part(tmp_path: Path, monkeypatch:
                 point.xyz = center + tiny * (point.xyz - center)
             elif len(sides) == 2:
                 model.delete_point3D(number)
-        return model
+        return models
 
     monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.map_pairs", shrinking)
     with silence_colmap():
