@@ -13,6 +13,9 @@ be misled as the guess is, so only a guess with far more matches outweighs what 
 Without an order, a pair only looks alike if it covers clearly less than each pair on the best way from one
 to the other along pairs that agree.
 
+Neighbours may be misled themselves, by a step past equal windows that looks like one back. Where pairs that
+agree share more across that step than the two do, these contradict nothing.
+
 Where even neighbours have a second geometry that explains about as much as the first, nothing contradicts
 either. Single ones are decided by what lies around; where there are many, the whole is not trusted.
 """
@@ -88,20 +91,29 @@ def find_contradictions(
     covered, share, parallax = np.median(usual, axis=0).tolist()
     steps = [apart(found, it.between) for it in of_tree if found.poses.keys() >= set(it.between)]
     near = _CLOSE * float(np.median(steps or [0.0]))
-    contradictions, agreeing, against = [], list[Pair](), list[tuple[Pair, Contradiction, float]]()
+    agreeing, against = list[Pair](), list[tuple[Pair, Contradiction, float]]()
+    own = list[tuple[Pair, Contradiction]]()  # of the tree
     for pair in evidence.pairs:
         carries = pair.between in skeleton.tree
         off = deviations(found, evidence, pair)
         fits = agrees(evidence, pair, off, bound)
         if fits is None:
             if carries and not has_moved(found, pair.between, motion(pair)):
-                contradictions.append(Contradiction(pair.between, len(pair.matches), 0))
+                own.append((pair, Contradiction(pair.between, len(pair.matches), 0)))
         elif fits:
             agreeing.append(pair)
         else:
             off = off[judged(pair, off)]
             fit = Contradiction(pair.between, len(off), int((off <= bound).sum()))
-            against.append((pair, fit, float(np.median(off))))
+            if carries:
+                own.append((pair, fit))
+            else:
+                against.append((pair, fit, float(np.median(off))))
+    firm = skeleton.certain if skeleton.ordered else frozenset[Edge]()
+    across = _shared_across(skeleton, agreeing)
+    contradictions = [
+        it for pair, it in own if pair.between not in firm or pair.share >= across[pair.between]
+    ]
     close = [pair for pair in agreeing if apart(found, pair.between) < near]
     contradictions += _fronts(Closeness(evidence, of_tree), skeleton, close, of_tree) if close else []
     sides = components(skeleton.certain, len(evidence.rays))
@@ -120,9 +132,7 @@ def find_contradictions(
             counts = pair.coverage >= _MARGIN * least
             usual_share = min([share, *(shares[edge] for edge in path if edge in shares)])
         nearer = max(1.0, parallax / pair.parallax) if pair.parallax else 1.0  # shares more, if it is true
-        if pair.between in skeleton.tree:
-            contradictions.append(fit)
-        elif counts and pair.share >= _SHARED * usual_share * np.sqrt(nearer):
+        if counts and pair.share >= _SHARED * usual_share * np.sqrt(nearer):
             likely.append((pair, fit))
     if likely and skeleton.ordered:
         likely = _leading_across_doubt(likely, skeleton, agreeing, of_tree)
@@ -175,13 +185,17 @@ def _outvoted(skeleton: Skeleton, agreeing: Sequence[Pair], against: Sequence[Pa
 
     Where a motion is wrong, all pairs that lead across it contradict, but for those that are misled alike.
     """
-    votes: dict[Edge, float] = dict.fromkeys(skeleton.edges, 0.0)
-    for pairs, sign in ((agreeing, 1.0), (against, -1.0)):
-        ways = tree_paths(skeleton.edges, [pair.between for pair in pairs])
-        for pair, way in zip(pairs, ways, strict=True):
-            for edge in way:
-                votes[edge] += sign * pair.share
-    return {edge for edge in skeleton.tree if votes[edge] < 0}
+    votes, others = _shared_across(skeleton, agreeing), _shared_across(skeleton, against)
+    return {edge for edge in skeleton.tree if others[edge] > votes[edge]}
+
+
+def _shared_across(skeleton: Skeleton, pairs: Sequence[Pair]) -> dict[Edge, float]:
+    """How much the pairs share in all that lead across each edge between panoramas; it is one of them."""
+    shared = dict.fromkeys(skeleton.edges, 0.0)
+    for pair, way in zip(pairs, tree_paths(skeleton.edges, [it.between for it in pairs]), strict=True):
+        for edge in way:
+            shared[edge] += pair.share
+    return shared
 
 
 def is_repetitive(skeleton: Skeleton, rows: Collection[int]) -> bool:

@@ -24,13 +24,14 @@ def _contradictions(
     first: float = 0.0,
     last: float = 0.5,
     copied: int = AROUND,
+    misled: Edge | None = None,
 ) -> set[Edge]:
     """Of a walk within a ring of houses, each of which looks as that ten degrees further on.
 
     Args: pairs that agree besides the neighbours, and pairs with copies; covers, the coverage of the latter;
         shared, of the features by these, and by the neighbours 2 and 3; guessed, of the walk; fronts,
         pairs that agree on one side alone; first, last, metres along the walk of these two panoramas, while
-        the others are 0.1 apart; copied, matches of a pair with copies.
+        the others are 0.1 apart; copied, matches of a pair with copies; misled, neighbours with copies.
     """
     random = np.random.default_rng(0)
     turn = np.deg2rad(np.arange(AROUND))
@@ -41,7 +42,10 @@ def _contradictions(
     same = np.repeat(np.arange(AROUND)[:, None], 2, axis=1)
     copies = np.column_stack([same[:, 0], (same[:, 0] + 10) % AROUND])
     walk = [(row, row + 1) for row in range(COUNT - 1)]
-    pairs = [Pair(edge, same, 0.9, share=shared[1] if edge == (2, 3) else 0.3) for edge in walk]
+    pairs = [
+        Pair(edge, copies if edge == misled else same, 0.9, share=shared[1] if edge == (2, 3) else 0.3)
+        for edge in walk
+    ]
     pairs += [Pair(edge, same, 0.9, share=0.3) for edge in agreeing]
     pairs += [Pair(edge, same[: AROUND // 2], 0.9, share=0.3) for edge in fronts]
     pairs += [Pair(edge, copies[:copied], covers, share=shared[0]) for edge in against]
@@ -66,6 +70,23 @@ def test_across_a_guess_a_single_one_counts_whatever_agrees(guess: Edge, counts:
     """What agrees across a guess may be misled as the guess is."""
     agreeing: list[Edge] = [(0, 2), (1, 3), (2, 4), (3, 5)]
     assert _contradictions(agreeing, [(1, 4), (2, 5)], True, 0.9, guessed=frozenset({guess})) == counts
+
+
+@pytest.mark.parametrize(
+    ("agreeing", "ordered", "guessed", "counts"),
+    [
+        ([], True, [], True),
+        ([(2, 4)], True, [], True),  # shares as much as the two, not more
+        ([(2, 4), (1, 3)], True, [], False),
+        ([(2, 4), (1, 3)], True, [(2, 3)], True),  # the next guess takes its place
+        ([(2, 4), (1, 3)], False, [], True),
+    ],
+)
+def test_neighbours_with_copies_count_unless_more_agrees_across_their_step(
+    agreeing: list[Edge], ordered: bool, guessed: list[Edge], counts: bool
+) -> None:
+    found = _contradictions(agreeing, [], ordered, 0.9, guessed=frozenset(guessed), misled=(2, 3))
+    assert found == ({(2, 3)} if counts else set())
 
 
 @pytest.mark.parametrize("copied", [AROUND // 5, AROUND // 3])
