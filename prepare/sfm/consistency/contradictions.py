@@ -21,7 +21,7 @@ either. Single ones are decided by what lies around; where there are many, the w
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,7 +110,7 @@ def find_contradictions(
             else:
                 against.append((pair, fit, float(np.median(off))))
     firm = skeleton.certain if skeleton.ordered else frozenset[Edge]()
-    across = _shared_across(skeleton, agreeing)
+    across = _shared_across(skeleton, agreeing) if skeleton.ordered else {}
     contradictions = [
         it for pair, it in own if pair.between not in firm or pair.share >= across[pair.between]
     ]
@@ -135,7 +135,7 @@ def find_contradictions(
         if counts and pair.share >= _SHARED * usual_share * np.sqrt(nearer):
             likely.append((pair, fit))
     if likely and skeleton.ordered:
-        likely = _leading_across_doubt(likely, skeleton, agreeing, of_tree)
+        likely = _leading_across_doubt(likely, skeleton, across, of_tree)
     contradictions += [fit for _, fit in likely]
     return sorted(contradictions, key=lambda it: (it.points - it.matches, it.between))
 
@@ -143,11 +143,16 @@ def find_contradictions(
 def _leading_across_doubt(
     likely: Sequence[tuple[Pair, Contradiction]],
     skeleton: Skeleton,
-    agreeing: Sequence[Pair],
+    across: Mapping[Edge, float],
     of_tree: Sequence[Pair],
 ) -> list[tuple[Pair, Contradiction]]:
-    """The pairs of a walk in order that do not only look alike."""
-    outvoted = _outvoted(skeleton, agreeing, [pair for pair, _ in likely])
+    """The pairs of a walk in order that do not only look alike.
+
+    Where a motion is wrong, all pairs that lead across it contradict, but for those that are misled alike.
+    Args: across, how much the pairs that agree share across each edge.
+    """
+    against = _shared_across(skeleton, [pair for pair, _ in likely])
+    outvoted = {edge for edge in skeleton.tree if against[edge] > across[edge]}
     telling = {it.between: len(it.telling) for it in of_tree if it.between in skeleton.guessed}
     ways = tree_paths(skeleton.edges, [pair.between for pair, _ in likely])
     return [
@@ -178,15 +183,6 @@ def _fronts(
     ways = tree_paths(skeleton.edges, [pair.between for pair in alike])
     doubted = [it for it, way in zip(alike, ways, strict=True) if not way or not sound.issuperset(way)]
     return [Contradiction(pair.between, len(pair.telling), len(pair.telling)) for pair in doubted]
-
-
-def _outvoted(skeleton: Skeleton, agreeing: Sequence[Pair], against: Sequence[Pair]) -> set[Edge]:
-    """The edges of the tree across which more is shared by pairs that contradict than by those that agree.
-
-    Where a motion is wrong, all pairs that lead across it contradict, but for those that are misled alike.
-    """
-    votes, others = _shared_across(skeleton, agreeing), _shared_across(skeleton, against)
-    return {edge for edge in skeleton.tree if others[edge] > votes[edge]}
 
 
 def _shared_across(skeleton: Skeleton, pairs: Sequence[Pair]) -> dict[Edge, float]:
