@@ -135,7 +135,7 @@ class Schedule:
         return max(start, self.capped(count))
 
     def capped(self, count: int) -> int:
-        """As many Gaussians as the cap on those of a task allows, at most `count`."""
+        """The number `count` of Gaussians, or `densify.max_gaussians`, the cap of a task, if that is less."""
         return min(count, self.densify.max_gaussians or count)
 
     def first(self, points: int, pixels: int) -> int:

@@ -170,10 +170,8 @@ def test_status_and_map_show_how_far_the_preparation_is_and_no_other_process_joi
     start(raw, root, action=lambda: look("check"))
     ((text, status),) = seen
     over = status["preparation"]["over"]
-    shown_before = re.match(r"preparing: poses 0 of 10 · (\d+)% ", text)
-    assert shown_before and 0 < int(shown_before[1]) <= round(
-        100 * over
-    )  # it grows from one look to the next
+    shown_first = re.match(r"preparing: poses 0 of 10 · (\d+)% ", text)
+    assert shown_first and 0 < int(shown_first[1]) <= round(100 * over)  # the share grows meanwhile
     assert 0 < over == status["progress"] < status["preparation"]["progress"] < 1
     assert "masks: " in text
     assert (status["status"], status["label"], status["stage"]) == ("running", "preparing", "prepare")
