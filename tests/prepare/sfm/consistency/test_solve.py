@@ -16,7 +16,7 @@ from panolog.prepare.sfm.consistency.skeleton import Skeleton
 from panolog.prepare.sfm.consistency.solution import Solution
 from panolog.prepare.sfm.consistency.solve import Solver, _strays
 from panolog.prepare.sfm.links import Link
-from panolog.prepare.sfm.mapping import adjust_poses, map_pairs
+from panolog.prepare.sfm.mapping import _drop_far, adjust_poses, map_pairs
 from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.write import no_progress
@@ -307,6 +307,31 @@ def test_more_than_the_mapper_adjusts_are_adjusted_in_its_place(
     found = _solve(place)
     assert found.trusted and _error(place, found) < 0.01
     assert found.adjusted and calls[:2] == ["map_pairs", "adjust_poses"] and calls.count("map_pairs") == 1
+
+
+def test_points_that_many_see_in_one_direction_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("panolog.prepare.sfm.mapping._MANY", COUNT - 1)
+    model = _solve(square(tmp_path, count=COUNT)).model
+    centers = np.array([image.projection_center() for image in model.images.values()])
+    middle, spread = centers.mean(axis=0), float(np.linalg.norm(np.ptp(centers, axis=0)))
+    tracks = []
+    for feature in (0, 1):
+        for number in model.reg_image_ids():
+            if model.image(number).points2D[feature].has_point3D():
+                model.delete_observation(number, feature)
+        tracks.append([pycolmap.TrackElement(number, feature) for number in model.reg_image_ids()])
+    assert len(centers) == COUNT
+    steeple = model.add_point3D(middle + [0.0, 0.0, spread], pycolmap.Track(tracks[0]))
+    before = set(model.points3D)
+    cloud = model.add_point3D(middle + [0.0, 0.0, 20 * spread], pycolmap.Track(tracks[1]))
+    assert cloud not in before and steeple in before
+    _drop_far(model)
+    assert set(model.points3D) == before
+    model.add_point3D(middle + [0.0, 0.0, 20 * spread], pycolmap.Track(tracks[1][1:]))
+    _drop_far(model)
+    assert len(model.points3D) == len(before) + 1  # of so few it is no work
 
 
 def test_without_order_true_neighbours_share_more_than_those_that_look_alike(tmp_path: Path) -> None:
