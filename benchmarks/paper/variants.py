@@ -256,9 +256,14 @@ def _ablations() -> list[Variant]:
     ]
 
 
+def _grid(count: int) -> dict[str, Any]:
+    """So many blocks. Of four cells along an axis, the outer ones of the contracted cube hold no camera."""
+    return {"blocks": _GRIDS[count]} | ({"partition.cells": "box"} if count > 4 else {})
+
+
 def _blocks() -> list[Variant]:
     return [
-        Variant(f"blocks-{count}", f"panolog in {grid}", {"recipe": "panolog", "blocks": grid})
+        Variant(f"blocks-{count}", f"panolog in {grid}", {"recipe": "panolog", **_grid(count)})
         for count, grid in _GRIDS.items()
     ]
 
@@ -273,8 +278,8 @@ def _memory() -> list[Variant]:
     alone = full | {"refine": False}
     return [
         *(
-            Variant(f"memory-{count}", f"{count} blocks", full | {"blocks": grid}, usual=usual)
-            for count, grid in _GRIDS.items()
+            Variant(f"memory-{count}", f"{count} blocks", full | _grid(count), usual=usual)
+            for count in _GRIDS
             if count > 1
         ),
         Variant("memory-1", "one model", alone, in_all, ("memory-4",), guess=5.0, usual=usual),
