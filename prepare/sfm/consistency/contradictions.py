@@ -91,24 +91,7 @@ def find_contradictions(
     covered, share, parallax = np.median(usual, axis=0).tolist()
     steps = [apart(found, it.between) for it in of_tree if found.poses.keys() >= set(it.between)]
     near = _CLOSE * float(np.median(steps or [0.0]))
-    agreeing, against = list[Pair](), list[tuple[Pair, Contradiction, float]]()
-    own = list[tuple[Pair, Contradiction]]()  # of the tree
-    for pair in evidence.pairs:
-        carries = pair.between in skeleton.tree
-        off = deviations(found, evidence, pair)
-        fits = agrees(evidence, pair, off, bound)
-        if fits is None:
-            if carries and not has_moved(found, pair.between, motion(pair)):
-                own.append((pair, Contradiction(pair.between, len(pair.matches), 0)))
-        elif fits:
-            agreeing.append(pair)
-        else:
-            off = off[judged(pair, off)]
-            fit = Contradiction(pair.between, len(off), int((off <= bound).sum()))
-            if carries:
-                own.append((pair, fit))
-            else:
-                against.append((pair, fit, float(np.median(off))))
+    agreeing, own, against = _verdicts(evidence, skeleton, found, bound, motion)
     firm = skeleton.certain if skeleton.ordered else frozenset[Edge]()
     across = _shared_across(skeleton, agreeing) if skeleton.ordered else {}
     contradictions = [
@@ -138,6 +121,34 @@ def find_contradictions(
         likely = _leading_across_doubt(likely, skeleton, across, of_tree)
     contradictions += [fit for _, fit in likely]
     return sorted(contradictions, key=lambda it: (it.points - it.matches, it.between))
+
+
+def _verdicts(
+    evidence: Evidence, skeleton: Skeleton, found: Posed, bound: float, motion: MotionOf
+) -> tuple[list[Pair], list[tuple[Pair, Contradiction]], list[tuple[Pair, Contradiction, float]]]:
+    """The pairs that agree, those of the tree that do not, and the others that do not.
+
+    The others come with the median of the degrees that points are off. What nothing judges is left out.
+    """
+    agreeing, own = list[Pair](), list[tuple[Pair, Contradiction]]()
+    against = list[tuple[Pair, Contradiction, float]]()
+    for pair in evidence.pairs:
+        carries = pair.between in skeleton.tree
+        off = deviations(found, evidence, pair)
+        fits = agrees(evidence, pair, off, bound)
+        if fits is None:
+            if carries and not has_moved(found, pair.between, motion(pair)):
+                own.append((pair, Contradiction(pair.between, len(pair.matches), 0)))
+        elif fits:
+            agreeing.append(pair)
+        else:
+            off = off[judged(pair, off)]
+            fit = Contradiction(pair.between, len(off), int((off <= bound).sum()))
+            if carries:
+                own.append((pair, fit))
+            else:
+                against.append((pair, fit, float(np.median(off))))
+    return agreeing, own, against
 
 
 def _leading_across_doubt(
