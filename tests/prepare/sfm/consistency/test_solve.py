@@ -315,7 +315,7 @@ def test_points_that_many_see_in_one_direction_are_left_out(
     monkeypatch.setattr("panolog.prepare.sfm.mapping._MANY", COUNT - 1)
     model = _solve(square(tmp_path, count=COUNT)).model
     centers = np.array([image.projection_center() for image in model.images.values()])
-    middle, spread = centers.mean(axis=0), float(np.linalg.norm(np.ptp(centers, axis=0)))
+    middle, up = centers.mean(axis=0), np.array([0.0, 0.0, np.linalg.norm(np.ptp(centers, axis=0))])
     tracks = []
     for feature in (0, 1):
         for number in model.reg_image_ids():
@@ -323,13 +323,13 @@ def test_points_that_many_see_in_one_direction_are_left_out(
                 model.delete_observation(number, feature)
         tracks.append([pycolmap.TrackElement(number, feature) for number in model.reg_image_ids()])
     assert len(centers) == COUNT
-    steeple = model.add_point3D(middle + [0.0, 0.0, spread], pycolmap.Track(tracks[0]))
+    steeple = model.add_point3D(middle + up, pycolmap.Track(tracks[0]))
     before = set(model.points3D)
-    cloud = model.add_point3D(middle + [0.0, 0.0, 20 * spread], pycolmap.Track(tracks[1]))
+    cloud = model.add_point3D(middle + 20 * up, pycolmap.Track(tracks[1]))
     assert cloud not in before and steeple in before
     _drop_far(model)
     assert set(model.points3D) == before
-    model.add_point3D(middle + [0.0, 0.0, 20 * spread], pycolmap.Track(tracks[1][1:]))
+    model.add_point3D(middle + 20 * up, pycolmap.Track(tracks[1][1:]))
     _drop_far(model)
     assert len(model.points3D) == len(before) + 1  # of so few it is no work
 
