@@ -40,7 +40,8 @@ _ROUNDS = 8  # of mapping with the pairs that fit
 _AS_NEIGHBOURS = 0.9  # of the median of the best coverage of panoramas whose poses are known
 _GUESSES = 4  # times that the next pairs take the place of guesses, before loops are closed and after
 _LOOSE = 100.0  # relative error of the scale across a link: either side may be a point for the other
-_STRAY = 6.0  # usual steps that a panorama is from those before and after it
+_STRAY = 6.0  # usual steps that panoramas are from those before and after them
+_ASTRAY = 4  # at most one after the other: more may be a way of their own
 _RIM = 0.1  # share of the panoramas that may be left out without an order: all others agree
 
 
@@ -347,19 +348,23 @@ def _unconfirmed(solution: Solution) -> set[int]:
         off = deviations(found, solution.evidence, pair)
         if pair.between in skeleton.tree or agrees(solution.evidence, pair, off, CLOSE):
             held.update(pair.between)
-    alone = {row for row in found.poses if held[row] < 2}
-    return (alone | _strays(found) if skeleton.ordered else alone).difference(*firm)
+    alone = {row for row in found.poses if held[row] < 2}.difference(*firm)
+    return alone | _strays(found, firm) if skeleton.ordered else alone
 
 
-def _strays(found: Posed) -> set[int]:
-    """The panoramas that are far from the one before and the one after, which are near each other.
+def _strays(found: Posed, firm: Collection[Edge]) -> set[int]:
+    """The panoramas that are far from those before and after them, which are near each other.
 
     Of places that look alike, as crossings do, several may stand on one, and confirm each other there.
+    Args: firm, pairs that are certain: what one of these connects with others does not stray.
     """
-    rows = sorted(found.poses)
+    rows, strays = sorted(found.poses), set[int]()
     centers = found.centers(rows)
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    past = np.linalg.norm(centers[2:] - centers[:-2], axis=1)
-    least = np.minimum(steps[:-1], steps[1:])
-    stray = (least > _STRAY * np.median(steps)) & (past < least / 2) if len(least) else []
-    return {rows[place + 1] for place in np.flatnonzero(stray)}
+    for count in range(1, min(_ASTRAY, len(steps) - 1) + 1):
+        least = np.minimum(steps[:-count], steps[count:])
+        past = np.linalg.norm(centers[count + 1 :] - centers[: -count - 1], axis=1)
+        for place in np.flatnonzero((least > _STRAY * np.median(steps)) & (past < least / 2)):
+            run = set(rows[place + 1 : place + 1 + count])
+            strays |= run if not any(len(run & {*edge}) == 1 for edge in firm) else set()
+    return strays

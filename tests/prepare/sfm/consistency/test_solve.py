@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from panolog.prepare.sfm.consistency.agreement import Posed, deviations, posed
-from panolog.prepare.sfm.consistency.skeleton import Skeleton
+from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton
 from panolog.prepare.sfm.consistency.solution import Solution
 from panolog.prepare.sfm.consistency.solve import Solver, _strays
 from panolog.prepare.sfm.links import Link
@@ -373,4 +373,23 @@ def test_a_panorama_far_from_those_around_it_in_the_order_is_a_stray() -> None:
     apart = np.where(np.arange(12)[:, None] == 4, [40.0, 0.0, 0.0], centers)
     for where, strays in ((centers, set()), (apart, {4}), (apart[:2], set()), (apart[:5], set())):
         poses = {row: (np.eye(3), -center) for row, center in enumerate(where)}
-        assert _strays(Posed(poses, {})) == strays
+        assert _strays(Posed(poses, {}), set()) == strays
+
+
+@pytest.mark.parametrize(
+    "count, firm, strays",
+    [
+        (3, {(4, 5), (5, 6), (7, 8)}, {4, 5, 6}),
+        (4, set(), {4, 5, 6, 7}),
+        (5, set(), set()),  # so many may be a way of their own
+        (3, {(3, 4), (4, 5)}, set()),
+        (3, {(4, 5), (6, 7)}, set()),
+    ],
+)
+def test_a_few_panoramas_that_stray_together_are_strays(
+    count: int, firm: set[Edge], strays: set[int]
+) -> None:
+    steps = np.arange(16.0)
+    steps[4 : 4 + count] += 400.0
+    poses = {row: (np.eye(3), np.array([-step, 0.0, 0.0])) for row, step in enumerate(steps)}
+    assert _strays(Posed(poses, {}), firm) == strays
