@@ -339,17 +339,23 @@ def _loose(solution: Solution) -> set[int]:
 def _unconfirmed(solution: Solution) -> set[int]:
     """The panoramas whose pose a single pair holds, or that stray from the order, unless that confirms it.
 
-    A pair that looks alike gives a pose, too: only a second one shows that it is right.
+    A pair that looks alike gives a pose, too: only a second one shows that it is right. Neighbours that stray
+    together do not confirm each other.
     """
-    skeleton, found = solution.skeleton, solution.found
+    skeleton, found, evidence = solution.skeleton, solution.found, solution.evidence
     firm = skeleton.certain if skeleton.ordered or skeleton.given else frozenset[Edge]()
-    held = Counter[int]()
-    for pair in solution.evidence.pairs:
-        off = deviations(found, solution.evidence, pair)
-        if pair.between in skeleton.tree or agrees(solution.evidence, pair, off, CLOSE):
+    group, held, leading = components(firm, len(evidence.rays)), Counter[int](), Counter[int]()
+    for pair in evidence.pairs:
+        off = deviations(found, evidence, pair)
+        if pair.between in skeleton.tree or agrees(evidence, pair, off, CLOSE):
             held.update(pair.between)
-    alone = {row for row in found.poses if held[row] < 2}.difference(*firm)
-    return alone | _strays(found, firm) if skeleton.ordered else alone
+            groups = {int(group[row]) for row in pair.between}
+            leading.update(groups if len(groups) > 1 else ())
+    confirmed = {row for edge in firm for row in edge}
+    alone = {row for row in found.poses if held[row] < 2} - confirmed
+    if not skeleton.ordered:
+        return alone
+    return alone | {row for row in _strays(found, firm) if row not in confirmed or leading[group[row]] < 2}
 
 
 def _strays(found: Posed, firm: Collection[Edge]) -> set[int]:

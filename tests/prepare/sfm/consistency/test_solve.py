@@ -12,9 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from panolog.prepare.sfm.consistency.agreement import Posed, deviations, posed
-from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton
+from panolog.prepare.sfm.consistency.skeleton import Skeleton
 from panolog.prepare.sfm.consistency.solution import Solution
-from panolog.prepare.sfm.consistency.solve import Solver, _strays
+from panolog.prepare.sfm.consistency.solve import Solver
 from panolog.prepare.sfm.links import Link
 from panolog.prepare.sfm.mapping import _drop_far, adjust_poses, map_pairs
 from panolog.prepare.sfm.sparse_model import SparseModel
@@ -366,30 +366,3 @@ def test_poses_that_have_drifted_are_adjusted_to_what_agrees(tmp_path: Path) -> 
     assert others.num_reg_images() == COUNT - 1
     again = replace(found, model=model, found=posed(model, place.work.ids()))
     assert off(again, place.centers) < 0.05
-
-
-def test_a_panorama_far_from_those_around_it_in_the_order_is_a_stray() -> None:
-    centers = np.array([[step, 0.0, 0.0] for step in [*range(8), 20, 21, 22, 23]])
-    apart = np.where(np.arange(12)[:, None] == 4, [40.0, 0.0, 0.0], centers)
-    for where, strays in ((centers, set()), (apart, {4}), (apart[:2], set()), (apart[:5], set())):
-        poses = {row: (np.eye(3), -center) for row, center in enumerate(where)}
-        assert _strays(Posed(poses, {}), set()) == strays
-
-
-@pytest.mark.parametrize(
-    "count, firm, strays",
-    [
-        (3, {(4, 5), (5, 6), (7, 8)}, {4, 5, 6}),
-        (4, set(), {4, 5, 6, 7}),
-        (5, set(), set()),  # so many may be a way of their own
-        (3, {(3, 4), (4, 5)}, set()),
-        (3, {(4, 5), (6, 7)}, set()),
-    ],
-)
-def test_a_few_panoramas_that_stray_together_are_strays(
-    count: int, firm: set[Edge], strays: set[int]
-) -> None:
-    steps = np.arange(16.0)
-    steps[4 : 4 + count] += 400.0
-    poses = {row: (np.eye(3), np.array([-step, 0.0, 0.0])) for row, step in enumerate(steps)}
-    assert _strays(Posed(poses, {}), firm) == strays
