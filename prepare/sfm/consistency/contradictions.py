@@ -92,11 +92,9 @@ def find_contradictions(
     steps = [apart(found, it.between) for it in of_tree if found.poses.keys() >= set(it.between)]
     near = _CLOSE * float(np.median(steps or [0.0]))
     agreeing, own, against = _verdicts(evidence, skeleton, found, bound, motion)
-    firm = skeleton.certain if skeleton.ordered else frozenset[Edge]()
     across = _shared_across(skeleton, agreeing) if skeleton.ordered else {}
-    contradictions = [
-        it for pair, it in own if pair.between not in firm or pair.share >= across[pair.between]
-    ]
+    outvoted = {it.between for it, _ in own if it.share < across.get(it.between, 0.0)} & skeleton.certain
+    contradictions = [it for _, it in own if it.between not in outvoted]
     close = [pair for pair in agreeing if apart(found, pair.between) < near]
     contradictions += _fronts(Closeness(evidence, of_tree), skeleton, close, of_tree) if close else []
     sides = components(skeleton.certain, len(evidence.rays))

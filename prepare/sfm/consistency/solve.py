@@ -372,5 +372,6 @@ def _strays(found: Posed, firm: Collection[Edge]) -> set[int]:
         past = np.linalg.norm(centers[count + 1 :] - centers[: -count - 1], axis=1)
         for place in np.flatnonzero((least > _STRAY * np.median(steps)) & (past < least / 2)):
             run = set(rows[place + 1 : place + 1 + count])
-            strays |= run if not any(len(run & {*edge}) == 1 for edge in firm) else set()
+            if not any(len(run & {*edge}) == 1 for edge in firm):
+                strays |= run
     return strays
