@@ -60,8 +60,8 @@ def capture(kind: str, count: int) -> list[tuple[str, int]]:
         case "second" | "third":
             rows = rows[:: 2 + (kind == "third")]
         case "sessions":  # the second with another light, where the first had a gap
-            return [(f"{'ab'[turn]}{row:03d}", row) for turn in (0, 1) for row in range(turn, count, 3)]
-    return [(f"{place:03d}", int(row)) for place, row in enumerate(rows)]
+            return [(f"{'ab'[turn]}{row:04d}", row) for turn in (0, 1) for row in range(turn, count, 3)]
+    return [(f"{place:04d}", int(row)) for place, row in enumerate(rows)]
 
 
 def other_light(picture: Image, seed: int) -> Image:
