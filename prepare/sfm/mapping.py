@@ -15,6 +15,7 @@ Mapper = Literal["incremental", "global"]
 Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 DIRECT = 1000  # panoramas up to which COLMAP's mapper has a direct solver: the other is slow on a chain
+_VERSION = 1  # of what the functions here find: what another version found is not used
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
 _GROWTH = 1.2  # of what is adjusted as a whole: COLMAP's 1.1 takes a third longer and ends in the same poses
 _NEVER = 10**9
@@ -38,10 +39,21 @@ def map_pairs(
     Args: max_error, pixels that an observation may be away from its point; known, a reconstruction of some of
     them, that of others is added to: its poses stay.
     """
-    shutil.rmtree(work.models, ignore_errors=True)
-    work.models.mkdir(parents=True)
-    models = _global(work, progress) if mapper == "global" else _incremental(work, progress, max_error, known)
-    return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    _clear(work)
+    if known is not None:
+        known.write(work.models)
+
+    def find() -> list[pycolmap.Reconstruction]:
+        progress("poses", 0, len(work.numbers))
+        found = _global(work) if mapper == "global" else _incremental(work, progress, max_error, known)
+        return sorted(found, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+    files = [work.database, *sorted(work.models.iterdir())]
+    models = work.once([_VERSION, mapper, max_error, DIRECT], files, find)
+    progress("poses", len(work.numbers), len(work.numbers))
+    if work.sketcher is not None and models:
+        work.sketcher.add(models[0], work.numbers)
+    return models
 
 
 def adjust_poses(
@@ -60,6 +72,23 @@ def adjust_poses(
     camera (3, 3) and (3,), others are left out; max_error, pixels that an observation may be away from its
     point; last, loops are closed and poses right: what fits badly counts for less.
     """
+    placed = [(row, *(part.tobytes() for part in poses[row])) for row in sorted(poses)]
+
+    def adjust() -> list[pycolmap.Reconstruction]:
+        adjusted = _adjusted(work, model, poses, max_error, last)
+        return [] if adjusted is None else [adjusted]
+
+    return next(iter(work.once([_VERSION, placed, max_error, last, DIRECT], [work.database], adjust)), None)
+
+
+def _adjusted(
+    work: Workspace,
+    model: pycolmap.Reconstruction,
+    poses: Mapping[int, Pose],
+    max_error: float,
+    last: bool,
+) -> pycolmap.Reconstruction | None:
+    """The model that `adjust_poses` returns."""
     model, ids = pycolmap.Reconstruction(model), work.ids()
     for number in set(model.reg_image_ids()) - {ids[row] for row in poses}:
         model.deregister_frame(model.image(number).frame_id)
@@ -80,8 +109,7 @@ def adjust_poses(
         options = _options(wider * max_error)
         options.triangulation.create_max_angle_error *= wider
         options.triangulation.continue_max_angle_error *= wider
-        shutil.rmtree(work.models, ignore_errors=True)
-        work.models.mkdir(parents=True)
+        _clear(work)
         try:
             model = pycolmap.triangulate_points(
                 model, work.database, work.images, work.models, options=options
@@ -98,6 +126,12 @@ def adjust_poses(
         # `pycolmap.bundle_adjustment` does the same, but turns COLMAP's log on.
         pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
     return model
+
+
+def _clear(work: Workspace) -> None:
+    """Makes the folder of models empty."""
+    shutil.rmtree(work.models, ignore_errors=True)
+    work.models.mkdir(parents=True)
 
 
 def _drop_far(model: pycolmap.Reconstruction) -> None:
@@ -147,7 +181,6 @@ def _incremental(
         options.ba_global_max_refinements, options.ba_global_max_num_iterations = 1, 1
     models, done = pycolmap.ReconstructionManager(), 2
     if known is not None:
-        known.write(work.models)
         models.read(work.models)
         options.fix_existing_frames = options.load_all_images = True
         options.structure_less_registration_fallback = False  # it needs no points, and so finds no scale
@@ -160,13 +193,11 @@ def _incremental(
         if work.sketcher is not None:
             work.sketcher.add(models.get(models.size() - 1), work.numbers)
 
-    progress("poses", 0, len(work.numbers))
     options.image_path = work.images
     with pycolmap.Database.open(work.database) as database:
         pipeline = pycolmap.IncrementalPipeline(options, database, models)
     pipeline.add_callback(pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK, another)
     pipeline.run()
-    progress("poses", len(work.numbers), len(work.numbers))
     if known is not None:
         _put_back(models.get(0), known)
     return [models.get(number) for number in range(models.size())]
@@ -184,12 +215,9 @@ def _put_back(model: pycolmap.Reconstruction, known: pycolmap.Reconstruction) ->
     model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), shift))
 
 
-def _global(work: Workspace, progress: StageProgress) -> list[pycolmap.Reconstruction]:
+def _global(work: Workspace) -> list[pycolmap.Reconstruction]:
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
     options.num_threads = options.mapper.num_threads = 1  # see above
     options.mapper.global_positioning.use_gpu = options.mapper.bundle_adjustment.ceres.use_gpu = False
-    progress("poses", 0, len(work.numbers))
-    found = list(pycolmap.global_mapping(work.database, work.images, work.models, options).values())
-    progress("poses", len(work.numbers), len(work.numbers))
-    return found
+    return list(pycolmap.global_mapping(work.database, work.images, work.models, options).values())

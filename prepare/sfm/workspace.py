@@ -5,7 +5,7 @@ import json
 import shutil
 import signal
 import threading
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.sketch import Sketcher
 from panolog.scene.errors import SceneError
-from panolog.scene.files import write_bytes
+from panolog.scene.files import atomic_folder, flush, write_bytes
 from panolog.scene.image_files import read_info
 
 _KEY = "key.json"
@@ -68,6 +68,11 @@ class Workspace:
         """Where the mapper writes."""
         return self.folder / "models"
 
+    @property
+    def _found(self) -> Path:
+        """What each step of the search for poses has found."""
+        return self.folder / "found"
+
     @cached_property
     def numbers(self) -> list[str]:
         """The name of each panorama in the database."""
@@ -97,7 +102,7 @@ class Workspace:
         note = self.folder / _KEY
         if note.is_file() and json.loads(note.read_text()) == digest:
             return
-        for leftover in (self.images, self.models):
+        for leftover in (self.images, self.models, self._found):
             shutil.rmtree(leftover, ignore_errors=True)
         self.database.unlink(missing_ok=True)
         self.images.mkdir(parents=True)
@@ -140,6 +145,30 @@ class Workspace:
                 geometry.inlier_matches = matches.astype(np.uint32)
                 some.write_two_view_geometry(a, b, geometry)
         return part
+
+    def once(
+        self, key: object, files: Sequence[Path], make: Callable[[], Sequence[pycolmap.Reconstruction]]
+    ) -> list[pycolmap.Reconstruction]:
+        """The reconstructions that `make` gives, kept in the folder: an interrupted job reads them.
+
+        They are read the first time, too, so that what follows is the same with and without interruption.
+        Args: key, with `files` all that they depend on, as something whose `repr` says it.
+        """
+        digest = hashlib.sha256(repr((pycolmap.__version__, key)).encode())
+        for path in files:
+            with path.open("rb") as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
+        kept = self._found / digest.hexdigest()
+        if not kept.exists():
+            models = make()
+            kept.parent.mkdir(exist_ok=True)
+            with atomic_folder(kept) as folder:
+                for place, model in enumerate(models):
+                    (folder / str(place)).mkdir()
+                    model.write(folder / str(place))
+                for written in (*folder.glob("*/*"), *folder.glob("*")):
+                    flush(written)
+        return [pycolmap.Reconstruction(kept / str(place)) for place in range(len(list(kept.iterdir())))]
 
 
 def file_state(path: Path) -> tuple[int, int]:
