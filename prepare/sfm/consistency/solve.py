@@ -42,6 +42,7 @@ _GUESSES = 4  # times that the next pairs take the place of guesses, before loop
 _LOOSE = 100.0  # relative error of the scale across a link: either side may be a point for the other
 _STRAY = 6.0  # usual steps that panoramas are from those before and after them
 _ASTRAY = 4  # at most one after the other: more may be a way of their own
+_MISFITS = 0.005  # pairs for each panorama that agreed, and do not fit once all is adjusted
 _RIM = 0.1  # share of the panoramas that may be left out without an order: all others agree
 
 
@@ -292,9 +293,9 @@ class Solver:
             return base
         new = self._solution(model, base.evidence, base.skeleton, kept, base.adjusted)
         # More points show more look-alikes, but no more of whether poses are right: what agreed still must.
-        fits = not any(it.between in base.agreeing for it in new.contradictions)
-        same = new.found.poses.keys() == poses.keys()
-        return replace(new, contradictions=base.contradictions) if fits and same else base
+        misfits = sum(it.between in base.agreeing for it in new.contradictions)
+        same = new.found.poses.keys() == poses.keys() and misfits <= _MISFITS * len(poses)
+        return replace(new, contradictions=base.contradictions) if same else base
 
     def _solution(
         self,

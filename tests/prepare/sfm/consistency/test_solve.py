@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from panolog.prepare.sfm.consistency.agreement import Posed, deviations, posed
+from panolog.prepare.sfm.consistency.contradictions import Contradiction, find_contradictions
 from panolog.prepare.sfm.consistency.skeleton import Skeleton
 from panolog.prepare.sfm.consistency.solution import Solution
 from panolog.prepare.sfm.consistency.solve import Solver
@@ -284,6 +285,30 @@ def test_at_last_all_pairs_that_agree_are_matched_along_their_motions(tmp_path: 
     assert found.trusted and _error(place, found) < 0.01
     others = [len(matches) for edge, matches in found.kept.items() if edge not in found.skeleton.tree]
     assert others and np.median(others) > 1.5 * few
+
+
+@pytest.mark.parametrize("misfits", [0, 1])
+def test_of_many_some_pairs_may_fit_less_once_all_is_adjusted(
+    misfits: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, last = "panolog.prepare.sfm.consistency.solve", list[bool]()
+
+    def adjusting(*arguments: Any, **named: Any) -> pycolmap.Reconstruction | None:
+        last.append(named.get("last", False))
+        return adjust_poses(*arguments, **named)
+
+    def contradicting(*arguments: Any) -> list[Contradiction]:
+        return [Contradiction((0, 1), 50, 0)] if any(last) else find_contradictions(*arguments)
+
+    monkeypatch.setattr(f"{module}.adjust_poses", adjusting)
+    monkeypatch.setattr(f"{module}.find_contradictions", contradicting)
+    place = square(tmp_path, count=COUNT)
+    before = sum(map(len, _solve(place).kept.values()))  # one pair in so few panoramas is too many
+    monkeypatch.setattr(f"{module}._MISFITS", misfits / COUNT)
+    last.clear()
+    after = _solve(place)
+    assert after.contradictions == []
+    assert (sum(map(len, after.kept.values())) > before) == (misfits > 0)
 
 
 def test_more_than_the_mapper_adjusts_are_adjusted_in_its_place(
