@@ -154,7 +154,7 @@ def _drop_far(model: pycolmap.Reconstruction) -> None:
 def _options(max_error: float, large: bool) -> pycolmap.IncrementalPipelineOptions:
     """Options of the mapper.
 
-    Args: max_error, pixels that an observation may be away from its point; large, more panoramas than `DIRECT`.
+    Args: max_error, pixels that an observation may be away from its point; large, of more than `DIRECT`.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False

@@ -161,16 +161,15 @@ class Solver:
 
     def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
         """The pairs of these edges with what matches along their motion."""
-
-        def thicker(pair: Pair) -> Pair:
-            motion = self._geometries.motion(pair) if pair.between in edges else None
-            if motion is None:
-                return pair
-            matches = self._guide.along(pair.between, motion)
-            more = len(matches) >= len(pair.matches)
-            return self._geometries.mark(replace(pair, matches=matches), motion) if more else pair
-
-        return replace(evidence, pairs=tuple(map(thicker, evidence.pairs)))
+        pairs = {pair.between: pair for pair in evidence.pairs}
+        for done, edge in enumerate(sorted(pairs.keys() & edges)):
+            self._progress("poses", done, len(edges))
+            if (motion := self._geometries.motion(pairs[edge])) is None:
+                continue
+            matches = self._guide.along(edge, motion)
+            if len(matches) >= len(pairs[edge].matches):
+                pairs[edge] = self._geometries.mark(replace(pairs[edge], matches=matches), motion)
+        return replace(evidence, pairs=tuple(pairs.values()))
 
     def _sides(self, rows: Collection[int]) -> list[set[int]]:
         """The parts of these panoramas that the skeleton connects, but for guesses that are doubted.
