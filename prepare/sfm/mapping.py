@@ -19,7 +19,6 @@ _VERSION = 1  # of what the functions here find: what another version found is n
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
 _GROWTH = 1.2  # of what is adjusted as a whole: COLMAP's 1.1 takes a third longer and ends in the same poses
 _NEVER = 10**9
-_STEPS = 25  # of each adjustment of more than DIRECT: 100 take three times as long, for a thousandth
 _WIDER = 4.0, 1.0, 1.0  # times the bound of errors, one adjustment after the other
 _LOOSE = 0.25  # of the bound of errors: Cauchy's scale
 _MANY = 100  # panoramas that see a point: fewer are no work for the solver, however far it is
@@ -100,13 +99,11 @@ def _adjusted(
     adjustment.print_summary = adjustment.refine_focal_length = adjustment.refine_extra_params = False
     adjustment.ceres.solver_options.num_threads = 1
     adjustment.ceres.max_num_images_direct_sparse_cpu_solver = _NEVER
-    if large := len(poses) > DIRECT:
-        adjustment.ceres.solver_options.max_num_iterations = _STEPS
     if last:
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = _LOOSE * max_error
     for wider in _WIDER[last:]:
-        options = _options(wider * max_error, large)
+        options = _options(wider * max_error)
         options.triangulation.create_max_angle_error *= wider
         options.triangulation.continue_max_angle_error *= wider
         _clear(work)
@@ -151,11 +148,8 @@ def _drop_far(model: pycolmap.Reconstruction) -> None:
         model.delete_point3D(number)
 
 
-def _options(max_error: float, large: bool) -> pycolmap.IncrementalPipelineOptions:
-    """Options of the mapper.
-
-    Args: max_error, pixels that an observation may be away from its point; large, of more than `DIRECT`.
-    """
+def _options(max_error: float) -> pycolmap.IncrementalPipelineOptions:
+    """Options of the mapper; max_error, pixels that an observation may be away from its point."""
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
     options.random_seed = 0
@@ -164,25 +158,24 @@ def _options(max_error: float, large: bool) -> pycolmap.IncrementalPipelineOptio
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.mapper.filter_max_reproj_error = max_error
     options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = max_error
-    if large:  # it is adjusted here: COLMAP takes three quarters of the time for what that does again
-        options.ba_global_max_refinements = options.ba_global_max_num_iterations = 1  # the least
     return options
 
 
 def _incremental(
     work: Workspace, progress: StageProgress, max_error: float, known: pycolmap.Reconstruction | None
 ) -> list[pycolmap.Reconstruction]:
-    large = len(work.numbers) > DIRECT
-    options = _options(max_error, large)
+    options = _options(max_error)
     options.min_model_size = 2
     # By default COLMAP starts from no pair that moves along the optical axis, nor from one below 16 degrees.
     # A panorama has no such axis: of a walk along its z, only pairs misled by repetition would be left.
     options.mapper.init_max_forward_motion = 1.0
     options.mapper.init_min_tri_angle = _FIRST_ANGLE
     options.mapper.abs_pose_min_num_inliers = _LEAST
+    large = len(work.numbers) > DIRECT  # then not as a whole: 1 iteration is the least that COLMAP takes
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _NEVER if large else _GROWTH
     if large:
         options.ba_global_frames_freq = options.ba_global_points_freq = _NEVER
+        options.ba_global_max_refinements, options.ba_global_max_num_iterations = 1, 1
     models, done = pycolmap.ReconstructionManager(), 2
     if known is not None:
         models.read(work.models)
