@@ -4,6 +4,7 @@
 """
 
 import errno
+import hashlib
 import os
 import re
 import secrets
@@ -19,6 +20,7 @@ StrPath: TypeAlias = str | os.PathLike[str]  # what users may give where a path 
 SUFFIX = ".part"
 FULL = (errno.ENOSPC, errno.EDQUOT)  # errors of a disk without room
 _NUMBER = re.compile("0*([0-9]+)")
+_CHUNK = 2**20  # bytes hashed at a time
 Locate = Callable[[Path], Path]  # a path as the run has it -> where the file is on this machine
 
 
@@ -167,6 +169,15 @@ def flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def sha256(path: Path) -> bytes:
+    """The SHA-256 of a file of any size. Raises OSError if it cannot be read."""
+    found = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK):
+            found.update(chunk)
+    return found.digest()
 
 
 def write_all(file: FileIO, content: memoryview) -> None:

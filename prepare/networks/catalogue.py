@@ -19,11 +19,11 @@ from panolog.prepare.networks.depth_maps import make_depth, plan_depth
 from panolog.prepare.networks.manifest import ManifestPart, manifest_path, manifest_task
 from panolog.prepare.networks.masks import MaskJob, make_masks
 from panolog.prepare.networks.movers import MoverNetwork
-from panolog.prepare.networks.network import Network, describe_ends, sha256
+from panolog.prepare.networks.network import Network, describe_ends
 from panolog.prepare.panorama_files import PanoramaFile, list_panoramas
 from panolog.prepare.provenance import read_layer
 from panolog.scene.errors import ConfigError, RunError
-from panolog.scene.files import write_bytes
+from panolog.scene.files import sha256, write_bytes
 from panolog.scene.read import DEPTHS
 from panolog.synthetic.make import make_town
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from panolog.prepare.networks.manifest import Input
 from panolog.prepare.networks.seam import Floats
 from panolog.scene.errors import ConfigError, DeviceError, RunError, in_one_line
+from panolog.scene.files import sha256
 
 DEVICES = {
     "cpu": "CPUExecutionProvider",
@@ -25,7 +26,6 @@ DEVICES = {
 }
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _FATAL = 4  # onnxruntime's log level: its errors are raised as ours, so its own lines would repeat them
-_CHUNK = 2**20  # bytes read at a time to hash a file
 _LONGEST = 200  # characters of an error of onnxruntime
 
 
@@ -168,15 +168,6 @@ def providers(device: str, available: Sequence[str], *, tensorrt: bool) -> list[
     if device == "auto" and not tensorrt:
         usable = usable[1:]
     return [DEVICES[name] for name in usable if DEVICES[name] in available]
-
-
-def sha256(path: Path) -> bytes:
-    """The SHA-256 of a file of any size."""
-    found = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK):
-            found.update(chunk)
-    return found.digest()
 
 
 def model_digest(model: Path, manifest: Path) -> str:

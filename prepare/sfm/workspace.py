@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.sketch import Sketcher
 from panolog.scene.errors import SceneError
-from panolog.scene.files import atomic_folder, flush, write_bytes
+from panolog.scene.files import atomic_folder, flush, sha256, write_bytes
 from panolog.scene.image_files import read_info
 
 _KEY = "key.json"
@@ -156,8 +156,7 @@ class Workspace:
         """
         digest = hashlib.sha256(repr((pycolmap.__version__, key)).encode())
         for path in files:
-            with path.open("rb") as file:
-                digest.update(hashlib.file_digest(file, "sha256").digest())
+            digest.update(sha256(path))
         kept = self._found / digest.hexdigest()
         if not kept.exists():
             models = make()

@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from panolog.orchestrator.runs.folder import RunFolder
-from panolog.orchestrator.runs.storage.layout import INFO, Manifest, StoredFile, current, digest_of
+from panolog.orchestrator.runs.storage.layout import INFO, Manifest, StoredFile, current
 from panolog.orchestrator.runs.storage.lease import holder
 from panolog.orchestrator.runs.storage.state import MirrorState, read_state, write_state
 from panolog.scene.errors import RunFolderError, StoreError
-from panolog.scene.files import atomic
+from panolog.scene.files import atomic, sha256
 from panolog.scene.stores.store import Store, open_store
 from panolog.scene.stores.url import StoreUrl
 
@@ -105,13 +105,13 @@ def for_export(name: str) -> bool:
 
 
 def _fetch_one(store: Store, path: Path, entry: StoredFile) -> None:
-    if path.is_file() and path.stat().st_size == entry.size and digest_of(path) == entry.sha256:
+    if path.is_file() and path.stat().st_size == entry.size and sha256(path).hex() == entry.sha256:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic(path) as temporary:
         for _ in range(_TRIES):  # a truncated answer
             store.get(entry.key, temporary)
-            if temporary.stat().st_size == entry.size and digest_of(temporary) == entry.sha256:
+            if temporary.stat().st_size == entry.size and sha256(temporary).hex() == entry.sha256:
                 break
         else:
             raise StoreError(f"{store.url}/{entry.key}: is not what was stored; its digest differs")

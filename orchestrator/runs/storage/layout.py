@@ -31,7 +31,6 @@ OBJECTS, MANIFESTS, POINTERS, LEASES = (
 DATABASE, INFO = "run.db", "run.json"
 _TRIES = 5  # of a pointer whose manifest is replaced while it is read
 _MOST = 2**30  # bytes of a manifest, uncompressed
-_PIECE = 2**22  # bytes hashed at a time
 # What is not copied out: it is of this machine, or a resumed driver makes it anew.
 _LOCAL = ("store", "control", "lock", "supervisor", "driver", "tensorboard", DATABASE, f"{DATABASE}-journal")
 _REMADE = ("initial.ply", "snapshot.safetensors")
@@ -135,15 +134,6 @@ def read_manifest(store: Store, name: str) -> Manifest:
     if packed is None:
         raise StoreError(f"{store.url}/{name}: is gone")
     return _unpacked(store, name, packed)
-
-
-def digest_of(path: Path) -> str:
-    """sha256 of a file. Raises OSError if it cannot be read."""
-    found = sha256()
-    with path.open("rb") as file:
-        while piece := file.read(_PIECE):
-            found.update(piece)
-    return found.hexdigest()
 
 
 def _unpacked(store: Store, name: str, packed: bytes) -> Manifest:

@@ -30,7 +30,6 @@ from panolog.orchestrator.runs.storage.layout import (
     POINTERS,
     Manifest,
     StoredFile,
-    digest_of,
     is_result,
     is_work,
     mirrored,
@@ -40,6 +39,7 @@ from panolog.orchestrator.runs.storage.layout import (
 from panolog.orchestrator.runs.storage.lease import Lease
 from panolog.orchestrator.runs.storage.state import MirrorState, write_state
 from panolog.scene.errors import RunFolderError, RunLockedError, StoreError, StoreLostError, in_one_line
+from panolog.scene.files import sha256
 from panolog.scene.stores.store import Store
 
 _THREADS = 4  # files stored at a time
@@ -210,7 +210,7 @@ class Mirror:
         """Stores a file that does not change as a new object, unless a known one has the same bytes."""
         status = path.stat()
         key = f"{OBJECTS}/{name}/{time.time_ns():x}-{secrets.token_hex(4)}"
-        entry = StoredFile(key, status.st_size, digest_of(path), status.st_mtime_ns)
+        entry = StoredFile(key, status.st_size, sha256(path).hex(), status.st_mtime_ns)
         if known is not None and (known.size, known.sha256) == (entry.size, entry.sha256):
             return known
         self._note(key)

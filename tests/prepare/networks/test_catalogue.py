@@ -11,7 +11,7 @@ from onnx import helper
 from panolog.prepare.networks import catalogue
 from panolog.prepare.networks.catalogue import Known, known_networks
 from panolog.prepare.networks.manifest import MaskManifest, read_manifest
-from panolog.prepare.networks.network import sha256
+from panolog.scene.files import sha256
 from tests.orchestrator.cli.program import call, one_line, shown
 from tests.prepare.networks.networks import CHANNELS, channel, given, red_depth, save
 
