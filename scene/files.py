@@ -95,8 +95,8 @@ def atomic(path: Path) -> Iterator[Path]:
 def atomic_folder(folder: Path) -> Iterator[Path]:
     """Yields an empty folder next to `folder`, which takes its place when the block ends well.
 
-    What was there is removed; a power cut between the two renames leaves it as `.NAME.….part`. If the block
-    raises, it stays.
+    Its files are on the disk before its name is. What was there is removed; a power cut between the two
+    renames leaves it as `.NAME.….part`. If the block raises, it stays.
 
     Raises OSError: the folder above is missing or cannot be written, or the disk is full.
     """
@@ -106,6 +106,8 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     try:
         with _named(folder, new):
             yield new
+            for written in (*new.rglob("*"), new):
+                flush(written)
         if folder.exists():
             folder.rename(old)
         try:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from panolog.scene.errors import FormatError
-from panolog.scene.files import atomic_folder, flush
+from panolog.scene.files import atomic_folder
 
 META, INDEX = "meta.json", "lod-meta.json"  # of a SOG, and of one that streams
 GENERATOR = "panolog"
@@ -35,12 +35,10 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
 
 def save(folder: Path, files: dict[str, bytes]) -> None:
-    """Writes files into a folder, and waits until they are on the disk. Raises OSError."""
+    """Writes files into a folder. Raises OSError."""
     folder.mkdir(exist_ok=True)
     for name, data in files.items():
         (folder / name).write_bytes(data)
-        flush(folder / name)
-    flush(folder)
 
 
 def _check(folder: Path) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.sketch import Sketcher
 from panolog.scene.errors import SceneError
-from panolog.scene.files import atomic_folder, flush, sha256, write_bytes
+from panolog.scene.files import atomic_folder, sha256, write_bytes
 from panolog.scene.image_files import read_info
 
 _KEY = "key.json"
@@ -165,8 +165,6 @@ class Workspace:
                 for place, model in enumerate(models):
                     (folder / str(place)).mkdir()
                     model.write(folder / str(place))
-                for written in (*folder.glob("*/*"), *folder.glob("*")):
-                    flush(written)
         return [pycolmap.Reconstruction(kept / str(place)) for place in range(len(list(kept.iterdir())))]
 
 

@@ -28,6 +28,21 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_folder_appears_once_its_files_are_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flushed, folder = list[str](), tmp_path / "a"
+
+    def noted(path: Path) -> None:
+        flushed.append("" if folder.exists() else path.name)
+
+    monkeypatch.setattr("panolog.scene.files.flush", noted)
+    with atomic_folder(folder) as new:
+        (new / "part").mkdir()
+        (new / "part" / "file").touch()
+    assert sorted(flushed) == ["", *sorted([new.name, "part", "file"])]  # at last the folder that names it
+
+
 @pytest.mark.parametrize("writer", [atomic, atomic_folder])
 def test_an_error_names_what_is_written(
     tmp_path: Path, writer: Callable[[Path], AbstractContextManager[Path]]
