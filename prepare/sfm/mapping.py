@@ -1,6 +1,5 @@
 """From matches to poses and points, by COLMAP's incremental or global mapper."""
 
-import shutil
 from collections.abc import Mapping
 from typing import Literal
 
@@ -38,7 +37,7 @@ def map_pairs(
     Args: max_error, pixels that an observation may be away from its point; known, a reconstruction of some of
     them, that of others is added to: its poses stay.
     """
-    _clear(work)
+    work.clear_models()
     if known is not None:
         known.write(work.models)
 
@@ -48,7 +47,7 @@ def map_pairs(
         return sorted(found, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
     files = [work.database, *sorted(work.models.iterdir())]
-    models = work.once([_VERSION, mapper, max_error, DIRECT], files, find)
+    models = work.once([_VERSION, mapper, max_error], files, find)
     progress("poses", len(work.numbers), len(work.numbers))
     if work.sketcher is not None and models:
         work.sketcher.add(models[0], work.numbers)
@@ -77,7 +76,7 @@ def adjust_poses(
         adjusted = _adjusted(work, model, poses, max_error, last)
         return [] if adjusted is None else [adjusted]
 
-    return next(iter(work.once([_VERSION, placed, max_error, last, DIRECT], [work.database], adjust)), None)
+    return next(iter(work.once([_VERSION, placed, max_error, last], [work.database], adjust)), None)
 
 
 def _adjusted(
@@ -106,7 +105,7 @@ def _adjusted(
         options = _options(wider * max_error)
         options.triangulation.create_max_angle_error *= wider
         options.triangulation.continue_max_angle_error *= wider
-        _clear(work)
+        work.clear_models()
         try:
             model = pycolmap.triangulate_points(
                 model, work.database, work.images, work.models, options=options
@@ -123,12 +122,6 @@ def _adjusted(
         # `pycolmap.bundle_adjustment` does the same, but turns COLMAP's log on.
         pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
     return model
-
-
-def _clear(work: Workspace) -> None:
-    """Makes the folder of models empty."""
-    shutil.rmtree(work.models, ignore_errors=True)
-    work.models.mkdir(parents=True)
 
 
 def _drop_far(model: pycolmap.Reconstruction) -> None:

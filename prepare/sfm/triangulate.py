@@ -1,6 +1,5 @@
 """Points for formats with poses only: features, matches between neighbours, triangulation, poses kept."""
 
-import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -74,8 +73,7 @@ def points_of(
 
     Raises RuntimeError or ValueError: pycolmap finds none.
     """
-    shutil.rmtree(work.models, ignore_errors=True)
-    work.models.mkdir()
+    work.clear_models()
     model = _model(work, images, size)
     return pycolmap.triangulate_points(model, work.database, work.images, work.models)
 

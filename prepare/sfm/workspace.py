@@ -115,6 +115,11 @@ class Workspace:
                 (self.images / number).symlink_to(panorama.path.resolve())
         write_bytes(note, json.dumps(digest).encode())
 
+    def clear_models(self) -> None:
+        """Makes the folder where the mapper writes, empty."""
+        shutil.rmtree(self.models, ignore_errors=True)
+        self.models.mkdir(parents=True)
+
     def with_pairs(
         self, kept: Mapping[tuple[int, int], NDArray[np.int64]], name: str, given: Collection[int] = ()
     ) -> "Workspace":

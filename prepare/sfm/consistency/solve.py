@@ -162,8 +162,9 @@ class Solver:
     def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
         """The pairs of these edges with what matches along their motion."""
         pairs = {pair.between: pair for pair in evidence.pairs}
-        for done, edge in enumerate(sorted(pairs.keys() & edges)):
-            self._progress("poses", done, len(edges))
+        verified = sorted(pairs.keys() & edges)
+        for done, edge in enumerate(verified):
+            self._progress("poses", done, len(verified))
             if (motion := self._geometries.motion(pairs[edge])) is None:
                 continue
             matches = self._guide.along(edge, motion)

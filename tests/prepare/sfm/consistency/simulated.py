@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from panolog.prepare.panorama_files import PanoramaFile
-from panolog.prepare.sfm.workspace import Workspace
+from panolog.prepare.sfm.consistency.solution import Solution
+from panolog.prepare.sfm.consistency.solve import Solver
+from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.projection import project_to_fractions
+from panolog.scene.write import no_progress
 
 Array = NDArray[np.float64]
 SIZE = (1024, 512)
@@ -28,6 +31,12 @@ class Place:
 
     centers: Array  # (K, 3)
     work: Workspace
+
+
+def parts_of(place: Place) -> list[Solution]:
+    """What is found of a place, of at least three panoramas, the largest part first."""
+    with silence_colmap():
+        return Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
 
 
 def square(

@@ -15,11 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.sfm.consistency.solution import Solution
-from panolog.prepare.sfm.consistency.solve import Solver
-from panolog.prepare.sfm.workspace import silence_colmap
-from panolog.scene.write import no_progress
 from tests.prepare.sfm.accuracy import drift
-from tests.prepare.sfm.consistency.simulated import SIZE, Place, square
+from tests.prepare.sfm.consistency.simulated import Place, parts_of, square
 from tests.prepare.sfm.consistency.streets import Grid, town
 
 _RIGHT = 0.1  # metres rms, where the next side of the square is 12 off
@@ -69,8 +66,7 @@ class Streets(Grid):
 
 
 def _outcome(place: Place, right: float) -> str:
-    with silence_colmap():
-        parts = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    parts = parts_of(place)
     if not parts:
         return "refused"
     if any(off(part, place.centers) > right for part in parts):

@@ -8,10 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from panolog.prepare.sfm.consistency.solve import Solver
-from panolog.prepare.sfm.workspace import silence_colmap
-from panolog.scene.write import no_progress
-from tests.prepare.sfm.consistency.simulated import SIZE, Place, square
+from tests.prepare.sfm.consistency.simulated import Place, parts_of, square
 
 pytestmark = pytest.mark.system
 
@@ -19,8 +16,7 @@ COUNT = 16  # panoramas
 
 
 def _poses(place: Place) -> dict[int, bytes]:
-    with silence_colmap():
-        (found,) = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    (found,) = parts_of(place)
     return {row: b"".join(part.tobytes() for part in pose) for row, pose in found.found.poses.items()}
 
 

@@ -22,7 +22,7 @@ from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.write import no_progress
 from tests.prepare.sfm.accuracy import drift, length
-from tests.prepare.sfm.consistency.simulated import SIZE, Place, square
+from tests.prepare.sfm.consistency.simulated import SIZE, Place, parts_of, square
 from tests.prepare.sfm.consistency.sweep import off
 
 pytestmark = pytest.mark.system
@@ -31,8 +31,7 @@ COUNT = 16  # panoramas, four for each side
 
 
 def _solve(place: Place) -> Solution:
-    with silence_colmap():
-        (found,) = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    (found,) = parts_of(place)
     return found
 
 
@@ -133,8 +132,7 @@ def test_a_jump_to_a_look_alike_with_what_lies_between_missing_is_not_trusted(
 def test_where_it_is_cut_a_guess_that_nothing_contradicts_stays(tmp_path: Path) -> None:
     """The walk jumps to a look-alike, and in the end next to where it began."""
     place = square(tmp_path, count=24, order=np.array([*range(8), *range(19, 9, -1), 22, 23]))
-    with silence_colmap():
-        parts = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    parts = parts_of(place)
     assert [{*part.found.poses} for part in parts] == [{*range(8), 18, 19}, {*range(8, 18)}]
 
 
@@ -206,8 +204,7 @@ def test_a_panorama_that_what_agrees_does_not_reach_is_added_last(
             if row in shared:
                 geometry.inlier_matches = geometry.inlier_matches[:60]  # of a front
                 database.write_two_view_geometry(ids[row], ids[last], geometry)
-    with silence_colmap():
-        (found,) = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    (found,) = parts_of(place)
     assert last not in {row for edge in found.skeleton.tree for row in edge}
     assert (last in found.found.poses) == added
     assert found.trusted and off(found, place.centers) < 0.1
@@ -238,8 +235,7 @@ def test_what_has_shrunk_to_a_point_is_another_part(tmp_path: Path, monkeypatch:
         return models
 
     monkeypatch.setattr("panolog.prepare.sfm.consistency.solve.map_pairs", shrinking)
-    with silence_colmap():
-        found = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    found = parts_of(place)
     assert [sorted(part.found.poses) for part in found] == [[*range(behind)], [*range(behind, COUNT)]]
     assert max(off(part, place.centers) for part in found) < 0.1
 
@@ -256,8 +252,7 @@ def test_what_nothing_holds_the_scale_of_is_another_part(
 
     monkeypatch.setattr("panolog.prepare.sfm.consistency.solution.links_of", links)
     place = square(tmp_path, count=COUNT)
-    with silence_colmap():
-        found = Solver(place.work, SIZE, "incremental", 2.0, no_progress).parts(3)
+    found = parts_of(place)
     assert [sorted(part.found.poses) for part in found] == [[*range(10)], [*range(10, COUNT)]]
 
 
