@@ -46,8 +46,7 @@ def map_pairs(
         found = _global(work) if mapper == "global" else _incremental(work, progress, max_error, known)
         return sorted(found, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
-    files = [work.database, *sorted(work.models.iterdir())]
-    models = work.once([_VERSION, mapper, max_error], files, find)
+    models = work.once([_VERSION, mapper, max_error], sorted(work.models.iterdir()), find)
     progress("poses", len(work.numbers), len(work.numbers))
     if work.sketcher is not None and models:
         work.sketcher.add(models[0], work.numbers)
@@ -76,7 +75,7 @@ def adjust_poses(
         adjusted = _adjusted(work, model, poses, max_error, last)
         return [] if adjusted is None else [adjusted]
 
-    return next(iter(work.once([_VERSION, placed, max_error, last], [work.database], adjust)), None)
+    return next(iter(work.once([_VERSION, placed, max_error, last], [], adjust)), None)
 
 
 def _adjusted(

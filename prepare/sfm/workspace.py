@@ -5,7 +5,7 @@ import json
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -52,6 +52,7 @@ class Workspace:
     panoramas: tuple[PanoramaFile, ...]
     name: str = "database.db"
     sketcher: Sketcher | None = None  # shows the poses as they are found
+    digest: str = ""  # of the database, if `with_pairs` has written it: COLMAP changes the file by opening it
 
     @property
     def database(self) -> Path:
@@ -149,17 +150,17 @@ class Workspace:
                 geometry = all_.read_two_view_geometry(a, b)
                 geometry.inlier_matches = matches.astype(np.uint32)
                 some.write_two_view_geometry(a, b, geometry)
-        return part
+        return replace(part, digest=sha256(part.database))
 
     def once(
-        self, key: object, files: Sequence[Path], make: Callable[[], Sequence[pycolmap.Reconstruction]]
+        self, key: object, files: Iterable[Path], make: Callable[[], Sequence[pycolmap.Reconstruction]]
     ) -> list[pycolmap.Reconstruction]:
         """The reconstructions that `make` gives, kept in the folder: an interrupted job reads them.
 
         They are read the first time, too, so that what follows is the same with and without interruption.
-        Args: key, with `files` all that they depend on, as something whose `repr` says it.
+        Args: key, with `files` and the database all that they depend on, as something whose `repr` says it.
         """
-        digest = hashlib.sha256(repr((pycolmap.__version__, key)).encode())
+        digest = hashlib.sha256(repr((pycolmap.__version__, self.digest, key)).encode())
         for path in files:
             digest.update(sha256(path))
         kept = self._found / digest.hexdigest()
