@@ -228,15 +228,13 @@ class Solver:
 
         Those that contradict are left out. The poses of the others stay.
         """
-        pairs, found = base.evidence.pairs, base.found.poses.keys()
+        pairs, found = list(base.evidence.pairs), base.found.poses.keys()
         rest = {row for pair in pairs for row in pair.between} - found
         while rest:
-            theirs = {
-                it.between: it.matches
-                for it in pairs
-                if rest & {*it.between} and {*it.between} <= rest | found
-            }
-            new = self._mapped(base.evidence, base.skeleton, base.agreeing | theirs, "incremental", base)
+            pairs = [it for it in pairs if {*it.between} <= rest | found]
+            theirs = {it.between: it.matches for it in pairs if rest & {*it.between}}
+            kept = {it.between: base.agreeing[it.between] for it in pairs if it.between in base.agreeing}
+            new = self._mapped(base.evidence, base.skeleton, kept | theirs, "incremental", base)
             if new is None:
                 break
             if not (wrong := {row for it in new.contradictions for row in it.between} & rest):
