@@ -39,11 +39,11 @@ Array = NDArray[np.float64]
 _TURNED = 2.5, 0.5  # degrees that a loop may be open, and more for the root of the steps on its way
 _GROWN = 0.1, 0.04  # the same for the logarithm of the scale
 _MOVED = 0.3, 0.05  # usual steps that it may be open, and more for each step on its way
-_SURE = 10  # steps of a way: longer loops are closed first if another one near them says the same
 _NEAR = 6.0  # usual steps between the ends of two loops that may say the same
 _SAME = 1.5, 7.5, 0.2  # usual steps, degrees, logarithm of the scale that they differ at most, together
-_LEVELS = (0.5, False), (1.0, False), (2.0, False), (2.0, True)  # of what a loop is expected to be open, and
-# whether none must confirm it: those below are closed before the others
+_LEVELS = (0.5, 10), (1.0, 10), (1.0, 100)  # of what loops are expected to be open that another one confirms,
+# and steps of the ways of those that none must confirm: those below are closed before the others
+_IN_ORDER = 2.0  # times as far those of neighbours may be open, which the order of capture confirms
 _LEAST_OPEN = 25  # percent of the loops: they show how much a walk drifts
 _TIMES = 10.0  # as far as these, others may be open
 _FARTHER, _SHORT = 1.5, 5  # times the shortest way, and steps: loops below both are closed together
@@ -110,13 +110,18 @@ def closed(
     motion: Callable[[Pair], Motion | None],
     fixed: Collection[Edge] = (),
     drift: float | None = None,
+    *,
+    ordered: bool = False,
+    contradicting: Collection[Edge] = (),
 ) -> tuple[Posed, float]:
     """The poses and points of a reconstruction once loops are closed that drift has left open, and the drift.
 
     Neighbours are the pairs of the tree, and those that share points: what is mapped together agrees.
     Args: motion, of the camera between the panoramas of a pair; fixed, pairs of panoramas whose poses do not
         change against each other; drift, how far loops may be open, as a share of what a long walk's may be:
-        at most 1, and by default what most of these loops show.
+        at most 1, and by default what most of these loops show; ordered, panoramas are in the order of
+        capture, which confirms loops between neighbours; contradicting, pairs of the tree that do not fit the
+        poses: what they say is a loop, too.
     """
     rows = sorted(found.poses)
     place = {row: number for number, row in enumerate(rows)}
@@ -124,8 +129,8 @@ def closed(
     shared = {edge: float(shared_points(found, pair)) for edge, pair in pairs.items()}
     held = {edge: count for edge, count in shared.items() if edge in tree or count >= LEAST}
     usual = max(1.0, float(np.median(list(held.values()) or [0.0])))
-    rest = [measured(found, evidence, pair, motion(pair)) for edge, pair in pairs.items() if edge not in held]
-    loops = relations_of(rest, place, usual)
+    rest = [pair for edge, pair in pairs.items() if edge not in held or edge in contradicting]
+    loops = relations_of([measured(found, evidence, it, motion(it)) for it in rest], place, usual)
     unchanged = found, 1.0 if drift is None else drift
     if not held or not len(loops.ends):
         return unchanged
@@ -140,18 +145,19 @@ def closed(
     if graph.step == 0:
         return unchanged
     drift = _drift(graph, carried, loops) if drift is None else drift
-    _close(graph, carried, loops, drift)
+    _close(graph, carried, loops, drift, ordered)
     return _moved(found, rows, graph), drift
 
 
 def _drift(graph: _Graph, carried: Relations, loops: Relations) -> float:
     """How far loops may be open, as those show that are least open."""
     far = _far(_ways(carried, loops.ends, len(graph.axes)), *graph.open(loops))
-    return min(1.0, _TIMES * float(np.percentile(far, _LEAST_OPEN)))
+    return min(1.0, _TIMES * float(np.percentile(np.minimum(far, 1.0), _LEAST_OPEN)))
 
 
-def _close(graph: _Graph, carried: Relations, loops: Relations, drift: float) -> None:
+def _close(graph: _Graph, carried: Relations, loops: Relations, drift: float, ordered: bool) -> None:
     """Closes the loops that the way between may explain, the shortest first."""
+    neighbours = ordered & (loops.ends[:, 1] - loops.ends[:, 0] == 1)
     taken, level = np.zeros(len(loops.ends), np.bool_), 0
     for _ in range(_TURNS):
         if taken.any():
@@ -164,8 +170,9 @@ def _close(graph: _Graph, carried: Relations, loops: Relations, drift: float) ->
         far = _far(steps, turned, grown, moved)
         says = np.concatenate([graph.places(rest) / _NEAR, moved / _SAME[0], turned / _SAME[1]], axis=1)
         confirmed = _confirmed(np.column_stack([says, grown / _SAME[2]]))
-        most, alone = _LEVELS[level]
-        fit = ((far < drift) & (steps <= _SURE)) | ((far < most * drift) & (confirmed | alone))
+        most, sure = _LEVELS[level]
+        fit = ((far < drift) & (steps <= sure)) | ((far < most * drift) & confirmed)
+        fit |= (far < _IN_ORDER * most * drift) & neighbours[~taken]
         if fit.any():
             taken[left[fit & (steps <= max(_FARTHER * steps[fit].min(), _SHORT))]] = True
         elif (level := level + 1) == len(_LEVELS):

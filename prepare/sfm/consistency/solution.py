@@ -70,14 +70,16 @@ class Solution:
 
     @cached_property
     def _closed(self) -> tuple[Posed, float]:
-        tree, star = self.skeleton.tree, self.skeleton.star
-        return closed(self.found, self.evidence, tree, self.motion, star, self.given_drift)
+        it, others = self.skeleton, (self.motion, self.skeleton.star, self.given_drift)
+        own = {contradiction.between for contradiction in self.contradictions} & it.certain
+        return closed(self.found, self.evidence, it.tree, *others, ordered=it.ordered, contradicting=own)
 
     @cached_property
     def open(self) -> list[Contradiction]:
         """The contradictions to it once loops are closed, for which pairs of the tree give way."""
         against = find_contradictions(self.evidence, self.skeleton, self.closed, CLOSE, self.motion)
-        own = [it for it in self.contradictions if it.between in self.skeleton.tree]
+        still = {it.between for it in against} | self.skeleton.guessed
+        own = [it for it in self.contradictions if it.between in self.skeleton.tree and it.between in still]
         return [*own, *(it for it in against if it.between not in self.skeleton.tree)]
 
     @cached_property
