@@ -155,9 +155,15 @@ class Solver:
     def _without(self, base: Solution, loose: Collection[int]) -> Solution | None:
         """The reconstruction of the other panoramas of one by their pairs that agree with it."""
         rows = base.found.poses.keys() - loose
-        if base.adjusted and (adjusted := self._adjusted(base, rows)):
-            return adjusted
-        return self._guessed(rows, {it: base.agreeing[it] for it in base.agreeing if rows >= {*it}})
+        kept = {edge: own for edge, own in base.agreeing.items() if rows >= {*edge}}
+        if not base.adjusted:
+            return self._guessed(rows, kept)
+        model = pycolmap.Reconstruction(base.model)
+        for row in loose:
+            model.deregister_frame(model.image(self._ids[row]).frame_id)
+        return self._solution(
+            model, base.evidence.among(rows), base.skeleton.among(rows), kept, adjusted=True
+        )
 
     def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
         """The pairs of these edges with what matches along their motion."""
@@ -194,7 +200,8 @@ class Solver:
             # The tree alone is not judged by all that its poses decide.
             if best is None or turn == 1 or new.rank >= best.rank:
                 best = new
-            if new.settled or refuted or turn == _ROUNDS:
+            final = reached and new.adjusted and new.trusted  # but for the last adjustment
+            if new.settled or final or refuted or turn == _ROUNDS:
                 break
             adjusted = self._adjusted(new, range(len(self._ids))) if new.adjusted or new.drifted else None
             new = adjusted or self._mapped(new.evidence, new.skeleton, new.agreeing, self._mapper)

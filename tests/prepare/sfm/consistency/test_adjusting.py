@@ -1,6 +1,5 @@
 """Poses that are adjusted as a whole: once loops are closed, where the mapper drifts, and at last."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from panolog.prepare.sfm.consistency.agreement import posed
 from panolog.prepare.sfm.consistency.contradictions import Contradiction, find_contradictions
 from panolog.prepare.sfm.consistency.solution import Solution
 from panolog.prepare.sfm.mapping import _drop_far, adjust_poses, map_pairs
-from panolog.prepare.sfm.workspace import silence_colmap
+from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from tests.prepare.sfm.accuracy import drift
 from tests.prepare.sfm.consistency.simulated import Place, parts_of, square
 from tests.prepare.sfm.consistency.sweep import off
@@ -54,27 +53,54 @@ def test_of_many_some_pairs_may_fit_less_once_all_is_adjusted(
     assert (sum(map(len, after.kept.values())) > before) == (misfits > 0)
 
 
+def _noted(monkeypatch: pytest.MonkeyPatch, missing: int | None = None) -> list[str]:
+    """What is called from now on, with fewer panoramas that COLMAP's mapper adjusts.
+
+    Args: missing, one that has no pose at first.
+    """
+    module, calls = "panolog.prepare.sfm.consistency.solve", list[str]()
+
+    def mapping(work: Workspace, *others: Any) -> list[pycolmap.Reconstruction]:
+        models = map_pairs(work, *others)
+        if missing is not None and "map" not in calls:
+            models[0].deregister_frame(models[0].image(work.ids()[missing]).frame_id)
+        calls.append("map")
+        return models
+
+    def adjusting(*arguments: Any, last: bool = False) -> pycolmap.Reconstruction | None:
+        calls.append("adjust at last" if last else "adjust")
+        return adjust_poses(*arguments, last=last)
+
+    for name in (f"{module}.DIRECT", "panolog.prepare.sfm.mapping.DIRECT"):
+        monkeypatch.setattr(name, COUNT - 1)
+    monkeypatch.setattr(f"{module}.map_pairs", mapping)
+    monkeypatch.setattr(f"{module}.adjust_poses", adjusting)
+    return calls
+
+
 def test_more_than_the_mapper_adjusts_are_adjusted_in_its_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What it maps of them drifts: it is adjusted before it is judged, and not mapped again."""
-    module, calls = "panolog.prepare.sfm.consistency.solve", list[str]()
-
-    def noted(call: Callable[..., Any]) -> Callable[..., Any]:
-        def noting(*arguments: Any, **named: Any) -> Any:
-            calls.append(call.__name__)
-            return call(*arguments, **named)
-
-        return noting
-
-    for name in (f"{module}.DIRECT", "panolog.prepare.sfm.mapping.DIRECT"):
-        monkeypatch.setattr(name, COUNT - 1)
-    for call in (map_pairs, adjust_poses):
-        monkeypatch.setattr(f"{module}.{call.__name__}", noted(call))
-    place = square(tmp_path, count=COUNT)
+    calls, place = _noted(monkeypatch), square(tmp_path, count=COUNT)
     found = _solve(place)
     assert found.trusted and off(found, place.centers) < 0.01
-    assert found.adjusted and calls[:2] == ["map_pairs", "adjust_poses"] and calls.count("map_pairs") == 1
+    assert found.adjusted and calls[:2] == ["map", "adjust"] and calls.count("map") == 1
+
+
+def test_what_is_added_to_many_or_left_out_is_adjusted_at_last_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls, place, added, left_out = _noted(monkeypatch, missing=13), square(tmp_path, count=COUNT), 13, 5
+    monkeypatch.setattr("panolog.prepare.sfm.consistency.solve._unconfirmed", lambda _: {left_out})
+    for module in ("solve", "solution"):
+        monkeypatch.setattr(
+            f"panolog.prepare.sfm.consistency.{module}.SETTLED", 1.5 / COUNT
+        )  # one may be missing
+    (found,) = parts_of(place)
+    assert found.trusted and off(found, place.centers) < 0.01
+    assert added in found.found.poses and found.found.poses.keys() == {*range(COUNT)} - {left_out}
+    assert calls.count("map") == 2 and calls[-2:] == ["map", "adjust at last"]
 
 
 def test_points_that_many_see_in_one_direction_are_left_out(
