@@ -52,7 +52,7 @@ class Workspace:
     panoramas: tuple[PanoramaFile, ...]
     name: str = "database.db"
     sketcher: Sketcher | None = None  # shows the poses as they are found
-    digest: str = ""  # of the database, if `with_pairs` has written it: COLMAP changes the file by opening it
+    digest: bytes = b""  # of what `with_pairs` has written: COLMAP changes the file by opening it
 
     @property
     def database(self) -> Path:

@@ -119,14 +119,15 @@ def test_a_loop_stays_open_that_the_way_does_not_explain(turned: float, loops: i
 def test_the_order_of_capture_confirms_neighbours(
     turned: float, ordered: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Their loops may be open farther than others, as the order tells them from look-alikes."""
+    """Their loops may be open farther than others, as the order distinguishes them from look-alikes."""
     monkeypatch.setattr("panolog.prepare.sfm.consistency.closing._LEVELS", ((1.0, 10),))
     walk, rows = (
         _walk(turned, 1.0, RETURN[:1]),
         [0, *range(2, 59), 1, 59],
     )  # the ends of the loop are neighbours
     before, evidence = walk.found, walk.evidence
-    poses, points = ({new: it[old] for old, new in enumerate(rows)} for it in (before.poses, before.points))
+    poses = {new: before.poses[old] for old, new in enumerate(rows)}
+    points = {new: before.points[old] for old, new in enumerate(rows)}
     places = np.argsort(rows).tolist()
     pairs = [replace(it, between=tuple(rows[row] for row in it.between)) for it in evidence.pairs]
     found = Posed(poses, points)
