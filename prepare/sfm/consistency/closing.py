@@ -33,7 +33,7 @@ from panolog.prepare.sfm.consistency.similarity import (
     relations_of,
     shared_points,
 )
-from panolog.prepare.sfm.consistency.skeleton import Edge
+from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton
 
 Array = NDArray[np.float64]
 _TURNED = 2.5, 0.5  # degrees that a loop may be open, and more for the root of the steps on its way
@@ -106,35 +106,33 @@ class _Graph:
 def closed(
     found: Posed,
     evidence: Evidence,
-    tree: Collection[Edge],
+    skeleton: Skeleton,
     motion: Callable[[Pair], Motion | None],
-    fixed: Collection[Edge] = (),
     drift: float | None = None,
-    *,
-    ordered: bool = False,
     contradicting: Collection[Edge] = (),
 ) -> tuple[Posed, float]:
     """The poses and points of a reconstruction once loops are closed that drift has left open, and the drift.
 
     Neighbours are the pairs of the tree, and those that share points: what is mapped together agrees.
-    Args: motion, of the camera between the panoramas of a pair; fixed, pairs of panoramas whose poses do not
-        change against each other; drift, how far loops may be open, as a share of what a long walk's may be:
-        at most 1, and by default what most of these loops show; ordered, panoramas are in the order of
-        capture, which confirms loops between neighbours; contradicting, pairs of the tree that do not fit the
-        poses: what they say is a loop, too.
+    Args: skeleton, whose given panoramas do not change against each other, and whose order of capture, if it
+        has one, confirms loops between neighbours; motion, of the camera between the panoramas of a pair;
+        drift, how far loops may be open, as a share of what a long walk's may be: at most 1, and by default
+        what most of these loops show; contradicting, pairs that do not fit the poses: what those of the tree
+        that are no guesses say is a loop, too.
     """
     rows = sorted(found.poses)
     place = {row: number for number, row in enumerate(rows)}
     pairs = {it.between: it for it in evidence.pairs if found.poses.keys() >= set(it.between)}
     shared = {edge: float(shared_points(found, pair)) for edge, pair in pairs.items()}
-    held = {edge: count for edge, count in shared.items() if edge in tree or count >= LEAST}
+    held = {edge: count for edge, count in shared.items() if edge in skeleton.tree or count >= LEAST}
     usual = max(1.0, float(np.median(list(held.values()) or [0.0])))
-    rest = [pair for edge, pair in pairs.items() if edge not in held or edge in contradicting]
+    doubted = skeleton.certain.intersection(contradicting)
+    rest = [pair for edge, pair in pairs.items() if edge not in held or edge in doubted]
     loops = relations_of([measured(found, evidence, it, motion(it)) for it in rest], place, usual)
     unchanged = found, 1.0 if drift is None else drift
     if not held or not len(loops.ends):
         return unchanged
-    held |= dict.fromkeys([edge for edge in fixed if found.poses.keys() >= set(edge)], _FIXED * usual)
+    held |= dict.fromkeys([edge for edge in skeleton.star if found.poses.keys() >= set(edge)], _FIXED * usual)
     carried = relations_of([as_posed(found, edge, held[edge]) for edge in sorted(held)], place, usual)
     graph = _Graph(
         np.array([found.poses[row][0].T for row in rows]),
@@ -145,7 +143,7 @@ def closed(
     if graph.step == 0:
         return unchanged
     drift = _drift(graph, carried, loops) if drift is None else drift
-    _close(graph, carried, loops, drift, ordered)
+    _close(graph, carried, loops, drift, skeleton.ordered)
     return _moved(found, rows, graph), drift
 
 

@@ -70,17 +70,21 @@ class Solution:
 
     @cached_property
     def _closed(self) -> tuple[Posed, float]:
-        it, others = self.skeleton, (self.motion, self.skeleton.star, self.given_drift)
-        own = {contradiction.between for contradiction in self.contradictions} & it.certain
-        return closed(self.found, self.evidence, it.tree, *others, ordered=it.ordered, contradicting=own)
+        against = {it.between for it in self.contradictions}
+        return closed(self.found, self.evidence, self.skeleton, self.motion, self.given_drift, against)
 
     @cached_property
     def open(self) -> list[Contradiction]:
-        """The contradictions to it once loops are closed, for which pairs of the tree give way."""
+        """The contradictions to it once loops are closed.
+
+        For these, pairs of the tree give way: that does not contradict. What did before still does if it is a
+        guess, or is not resolved.
+        """
         against = find_contradictions(self.evidence, self.skeleton, self.closed, CLOSE, self.motion)
-        still = {it.between for it in against} | self.skeleton.guessed
-        own = [it for it in self.contradictions if it.between in self.skeleton.tree and it.between in still]
-        return [*own, *(it for it in against if it.between not in self.skeleton.tree)]
+        tree = self.skeleton.tree
+        still = self.skeleton.guessed | tree.intersection(it.between for it in against)
+        own = [it for it in self.contradictions if it.between in still]
+        return [*own, *(it for it in against if it.between not in tree)]
 
     @cached_property
     def agreeing(self) -> Kept:
@@ -104,6 +108,11 @@ class Solution:
             if len(matches):
                 kept[edge] = matches
         return kept
+
+    def agreeing_among(self, rows: Collection[int]) -> Kept:
+        """The pairs of these panoramas that agree."""
+        inside = set(rows)
+        return {edge: matches for edge, matches in self.agreeing.items() if inside.issuperset(edge)}
 
     @property
     def drifted(self) -> bool:

@@ -7,7 +7,7 @@ Panoramas that this does not reach are added last.
 """
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -155,12 +155,11 @@ class Solver:
     def _without(self, base: Solution, loose: Collection[int]) -> Solution | None:
         """The reconstruction of the other panoramas of one by their pairs that agree with it."""
         rows = base.found.poses.keys() - loose
-        kept = {edge: own for edge, own in base.agreeing.items() if rows >= {*edge}}
+        kept = base.agreeing_among(rows)
         if not base.adjusted:
             return self._guessed(rows, kept)
         model = pycolmap.Reconstruction(base.model)
-        for row in loose:
-            model.deregister_frame(model.image(self._ids[row]).frame_id)
+        self._remove_poses(model, loose)
         return self._solution(
             model, base.evidence.among(rows), base.skeleton.among(rows), kept, adjusted=True
         )
@@ -200,7 +199,7 @@ class Solver:
             # The tree alone is not judged by all that its poses decide.
             if best is None or turn == 1 or new.rank >= best.rank:
                 best = new
-            final = reached and new.adjusted and new.trusted  # but for the last adjustment
+            final = reached and new.adjusted and new.trusted  # what is left is the last adjustment
             if new.settled or final or refuted or turn == _ROUNDS:
                 break
             adjusted = self._adjusted(new, range(len(self._ids))) if new.adjusted or new.drifted else None
@@ -235,13 +234,13 @@ class Solver:
 
         Those that contradict are left out. The poses of the others stay.
         """
-        pairs, found = list(base.evidence.pairs), base.found.poses.keys()
-        rest = {row for pair in pairs for row in pair.between} - found
+        found = base.found.poses.keys()
+        rest = {row for pair in base.evidence.pairs for row in pair.between} - found
         while rest:
-            pairs = [it for it in pairs if {*it.between} <= rest | found]
+            pairs = base.evidence.among(rest | found).pairs
             theirs = {it.between: it.matches for it in pairs if rest & {*it.between}}
-            kept = {it.between: base.agreeing[it.between] for it in pairs if it.between in base.agreeing}
-            new = self._mapped(base.evidence, base.skeleton, kept | theirs, "incremental", base)
+            kept = base.agreeing_among(rest | found) | theirs
+            new = self._mapped(base.evidence, base.skeleton, kept, "incremental", base)
             if new is None:
                 break
             if not (wrong := {row for it in new.contradictions for row in it.between} & rest):
@@ -278,7 +277,7 @@ class Solver:
         missing = len(carried - poses.keys())
         if self._given or self._mapper == "global" or missing > SETTLED * len(carried):
             return None
-        kept = {edge: own for edge, own in base.agreeing.items() if poses.keys() >= {*edge}}
+        kept = base.agreeing_among(poses)
         part = self._work.with_pairs(kept, "pairs.db", range(len(self._ids)))
         new = adjust_poses(part, base.model, poses, self._max_error)
         return None if new is None else self._solution(new, evidence, skeleton, kept, adjusted=True)
@@ -302,6 +301,11 @@ class Solver:
         same = new.found.poses.keys() == poses.keys() and misfits <= _MISFITS * len(poses)
         return replace(new, contradictions=base.contradictions) if same else base
 
+    def _remove_poses(self, model: pycolmap.Reconstruction, rows: Iterable[int]) -> None:
+        """Leaves panoramas out of a model."""
+        for row in rows:
+            model.deregister_frame(model.image(self._ids[row]).frame_id)
+
     def _solution(
         self,
         model: pycolmap.Reconstruction,
@@ -314,8 +318,7 @@ class Solver:
         found, motion = posed(model, self._ids), self._geometries.motion
         # Without an order it shows that the tree is wrong elsewhere, too, and has to contradict.
         if skeleton.ordered and (shrunk := found.shrunk() - self._given):
-            for row in shrunk:
-                model.deregister_frame(model.image(self._ids[row]).frame_id)
+            self._remove_poses(model, shrunk)
             found = posed(model, self._ids)
         against = find_contradictions(evidence, skeleton, found, CLOSE, motion)
         rest = self._work.numbers, self._size, motion, adjusted, self._drift

@@ -93,10 +93,8 @@ def test_what_is_added_to_many_or_left_out_is_adjusted_at_last_alone(
 ) -> None:
     calls, place, added, left_out = _noted(monkeypatch, missing=13), square(tmp_path, count=COUNT), 13, 5
     monkeypatch.setattr("panolog.prepare.sfm.consistency.solve._unconfirmed", lambda _: {left_out})
-    for module in ("solve", "solution"):
-        monkeypatch.setattr(
-            f"panolog.prepare.sfm.consistency.{module}.SETTLED", 1.5 / COUNT
-        )  # one may be missing
+    for module in ("solve", "solution"):  # one may be missing
+        monkeypatch.setattr(f"panolog.prepare.sfm.consistency.{module}.SETTLED", 1.5 / COUNT)
     (found,) = parts_of(place)
     assert found.trusted and off(found, place.centers) < 0.01
     assert added in found.found.poses and found.found.poses.keys() == {*range(COUNT)} - {left_out}

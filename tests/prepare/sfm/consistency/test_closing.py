@@ -11,7 +11,7 @@ from panolog.prepare.sfm.consistency.agreement import Posed, deviations
 from panolog.prepare.sfm.consistency.closing import closed
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
 from panolog.prepare.sfm.consistency.motion import Motion
-from panolog.prepare.sfm.consistency.skeleton import Edge
+from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton
 
 Array = NDArray[np.float64]
 COUNT, RADIUS, SEEN = 60, 40.0, 11.0  # panoramas, and metres: steps are 4.2
@@ -34,7 +34,9 @@ class Walk:
 
     def close(self, fixed: tuple[Edge, ...] = (), drift: float | None = None) -> tuple[Posed, float]:
         """The poses once loops are closed, and the drift."""
-        return closed(self.found, self.evidence, WALK, lambda pair: self.motions[pair.between], fixed, drift)
+        given = frozenset(row for edge in fixed for row in edge)
+        skeleton = Skeleton(False, frozenset(WALK), given=given)
+        return closed(self.found, self.evidence, skeleton, lambda pair: self.motions[pair.between], drift)
 
     def off(self, poses: Posed, edge: Edge) -> float:
         """Degrees between where the matches of a pair are seen and where they should be, their median."""
@@ -121,10 +123,8 @@ def test_the_order_of_capture_confirms_neighbours(
 ) -> None:
     """Their loops may be open farther than others, as the order distinguishes them from look-alikes."""
     monkeypatch.setattr("panolog.prepare.sfm.consistency.closing._LEVELS", ((1.0, 10),))
-    walk, rows = (
-        _walk(turned, 1.0, RETURN[:1]),
-        [0, *range(2, 59), 1, 59],
-    )  # the ends of the loop are neighbours
+    walk = _walk(turned, 1.0, RETURN[:1])
+    rows = [0, *range(2, 59), 1, 59]  # the ends of the loop are neighbours
     before, evidence = walk.found, walk.evidence
     poses = {new: before.poses[old] for old, new in enumerate(rows)}
     points = {new: before.points[old] for old, new in enumerate(rows)}
@@ -132,9 +132,9 @@ def test_the_order_of_capture_confirms_neighbours(
     pairs = [replace(it, between=tuple(rows[row] for row in it.between)) for it in evidence.pairs]
     found = Posed(poses, points)
     evidence = Evidence(tuple(evidence.rays[place] for place in places), tuple(pairs))
-    tree = [pair.between for pair in pairs[: len(WALK)]]
+    skeleton = Skeleton(ordered, frozenset(pair.between for pair in pairs[: len(WALK)]))
     motions = dict(zip((it.between for it in pairs), walk.motions.values(), strict=True))
-    straight, _ = closed(found, evidence, tree, lambda pair: motions[pair.between], ordered=ordered)
+    straight, _ = closed(found, evidence, skeleton, lambda pair: motions[pair.between])
     off = float(np.nanmedian(deviations(straight, evidence, pairs[-1])))
     assert (off < 2) == ordered
 
