@@ -101,9 +101,7 @@ def _adjusted(
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = _LOOSE * max_error
     for wider in _WIDER[last:]:
-        options = _options(wider * max_error)
-        if len(poses) > DIRECT:  # it is adjusted here: COLMAP takes half of the time for what that does again
-            options.ba_global_max_refinements = options.ba_global_max_num_iterations = 1  # the least
+        options = _options(wider * max_error, large=len(poses) > DIRECT)
         options.triangulation.create_max_angle_error *= wider
         options.triangulation.continue_max_angle_error *= wider
         work.clear_models()
@@ -142,8 +140,12 @@ def _drop_far(model: pycolmap.Reconstruction) -> None:
         model.delete_point3D(number)
 
 
-def _options(max_error: float) -> pycolmap.IncrementalPipelineOptions:
-    """Options of the mapper; max_error, pixels that an observation may be away from its point."""
+def _options(max_error: float, *, large: bool) -> pycolmap.IncrementalPipelineOptions:
+    """Options of the mapper.
+
+    Args: max_error, pixels that an observation may be away from its point; large, `_adjusted` adjusts the
+    whole: COLMAP takes half of the time for what that does again.
+    """
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
     options.random_seed = 0
@@ -152,24 +154,25 @@ def _options(max_error: float) -> pycolmap.IncrementalPipelineOptions:
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.mapper.filter_max_reproj_error = max_error
     options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = max_error
+    if large:
+        options.ba_global_max_refinements = options.ba_global_max_num_iterations = 1  # the least
     return options
 
 
 def _incremental(
     work: Workspace, progress: StageProgress, max_error: float, known: pycolmap.Reconstruction | None
 ) -> list[pycolmap.Reconstruction]:
-    options = _options(max_error)
+    large = len(work.numbers) > DIRECT
+    options = _options(max_error, large=large)
     options.min_model_size = 2
     # By default COLMAP starts from no pair that moves along the optical axis, nor from one below 16 degrees.
     # A panorama has no such axis: of a walk along its z, only pairs misled by repetition would be left.
     options.mapper.init_max_forward_motion = 1.0
     options.mapper.init_min_tri_angle = _FIRST_ANGLE
     options.mapper.abs_pose_min_num_inliers = _LEAST
-    large = len(work.numbers) > DIRECT  # then not as a whole: 1 iteration is the least that COLMAP takes
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _NEVER if large else _GROWTH
     if large:
         options.ba_global_frames_freq = options.ba_global_points_freq = _NEVER
-        options.ba_global_max_refinements, options.ba_global_max_num_iterations = 1, 1
     models, done = pycolmap.ReconstructionManager(), 2
     if known is not None:
         models.read(work.models)
