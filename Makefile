@@ -67,6 +67,7 @@ lint: $(READY) $(TSC)  ## check style and types of Python and of the scripts, an
 	$(BIN)/ruff format --check
 	$(BIN)/clang-format --dry-run --Werror $$(find renderer/csrc tests/renderer/cuda -name '*.cpp' -o -name '*.h' -o -name '*.cu*')
 	$(BIN)/mypy
+	$(BIN)/vermin --quiet --no-tips --violations --target=3.10- --exclude str.decode src/panolog/*/ tests benchmarks examples
 	$(BIN)/lint-imports
 	$(BIN)/node $(TSC)
 	$(BIN)/node $(BIOME) check --error-on-warnings
