@@ -21,6 +21,8 @@ Edge = tuple[int, int]  # rows of two panoramas, ascending
 _ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
 _WEAK, _FEEBLE = (0.3, 0.5), (0.5, 0.0)  # of coverage and share of neighbours: those with less are left out
 _CLEAR = 0.5  # that is shared at one place: streets that look alike share less, as do doubted neighbours
+_ALIKE = 0.6  # of that, what either shares with a third place: copies of a place share about as much
+_RUN = 3  # panoramas from one to the next, at most, that see one place
 _AMONG_BEST = 0.75  # of the best coverage of either panorama
 _AT_ONCE = 256  # panoramas whose ways to all others are found together
 
@@ -81,7 +83,7 @@ def find_skeleton(
     firm = _chain(own, LIKE_OTHERS, LIKE_OTHERS) if ordered else frozenset()
     weak = _chain(own, *_WEAK) | _chain(own, *_FEEBLE) if ordered else frozenset()
     by_share = sorted(pairs, key=lambda it: -_shared(it))
-    clear = [it.between for it in by_share if _shared(it) >= _CLEAR]
+    clear = _clear(by_share)
     doubted = [it.between for it in by_share if it.between in weak]
     rest = pairs if ordered or given else by_share
     tree = _strongest_tree(rest, count, [*sorted(firm), *clear, *doubted] if ordered else [], given)
@@ -114,6 +116,34 @@ def _chain(pairs: Sequence[Pair], covered: float, shared: float) -> frozenset[Ed
 def _shared(pair: Pair) -> float:
     """How much a pair shares: a meadow that repeats is all around, but little of what is seen."""
     return pair.coverage * float(np.sqrt(pair.share))
+
+
+def _clear(pairs: Sequence[Pair]) -> list[Edge]:
+    """The pairs, in their order, that share much at one place, and much less with any third one.
+
+    Who looks like several places stands at one of them at most, and nothing says at which. Neighbours in
+    order do at theirs.
+    """
+    shared: dict[int, dict[int, float]] = {}
+    for pair in pairs:
+        for row, other in (pair.between, pair.between[::-1]):
+            shared.setdefault(row, {})[other] = _shared(pair)
+
+    def elsewhere(row: int, other: int) -> float:
+        rows = np.array(sorted({row, *shared[row]}))
+        places = np.cumsum(np.diff(rows, prepend=rows[0]) > _RUN)
+        third = ~np.isin(places, places[np.isin(rows, (row, other))])
+        return max((shared[row][it] for it in rows[third].tolist()), default=0.0)
+
+    return [
+        pair.between
+        for pair in pairs
+        if (most := _shared(pair)) >= _CLEAR
+        and (
+            pair.apart == 1
+            or max(elsewhere(*it) for it in (pair.between, pair.between[::-1])) <= _ALIKE * most
+        )
+    ]
 
 
 def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> dict[Edge, float]:

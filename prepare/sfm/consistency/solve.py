@@ -202,7 +202,7 @@ class Solver:
             final = reached and new.adjusted and new.trusted  # what is left is the last adjustment
             if new.settled or final or refuted or turn == _ROUNDS:
                 break
-            adjusted = self._adjusted(new, range(len(self._ids))) if new.adjusted or new.drifted else None
+            adjusted = self._adjusted(new) if new.adjusted or new.drifted else None
             new = adjusted or self._mapped(new.evidence, new.skeleton, new.agreeing, self._mapper)
             turn += 1
         return best
@@ -266,21 +266,22 @@ class Solver:
         rows = {number: row for row, number in enumerate(self._ids)}
         return replace(solution, others=[{rows[number] for number in it.reg_image_ids()} for it in others])
 
-    def _adjusted(self, base: Solution, rows: Collection[int]) -> Solution | None:
-        """The reconstruction of these panoramas by what agrees, from the poses once loops are closed.
+    def _adjusted(self, base: Solution) -> Solution | None:
+        """The reconstruction by what agrees, from the poses once loops are closed.
 
         None where many that the tree carries have no pose yet, poses stay, or another mapper is wanted.
         """
-        poses = {row: pose for row, pose in base.closed.poses.items() if row in rows}
-        evidence, skeleton = base.evidence.among(rows), base.skeleton.among(rows)
-        carried = {row for edge in skeleton.tree for row in edge}
+        poses = base.closed.poses
+        carried = {row for edge in base.skeleton.tree for row in edge}
         missing = len(carried - poses.keys())
         if self._given or self._mapper == "global" or missing > SETTLED * len(carried):
             return None
         kept = base.agreeing_among(poses)
         part = self._work.with_pairs(kept, "pairs.db", range(len(self._ids)))
         new = adjust_poses(part, base.model, poses, self._max_error)
-        return None if new is None else self._solution(new, evidence, skeleton, kept, adjusted=True)
+        if new is None:
+            return None
+        return self._solution(new, base.evidence, base.skeleton, kept, adjusted=True)
 
     def _refined(self, base: Solution) -> Solution:
         """A reconstruction with all that matches along the motions between its poses: that drifts less."""

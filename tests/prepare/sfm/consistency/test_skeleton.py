@@ -87,6 +87,19 @@ def test_what_shares_more_than_neighbours_do_comes_before_feeble_ones(share: flo
     assert len(found.tree) == 11
 
 
+@pytest.mark.parametrize(
+    ("third", "more"), [(None, True), ((4, 9), True), ((6, 9), True), ((9, 17), False), ((2, 16), False)]
+)
+def test_what_looks_like_several_places_comes_after_feeble_neighbours(third: Edge | None, more: bool) -> None:
+    """Copies of a place share more than feeble neighbours do, but about as much with other copies of it."""
+    walk = [Pair((row, row + 1), NOTHING, 0.8, share=0.36) for row in range(19)]
+    walk[5] = Pair((5, 6), NOTHING, 0.5, share=0.1)
+    others = [Pair((2, 9), NOTHING, 0.9, share=0.6)]
+    others += [] if third is None else [Pair(third, NOTHING, 0.9, share=0.4)]
+    found = find_skeleton(Evidence(tuple(np.empty((0, 3)) for _ in range(20)), (*walk, *others)))
+    assert found.guessed == {(2, 9) if more else (5, 6)}
+
+
 def test_neighbours_stay_where_others_of_the_tree_cover_more() -> None:
     """What is joined out of order covers more than neighbours do: it does not make these a guess."""
     walk = {(row, row + 1): 0.6 if row < 9 else 0.7 for row in range(16)} | {(5, 6): 0.46}
