@@ -160,8 +160,15 @@ class Solver:
             return self._guessed(rows, kept)
         model = pycolmap.Reconstruction(base.model)
         self._remove_poses(model, loose)
-        return self._solution(
-            model, base.evidence.among(rows), base.skeleton.among(rows), kept, adjusted=True
+        # The others do not move, so nothing new contradicts them, though they connect less of the tree.
+        return replace(
+            base,
+            model=model,
+            contradictions=[it for it in base.contradictions if rows >= {*it.between}],
+            evidence=base.evidence.among(rows),
+            skeleton=base.skeleton.among(rows),
+            found=posed(model, self._ids),
+            kept=kept,
         )
 
     def _thicker(self, evidence: Evidence, edges: Collection[Edge]) -> Evidence:
