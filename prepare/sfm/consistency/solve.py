@@ -357,22 +357,26 @@ def _unconfirmed(solution: Solution) -> set[int]:
     """The panoramas whose pose a single pair holds, or that stray from the order, unless that confirms it.
 
     A pair that looks alike gives a pose, too: only a second one shows that it is right. Neighbours that stray
-    together do not confirm each other.
+    together do not confirm each other, and no look-alikes those that match the next one in order elsewhere.
     """
     skeleton, found, evidence = solution.skeleton, solution.found, solution.evidence
     firm = skeleton.certain if skeleton.ordered or skeleton.given else frozenset[Edge]()
     group, held, leading = components(firm, len(evidence.rays)), Counter[int](), Counter[int]()
+    torn = set[int]()  # groups that do not agree with a neighbour in order
     for pair in evidence.pairs:
         off = deviations(found, evidence, pair)
+        groups = {int(group[row]) for row in pair.between}
         if pair.between in skeleton.tree or agrees(evidence, pair, off, CLOSE):
             held.update(pair.between)
-            groups = {int(group[row]) for row in pair.between}
             leading.update(groups if len(groups) > 1 else ())
+        elif pair.apart == 1 and found.poses.keys() >= {*pair.between}:
+            torn |= groups
     confirmed = {row for edge in firm for row in edge}
     alone = {row for row in found.poses if held[row] < 2} - confirmed
     if not skeleton.ordered:
         return alone
-    return alone | {row for row in _strays(found, firm) if row not in confirmed or leading[group[row]] < 2}
+    sure = {row for row in confirmed if leading[group[row]] > 1 and group[row] not in torn}
+    return alone | (_strays(found, firm) - sure)
 
 
 def _strays(found: Posed, firm: Collection[Edge]) -> set[int]:
@@ -389,6 +393,6 @@ def _strays(found: Posed, firm: Collection[Edge]) -> set[int]:
         past = np.linalg.norm(centers[count + 1 :] - centers[: -count - 1], axis=1)
         for place in np.flatnonzero((least > _STRAY * np.median(steps)) & (past < least / 2)):
             run = set(rows[place + 1 : place + 1 + count])
-            if not any(len(run & {*edge}) == 1 for edge in firm):
+            if not any(len(run & {*edge}) == 1 and found.poses.keys() >= {*edge} for edge in firm):
                 strays |= run
     return strays

@@ -36,6 +36,7 @@ def test_a_panorama_far_from_those_around_it_in_the_order_is_a_stray() -> None:
         (5, set(), set()),  # so many may be a way of their own
         (3, {(3, 4), (4, 5)}, set()),
         (3, {(4, 5), (6, 7)}, set()),
+        (3, {(4, 5), (6, 16)}, {4, 5, 6}),  # the last one has no pose
     ],
 )
 def test_a_few_panoramas_that_stray_together_are_strays(
@@ -45,17 +46,23 @@ def test_a_few_panoramas_that_stray_together_are_strays(
 
 
 @pytest.mark.parametrize(
-    "leading, unconfirmed",
-    [([(5, 12)], {4, 5, 6}), ([(4, 6), (5, 12)], {4, 5, 6}), ([(4, 11), (5, 12)], set())],
+    "leading, against, unconfirmed",
+    [
+        ([(5, 12)], (), {4, 5, 6}),
+        ([(4, 6), (5, 12)], (), {4, 5, 6}),
+        ([(4, 11), (5, 12)], (), set()),
+        ([(4, 11), (5, 12)], (3, 4), {4, 5, 6}),  # all of a copy of a place agree
+        ([(4, 11), (5, 12)], (2, 4), set()),
+    ],
 )
 def test_neighbours_that_stray_do_not_confirm_each_other(
-    leading: list[Edge], unconfirmed: set[int], monkeypatch: pytest.MonkeyPatch
+    leading: list[Edge], against: Edge, unconfirmed: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module = "panolog.prepare.sfm.consistency.solve"
     monkeypatch.setattr(f"{module}.deviations", lambda *_: np.zeros(0))
-    monkeypatch.setattr(f"{module}.agrees", lambda *_: True)
+    monkeypatch.setattr(f"{module}.agrees", lambda _, pair, *__: pair.between != against)
     firm = {(row, row + 1) for row in range(15)} - {(3, 4), (6, 7)}
-    pairs = [Pair(edge, np.empty((0, 2), np.int64)) for edge in sorted({*firm, *leading})]
+    pairs = [Pair(edge, np.empty((0, 2), np.int64)) for edge in sorted({*firm, *leading, against} - {()})]
     skeleton = SimpleNamespace(ordered=True, given=set(), certain=firm, tree={*firm, leading[0]})
     evidence = SimpleNamespace(pairs=pairs, rays=[None] * 16)
     solution = SimpleNamespace(skeleton=skeleton, found=_walk(4, 3), evidence=evidence)
