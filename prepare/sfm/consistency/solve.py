@@ -357,7 +357,7 @@ def _unconfirmed(solution: Solution) -> set[int]:
     """The panoramas whose pose a single pair holds, or that stray from the order, unless that confirms it.
 
     A pair that looks alike gives a pose, too: only a second one shows that it is right. Neighbours that stray
-    together do not confirm each other, and no look-alikes those that match the next one in order elsewhere.
+    together do not confirm each other, and look-alikes none that match a neighbour in order elsewhere.
     """
     skeleton, found, evidence = solution.skeleton, solution.found, solution.evidence
     firm = skeleton.certain if skeleton.ordered or skeleton.given else frozenset[Edge]()
