@@ -83,10 +83,10 @@ def find_skeleton(
     firm = _chain(own, LIKE_OTHERS, LIKE_OTHERS) if ordered else frozenset()
     weak = _chain(own, *_WEAK) | _chain(own, *_FEEBLE) if ordered else frozenset()
     by_share = sorted(pairs, key=lambda it: -_shared(it))
-    clear = _clear(by_share)
+    clear = _clear(by_share) if ordered else []
     doubted = [it.between for it in by_share if it.between in weak]
     rest = pairs if ordered or given else by_share
-    tree = _strongest_tree(rest, count, [*sorted(firm), *clear, *doubted] if ordered else [], given)
+    tree = _strongest_tree(rest, count, [*sorted(firm), *clear, *doubted], given)
     return Skeleton(
         ordered,
         frozenset(tree),
@@ -135,15 +135,12 @@ def _clear(pairs: Sequence[Pair]) -> list[Edge]:
         third = ~np.isin(places, places[np.isin(rows, (row, other))])
         return max((shared[row][it] for it in rows[third].tolist()), default=0.0)
 
-    return [
-        pair.between
-        for pair in pairs
-        if (most := _shared(pair)) >= _CLEAR
-        and (
-            pair.apart == 1
-            or max(elsewhere(*it) for it in (pair.between, pair.between[::-1])) <= _ALIKE * most
-        )
-    ]
+    def looks_like_others(pair: Pair) -> bool:
+        most = max(elsewhere(*it) for it in (pair.between, pair.between[::-1]))
+        return most > _ALIKE * _shared(pair)
+
+    much = [pair for pair in pairs if _shared(pair) >= _CLEAR]
+    return [pair.between for pair in much if pair.apart == 1 or not looks_like_others(pair)]
 
 
 def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> dict[Edge, float]:
