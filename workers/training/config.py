@@ -8,6 +8,7 @@ Iterations are stated for a run of 30,000 and scale with its real length (`sched
 field has "as they are". "3DGS" is Kerbl et al. 2023; "eq." and "app." are those of the PanoLOG paper.
 """
 
+import math
 from typing import Literal
 
 from pydantic import Field, model_validator
@@ -75,6 +76,11 @@ class SkyConfig(Group):
     size: float = Field(
         default=1.0, gt=0, description="sigma in distances of neighbours; with 1 the sky can be sharp"
     )
+    shrink: bool = Field(
+        default=False,
+        description="whether Stage I trains scales, none larger than at the start (`optimizer.unit`): clouds"
+        " get edges; sec. 3.2.1 has colour, rotation and opacity",
+    )
     views: int = Field(
         default=16, ge=1, description="training panoramas, evenly chosen, whose mean colours the sky"
     )
@@ -82,6 +88,10 @@ class SkyConfig(Group):
     def number(self, pixels: int) -> int:
         """The sky Gaussians of a run. Args: pixels of one of its panoramas."""
         return min(self.count, pixels // self.pixels) if self.pixels else self.count
+
+    def sigma(self, number: int) -> float:
+        """Sigma of `number` sky Gaussians at the start, in parts of their distance from the centre."""
+        return self.size * math.sqrt(4 * math.pi / number)
 
 
 class DensifyConfig(Group):
@@ -361,9 +371,9 @@ class TrainConfig(CaptureConfig):
             raise ValueError(
                 "densify.split_gradient is of affine splats: set it to 0, or projection to affine"
             )
-        for name in ("least_pixels", "largest"):
-            if getattr(self.optimizer, name) > 0 and self.optimizer.unit != "distance":
-                raise ValueError(
-                    f"optimizer.{name} needs distances: set it to 0, or optimizer.unit to distance"
-                )
+        rates, sky = self.optimizer, self.sky
+        needs = {"optimizer.least_pixels": rates.least_pixels, "optimizer.largest": rates.largest}
+        for name, value in (needs | {"sky.shrink": sky.shrink}).items():
+            if value and rates.unit != "distance":
+                raise ValueError(f"{name} needs distances: set it to 0, or optimizer.unit to distance")
         return self

@@ -187,10 +187,9 @@ def sky_gaussians(
     centroid = scene.centers[list(scene.train)].mean(axis=0)
     radius = config.kappa * float(np.linalg.norm(scene.points - centroid, axis=1).max())
     means = centroid + radius * fibonacci_sphere(count)
-    spacing = config.size * radius * math.sqrt(4 * math.pi / count)
     evenly = np.linspace(0, len(views) - 1, min(config.views, len(views))).astype(int)
     colors = _colors(scene, means, [views[i] for i in evenly], view)
-    gaussians = isotropic(means, np.full(count, spacing), colors, config.opacity)
+    gaussians = isotropic(means, np.full(count, radius * config.sigma(count)), colors, config.opacity)
     return replace(gaussians, sky=count)
 
 

@@ -44,7 +44,7 @@ class Planned:
     state: ModelState
     rates: dict[str, float]
     rows: dict[str, int]  # how many of each parameter move; parameters that are not in it do not
-    sizes: tuple[float, float]  # as in `ModelState.bound`
+    sizes: tuple[float, float, float]  # as in `ModelState.bound`
     statistics: Statistics | None  # where its screen gradients count
     learning: Learning | None  # of how the view was captured, in Stage I
 

@@ -77,21 +77,26 @@ class ModelState:
             if name in rows
         }
 
-    def bound(self, least: float, most: float) -> None:
-        """No axis of a scene Gaussian is smaller or larger, in parts of its first distance from a camera.
+    def bound(self, least: float, most: float, sky: float) -> None:
+        """No axis of a Gaussian is smaller or larger, in parts of its first distance from a camera.
 
         What is thinner than a pixel of all training panoramas is not determined by them. Seen from nearer, or
         in a picture with more pixels, it is a needle (cf. the 3D smoothing of Mip-Splatting, Yu et al. 2024).
         What is larger than its distance lies over the whole sky of a panorama: it shifts the colours of all
         that is behind, and they change when it is removed.
 
-        Args: least and most; 0 = no bound.
+        Args: least and most of the scene, 0 = no bound; sky, most of the sky, 0 = it has no bounds.
         """
+        scene = self.gaussians.scene
         if least > 0 or most > 0:
-            distance = self.units["means"][self.gaussians.scene, None]
-            low, high = ((distance * part).log_() if part > 0 else None for part in (least, most))
-            scales = self.gaussians.scales[self.gaussians.scene]
-            torch.clamp(scales, low, high, out=scales)
+            self._bound(scene, least, most)
+        if sky > 0:
+            self._bound(slice(scene.stop, None), least, sky)
+
+    def _bound(self, rows: slice, least: float, most: float) -> None:
+        distance, scales = self.units["means"][rows, None], self.gaussians.scales[rows]
+        low, high = ((distance * part).log_() if part > 0 else None for part in (least, most))
+        torch.clamp(scales, low, high, out=scales)
 
     def rearrange(self, source: Tensor, new: Tensor, sky: int) -> None:
         """Row i becomes a copy of row source[i], with zero moments if it is `new`.
@@ -144,14 +149,15 @@ def check_kind(tensors: Mapping[str, Tensor], config: TrainConfig) -> None:
         )
 
 
-def trained_rows(gaussians: Gaussians, degree: int, *, refine: bool) -> dict[str, int]:
+def trained_rows(gaussians: Gaussians, degree: int, *, refine: bool, shrinks: bool) -> dict[str, int]:
     """How many rows of each parameter train: of the sky in Stage I its appearance, in Stage II nothing.
 
-    Args: degree of spherical harmonics in use; refine, Stage II.
+    Args: degree of spherical harmonics in use; refine, Stage II; shrinks, whether the sky's scales train too.
     """
-    count, scene = len(gaussians), gaussians.scene.stop
+    scene = gaussians.scene.stop
+    count = scene if refine else len(gaussians)
     used = [name for name in gaussians.tensors() if degree > 0 or name != "shN"]
-    return dict.fromkeys(used, scene if refine else count) | {"means": scene, "scales": scene}
+    return dict.fromkeys(used, count) | {"means": scene, "scales": count if shrinks else scene}
 
 
 class Average:

@@ -189,10 +189,11 @@ class Schedule:
         """A value that decays exponentially from the first at iteration 0 to the last at the end."""
         return float(first * (last / first) ** (iteration / self.iterations))
 
-    def sizes(self, width: int) -> tuple[float, float]:
+    def sizes(self, width: int) -> tuple[float, float, float]:
         """The bounds of scales, as `ModelState.bound` takes them, of panoramas `width` pixels wide."""
-        rates = self.config.optimizer
-        return rates.least_pixels * 2 * math.pi / width, rates.largest
+        rates, sky = self.config.optimizer, self.config.sky
+        number = 0 if self.refine or not sky.shrink else sky.number(width * (width // 2))
+        return rates.least_pixels * 2 * math.pi / width, rates.largest, sky.sigma(number) if number else 0.0
 
     @property
     def length(self) -> float:

@@ -352,7 +352,9 @@ class Trainer:
             problem=problem,
             state=self.state,
             rates=self.schedule.rates(iteration),
-            rows=trained_rows(self.state.gaussians, degree, refine=self.schedule.refine),
+            rows=trained_rows(
+                self.state.gaussians, degree, refine=self.schedule.refine, shrinks=self.spec.config.sky.shrink
+            ),
             sizes=self.schedule.sizes(self.spec.width),
             statistics=self.statistics if self.schedule.collects(iteration) else None,
             learning=self.learning if self.spec.cell is None else None,

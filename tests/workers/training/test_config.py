@@ -21,7 +21,8 @@ def test_absolute_gradients_are_of_affine_splats() -> None:
         TrainConfig.model_validate({"projection": "exact", "densify": {"split_gradient": 4e-4}})
 
 
-@pytest.mark.parametrize("name", ["least_pixels", "largest"])
+@pytest.mark.parametrize("name", ["optimizer.least_pixels", "optimizer.largest", "sky.shrink"])
 def test_bounds_of_sizes_need_distances(name: str) -> None:
+    group, key = name.split(".")
     with pytest.raises(ValidationError, match=f"{name} needs distances: set it to 0, or "):
-        TrainConfig.model_validate({"optimizer": {name: 0.3}})
+        TrainConfig.model_validate({group: {key: 1}})

@@ -101,20 +101,22 @@ def test_a_step_may_be_a_part_of_the_distance() -> None:
 
 
 @pytest.mark.parametrize(
-    ("least", "most", "expected"),
+    ("bounds", "expected"),
     [
-        (0.01, 0.0, [0.05, 8.0, 0.1, 8.0, 0.5, 8.0]),
-        (0.0, 0.5, [0.05, 2.0, 0.05, 5.0, 0.5, 8.0]),
-        (0.01, 0.5, [0.05, 2.0, 0.1, 5.0, 0.5, 8.0]),
+        ((0.01, 0.0, 0.0), [0.05, 8.0, 0.1, 8.0, 0.5, 8.0]),
+        ((0.0, 0.5, 0.0), [0.05, 2.0, 0.05, 5.0, 0.5, 8.0]),
+        ((0.01, 0.5, 0.0), [0.05, 2.0, 0.1, 5.0, 0.5, 8.0]),
+        ((0.0, 0.0, 0.6), [0.05, 8.0, 0.05, 8.0, 0.5, 6.0]),
+        ((0.06, 0.5, 0.1), [0.24, 2.0, 0.6, 5.0, 0.6, 1.0]),
     ],
 )
 def test_axes_are_bounded_by_the_distance_from_the_nearest_camera(
-    least: float, most: float, expected: list[float]
+    bounds: tuple[float, float, float], expected: list[float]
 ) -> None:
     state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=1, moments=0)
     state.units["means"] = torch.tensor([4.0, 10.0, 10.0])
     state.gaussians.scales[:, 1] = math.log(8.0)
-    state.bound(least, most)
+    state.bound(*bounds)
     assert state.gaussians.scales[:, :2].exp().flatten().tolist() == pytest.approx(expected)
 
 

@@ -126,6 +126,19 @@ def test_nothing_becomes_thinner_than_a_pixel(
     assert bool(torch.isclose(scales, least).any()) and bool((scales > least + 0.01).any())
 
 
+@pytest.mark.parametrize("where", [nullcontext, lambda: stubbed(Emulated())], ids=["cpu", "emulated"])
+def test_the_sky_shrinks_and_does_not_grow(
+    spec: TrainSpec, where: Callable[[], AbstractContextManager[None]]
+) -> None:
+    groups: dict[str, Any] = {"optimizer": {"unit": "distance"}, "sky": {"count": 20, "shrink": True}}
+    with where():
+        tensors = saved_first(changed(spec, **groups, checkpoint={"every": 5, "share": 1}))
+    scales, distance = tensors["scales"][-20:], tensors["units.means"][-20:, None]
+    ratio = scales.exp() / distance / math.sqrt(4 * math.pi / 20)
+    assert bool((ratio < 1 + 1e-5).all()) and bool((ratio < 0.99).any()) and bool((ratio > 0.999).any())
+    assert bool((scales.std(1) > 1e-3).any())  # each axis by itself
+
+
 def contents(events: list[Event]) -> list[object]:
     """The bytes of checkpoints, previews and the model. When there is progress, depends on the time."""
     return [content(event) for event in events if not isinstance(event, Progress)]
