@@ -55,7 +55,7 @@ def initial_gaussians(scene: Scene, *, sky: int = 0, width: int | None = None) -
     width = width or scene.width
     config, chosen = TrainConfig(sky=SkyConfig(count=sky)), points_of(scene, scene.train)
     begin = scene, config, chosen, NO_POINTS, scene.train, width * (width // 2)
-    return first_model(*begin, lambda row: load_view(scene.panoramas[row], row, width))
+    return first_model(*begin, lambda row: load_view(scene.panoramas[row], row, width))[0]
 
 
 def known_rows(scene: Scene, rows: Sequence[int], name: str) -> tuple[int, ...]:

@@ -76,10 +76,11 @@ class SkyConfig(Group):
     size: float = Field(
         default=1.0, gt=0, description="sigma in distances of neighbours; with 1 the sky can be sharp"
     )
-    shrink: bool = Field(
+    sharp: bool = Field(
         default=False,
-        description="whether Stage I trains scales, none larger than at the start (`optimizer.unit`): clouds"
-        " get edges; sec. 3.2.1 has colour, rotation and opacity",
+        description="whether Stage I trains scales too, from half to all of those at the start, so that"
+        " clouds have edges (`optimizer.unit`), and nothing of what sky masks never show as sky: it would fit"
+        " single views through what is not opaque yet; sec. 3.2.1 has colour, rotation and opacity of all",
     )
     views: int = Field(
         default=16, ge=1, description="training panoramas, evenly chosen, whose mean colours the sky"
@@ -373,7 +374,7 @@ class TrainConfig(CaptureConfig):
             )
         rates, sky = self.optimizer, self.sky
         needs = {"optimizer.least_pixels": rates.least_pixels, "optimizer.largest": rates.largest}
-        for name, value in (needs | {"sky.shrink": sky.shrink}).items():
+        for name, value in (needs | {"sky.sharp": sky.sharp}).items():
             if value and rates.unit != "distance":
                 raise ValueError(f"{name} needs distances: set it to 0, or optimizer.unit to distance")
         return self

@@ -130,11 +130,12 @@ def densify(
 
 
 def rate_units(
-    means: Tensor, centers: NDArray[np.float64], schedule: Schedule, baseline: float
+    means: Tensor, centers: NDArray[np.float64], schedule: Schedule, baseline: float, sky: Tensor
 ) -> dict[str, Tensor]:
-    """`ModelState.units` of means (N, 3) and of SH of higher degrees; copies have those of their source.
+    """`ModelState.units` of means (N, 3), of SH of higher degrees, and of the sky, some of which stays.
 
-    Args: centers (K, 3) of cameras and their baseline b̂ (eq. 8), world units.
+    Copies have those of their source.
+    Args: centers (K, 3) of cameras and their baseline b̂ (eq. 8), world units; sky (N_sky,) bool, which learn.
     """
     units, config = {}, schedule.config
     near = config.sh.near * baseline / schedule.length**2  # as far in all in a run of any length
@@ -144,6 +145,12 @@ def rate_units(
         units["means"] = distance
     if near > 0:
         units["shN"] = (distance / near).clamp(max=1)
+    if not bool(sky.all()):
+        learns = torch.ones_like(distance)
+        learns[len(learns) - len(sky) :] = sky.to(learns)
+        units |= {
+            name: units.get(name, 1) * learns for name in ("quats", "scales", "opacities", "sh0", "shN")
+        }
     return units
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from panolog.partition.bounds import baseline, strays
 from panolog.partition.cells import Volume
@@ -26,6 +27,7 @@ NEIGHBOURS = 3  # whose distances set the size of a Gaussian, 3DGS
 # Initial sizes as fractions of the distance to the nearest camera. A lone point, far from its neighbours, may
 # not cover more than a fifth of a radian; a duplicate point may not vanish (a pixel is about 3e-3 radians).
 SCALE_MIN, SCALE_MAX = 1e-4, 0.2
+_RIM = 3.0  # distances of neighbours: what is farther behind the rim of the sky hardly shows
 OUTSIDE = 8  # pixels of a panorama that what is outside of a district begins with
 
 
@@ -141,15 +143,19 @@ def first_model(
     views: Sequence[int],
     pixels: int,
     view: Callable[[int], View | None],
-) -> Gaussians:
-    """What Stage I starts with: `scene_gaussians` and `sky_gaussians`. Args: pixels of a panorama.
+) -> tuple[Gaussians, Tensor]:
+    """What Stage I starts with: `scene_gaussians` and `sky_gaussians`; (N_sky,) which of the sky are sky.
 
     Points that all have about one colour, as of programs that write none, get that of the panoramas.
+    Args: pixels of a panorama.
     """
     if len(chosen) and of_one_color(scene.colors[chosen]):
         scene = _with_colors(scene, chosen, views, view)
     points, count = scene_gaussians(scene, chosen, more, config.initial_opacity), config.sky.number(pixels)
-    return concatenate(points, sky_gaussians(scene, config.sky, count, views, view)) if count else points
+    if not count:
+        return points, torch.ones(0, dtype=torch.bool)
+    sky, seen = sky_gaussians(scene, config.sky, count, views, view)
+    return concatenate(points, sky), seen
 
 
 def _with_colors(
@@ -160,7 +166,7 @@ def _with_colors(
     _, nearest = cKDTree(scene.centers[list(views)]).query(scene.points[chosen])
     for place in np.unique(nearest):
         rows = chosen[nearest == place]
-        found = _colors(scene, scene.points[rows], [views[place]], view)
+        found, _ = _colors(scene, scene.points[rows], [views[place]], view)
         colors[rows] = np.rint(255 * found.clip(0, 1))
     return replace(scene, colors=colors)
 
@@ -175,7 +181,7 @@ def _neighbour_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def sky_gaussians(
     scene: Scene, config: SkyConfig, count: int, views: Sequence[int], view: Callable[[int], View | None]
-) -> Gaussians:
+) -> tuple[Gaussians, Tensor]:
     """N_sky Gaussians on the sphere of radius κ · max‖x_i − C̄‖ about the training cameras' centroid (eq. 3).
 
     The maximum is over all sparse points, as the paper has it: a stray point makes the sky more distant, but
@@ -183,22 +189,28 @@ def sky_gaussians(
 
     Args: count, N_sky; views, the rows of `scene.panoramas` to colour it from; view, which decodes a row,
     None = leave out.
+    Returns: them; (N_sky,) bool, which are seen as sky or are next to one that is: all without sky masks.
     """
     centroid = scene.centers[list(scene.train)].mean(axis=0)
     radius = config.kappa * float(np.linalg.norm(scene.points - centroid, axis=1).max())
     means = centroid + radius * fibonacci_sphere(count)
     evenly = np.linspace(0, len(views) - 1, min(config.views, len(views))).astype(int)
-    colors = _colors(scene, means, [views[i] for i in evenly], view)
+    colors, seen = _colors(scene, means, [views[i] for i in evenly], view)
     gaussians = isotropic(means, np.full(count, radius * config.sigma(count)), colors, config.opacity)
-    return replace(gaussians, sky=count)
+    if seen.any():
+        apart, _ = cKDTree(means[seen]).query(means)
+        seen = apart <= _RIM * radius * math.sqrt(4 * math.pi / count)
+    else:
+        seen = np.ones(count, bool)
+    return replace(gaussians, sky=count), torch.from_numpy(seen)
 
 
 def _colors(
     scene: Scene, points: NDArray[np.float64], rows: Sequence[int], view: Callable[[int], View | None]
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """(N, 3) mean colours in [0, 1] of the pixels that points (N, 3) fall on: the sky ones, else all.
 
-    Of the scene, without the exposures of the panoramas.
+    Of the scene, without the exposures of the panoramas. And (N,), whether any of these pixels is sky.
     """
     sums = np.zeros((2, len(points), 3))  # of sky pixels, of all pixels
     counts = np.zeros((2, len(points), 1))
@@ -215,4 +227,4 @@ def _colors(
             counts[kind] += chosen[:, None]
     means = sums / np.maximum(counts, 1)
     unseen = np.where(counts[1] > 0, means[1], 0.5)
-    return np.where(counts[0] > 0, means[0], unseen)
+    return np.where(counts[0] > 0, means[0], unseen), counts[0][:, 0] > 0

@@ -14,6 +14,7 @@ from panolog.workers.training.config import TrainConfig
 MOMENT = "exp_avg."  # in `ModelState.tensors`, before the name of a parameter
 AVERAGE = "average."  # before the names of what `Average.tensors` has
 _COUNT = f"{AVERAGE}count"
+_SMALLEST = 0.5  # of the most: least scale of the sky
 UNITS = "units."  # before the names of parameters whose rate has units
 
 
@@ -85,13 +86,14 @@ class ModelState:
         What is larger than its distance lies over the whole sky of a panorama: it shifts the colours of all
         that is behind, and they change when it is removed.
 
-        Args: least and most of the scene, 0 = no bound; sky, most of the sky, 0 = it has no bounds.
+        Args: least and most of the scene, 0 = no bound; sky, most of the sky, 0 = no bounds. Sky of smaller
+            Gaussians has gaps where a picture has more pixels.
         """
         scene = self.gaussians.scene
         if least > 0 or most > 0:
             self._bound(scene, least, most)
         if sky > 0:
-            self._bound(slice(scene.stop, None), least, sky)
+            self._bound(slice(scene.stop, None), _SMALLEST * sky, sky)
 
     def _bound(self, rows: slice, least: float, most: float) -> None:
         distance, scales = self.units["means"][rows, None], self.gaussians.scales[rows]
@@ -149,15 +151,15 @@ def check_kind(tensors: Mapping[str, Tensor], config: TrainConfig) -> None:
         )
 
 
-def trained_rows(gaussians: Gaussians, degree: int, *, refine: bool, shrinks: bool) -> dict[str, int]:
+def trained_rows(gaussians: Gaussians, degree: int, *, refine: bool, sharp: bool) -> dict[str, int]:
     """How many rows of each parameter train: of the sky in Stage I its appearance, in Stage II nothing.
 
-    Args: degree of spherical harmonics in use; refine, Stage II; shrinks, whether the sky's scales train too.
+    Args: degree of spherical harmonics in use; refine, Stage II; sharp, whether the sky's scales train too.
     """
     scene = gaussians.scene.stop
     count = scene if refine else len(gaussians)
     used = [name for name in gaussians.tensors() if degree > 0 or name != "shN"]
-    return dict.fromkeys(used, count) | {"means": scene, "scales": count if shrinks else scene}
+    return dict.fromkeys(used, count) | {"means": scene, "scales": count if sharp else scene}
 
 
 class Average:

@@ -192,7 +192,7 @@ class Schedule:
     def sizes(self, width: int) -> tuple[float, float, float]:
         """The bounds of scales, as `ModelState.bound` takes them, of panoramas `width` pixels wide."""
         rates, sky = self.config.optimizer, self.config.sky
-        number = 0 if self.refine or not sky.shrink else sky.number(width * (width // 2))
+        number = 0 if self.refine or not sky.sharp else sky.number(width * (width // 2))
         return rates.least_pixels * 2 * math.pi / width, rates.largest, sky.sigma(number) if number else 0.0
 
     @property

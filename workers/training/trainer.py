@@ -159,18 +159,18 @@ class Trainer:
     def begin(self) -> Iterator[Progress]:
         """Start from points and the sky (Stage I) or the Stage I model (Stage II), with signs of work."""
         if self.spec.initial is not None:
-            gaussians = self._block(self.spec.initial)
+            gaussians, sky = self._block(self.spec.initial), torch.ones(0, dtype=torch.bool)
             self.start = int(inside(gaussians, self.spec.cell).sum())
         else:
-            gaussians = yield from self._first()
+            gaussians, sky = yield from self._first()
         self.state = ModelState.start(replace(gaussians, exact=self.exact).to(self.spec.device))
-        given = self.centers, self.schedule, scene_length(self.scene)
+        given = self.centers, self.schedule, scene_length(self.scene), sky
         self.state.units = rate_units(self.state.gaussians.means, *given)
         count, config = self.state.gaussians.scene.stop, self.spec.config.densify
         self.statistics = Statistics.zeros(count, self.spec.device, config)
 
-    def _first(self) -> Generator[Progress, None, Gaussians]:
-        """What Stage I starts with."""
+    def _first(self) -> Generator[Progress, None, tuple[Gaussians, Tensor]]:
+        """What Stage I starts with; (N_sky,) bool, which of the sky learn."""
         scene, spec, pixels = self.scene, self.spec, self.spec.width * (self.spec.width // 2)
         points = points_of(scene, spec.views, spec.district, spec.width)
         chosen = evenly(points, self.schedule.capped(len(points)))
@@ -182,7 +182,8 @@ class Trainer:
             if self.meter.due():
                 yield self.meter.progress(0, self.start)
         more = surfaces.points(scene.points[chosen], self.centers, missing)
-        return first_model(scene, spec.config, chosen, more, spec.views, pixels, self.views.get)
+        model, sky = first_model(scene, spec.config, chosen, more, spec.views, pixels, self.views.get)
+        return model, sky if spec.config.sky.sharp else torch.ones_like(sky)
 
     def _block(self, initial: Source[Gaussians]) -> Gaussians:
         """What a block trains with, of the Stage I model."""
@@ -353,7 +354,7 @@ class Trainer:
             state=self.state,
             rates=self.schedule.rates(iteration),
             rows=trained_rows(
-                self.state.gaussians, degree, refine=self.schedule.refine, shrinks=self.spec.config.sky.shrink
+                self.state.gaussians, degree, refine=self.schedule.refine, sharp=self.spec.config.sky.sharp
             ),
             sizes=self.schedule.sizes(self.spec.width),
             statistics=self.statistics if self.schedule.collects(iteration) else None,

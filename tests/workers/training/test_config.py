@@ -21,7 +21,7 @@ def test_absolute_gradients_are_of_affine_splats() -> None:
         TrainConfig.model_validate({"projection": "exact", "densify": {"split_gradient": 4e-4}})
 
 
-@pytest.mark.parametrize("name", ["optimizer.least_pixels", "optimizer.largest", "sky.shrink"])
+@pytest.mark.parametrize("name", ["optimizer.least_pixels", "optimizer.largest", "sky.sharp"])
 def test_bounds_of_sizes_need_distances(name: str) -> None:
     group, key = name.split(".")
     with pytest.raises(ValidationError, match=f"{name} needs distances: set it to 0, or "):

@@ -29,6 +29,7 @@ from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.hard_scenes import as_leaves
 from tests.workers.trainings import settings
 
+ALL = torch.ones(0, dtype=torch.bool)  # of the sky
 EXTENT = 10.0  # so that scales above 0.1 split
 QUIET, LOUD = 1.9e-4, 1.0  # screen gradients, below and above `densify.gradient`
 
@@ -88,7 +89,7 @@ def test_a_step_may_be_a_part_of_the_distance() -> None:
     """From the nearest camera; what is divided keeps it."""
     state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0, moments=0)  # at x = 0, 100 and 200
     centers, given = np.array([[1.0, 0, 0], [210, 0, 0]]), schedule_of(optimizer={"unit": "distance"})
-    state.units = rate_units(state.gaussians.means, centers, given, 5.0)
+    state.units = rate_units(state.gaussians.means, centers, given, 5.0, ALL)
     assert {name: units.tolist() for name, units in state.units.items()} == {"means": [1, 99, 10]}
     saved = {name: tensor.clone() for name, tensor in state.tensors().items()}
     state = ModelState.from_tensors(saved)
@@ -106,8 +107,9 @@ def test_a_step_may_be_a_part_of_the_distance() -> None:
         ((0.01, 0.0, 0.0), [0.05, 8.0, 0.1, 8.0, 0.5, 8.0]),
         ((0.0, 0.5, 0.0), [0.05, 2.0, 0.05, 5.0, 0.5, 8.0]),
         ((0.01, 0.5, 0.0), [0.05, 2.0, 0.1, 5.0, 0.5, 8.0]),
-        ((0.0, 0.0, 0.6), [0.05, 8.0, 0.05, 8.0, 0.5, 6.0]),
-        ((0.06, 0.5, 0.1), [0.24, 2.0, 0.6, 5.0, 0.6, 1.0]),
+        ((0.0, 0.0, 0.6), [0.05, 8.0, 0.05, 8.0, 3.0, 6.0]),
+        ((0.06, 0.5, 0.1), [0.24, 2.0, 0.6, 5.0, 0.5, 1.0]),
+        ((0.0, 0.0, 2.0), [0.05, 8.0, 0.05, 8.0, 10.0, 10.0]),
     ],
 )
 def test_axes_are_bounded_by_the_distance_from_the_nearest_camera(
@@ -120,14 +122,23 @@ def test_axes_are_bounded_by_the_distance_from_the_nearest_camera(
     assert state.gaussians.scales[:, :2].exp().flatten().tolist() == pytest.approx(expected)
 
 
+def test_sky_that_nothing_shows_does_not_learn() -> None:
+    state = state_of([0.05, 0.05, 0.5, 0.5], [0.5] * 4, sky=2, moments=0)
+    given = np.array([[1.0, 0, 0]]), schedule_of(sh={"near": 4}), 5.0
+    units = rate_units(state.gaussians.means, *given, torch.tensor([True, False]))
+    assert [units[name].tolist() for name in ("quats", "scales", "opacities", "sh0")] == [[1, 1, 1, 0]] * 4
+    assert units["shN"].tolist() == pytest.approx([0.05, 1, 1, 0])
+    assert [*rate_units(state.gaussians.means, *given, torch.tensor([True, True]))] == ["shN"]
+
+
 def test_what_is_near_may_be_slow_to_depend_on_the_direction() -> None:
     state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0, moments=0)  # at x = 0, 100 and 200
     centers, full = np.array([[1.0, 0, 0], [210, 0, 0]]), schedule_of(sh={"near": 4})
-    state.units = rate_units(state.gaussians.means, centers, full, 5.0)
+    state.units = rate_units(state.gaussians.means, centers, full, 5.0, ALL)
     assert state.units["shN"].tolist() == pytest.approx([0.05, 1, 0.5])
-    assert rate_units(state.gaussians.means, centers, full, 0.0) == {}
+    assert rate_units(state.gaussians.means, centers, full, 0.0, ALL) == {}
     short = schedule_of(15_000, sh={"near": 4}, optimizer={"short_runs": 0.5})  # half as far in an iteration
-    assert rate_units(state.gaussians.means, centers, short, 5.0)["shN"].tolist() == pytest.approx(
+    assert rate_units(state.gaussians.means, centers, short, 5.0, ALL)["shN"].tolist() == pytest.approx(
         [0.1, 1, 1]
     )
     names = state.gaussians.tensors()

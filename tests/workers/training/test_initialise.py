@@ -59,7 +59,7 @@ def test_points_without_colours_get_those_of_the_panoramas(scene: Scene) -> None
 
     config = TrainConfig(sky=SkyConfig(count=20))
     views = scene.train
-    model = first_model(black, config, chosen, NO_POINTS, views, WIDTH * WIDTH // 2, shown)
+    model, _ = first_model(black, config, chosen, NO_POINTS, views, WIDTH * WIDTH // 2, shown)
     nearest = cKDTree(scene.centers[list(views)]).query(scene.points)[1]
     expected = 40 * np.array(views)[nearest]
     color = model.sh0[: len(chosen), 0].numpy() * SH_C0 + 0.5
@@ -138,7 +138,7 @@ def test_extent_is_that_of_the_views_trained_on(scene: Scene) -> None:
 
 
 def test_sky_lies_on_its_sphere_without_holes(scene: Scene) -> None:
-    sky = sky_gaussians(
+    sky, _ = sky_gaussians(
         scene, SkyConfig(), 500, scene.train, lambda row: load_view(scene.panoramas[row], row, WIDTH)
     )
     assert sky.sky == len(sky) == 500
@@ -156,7 +156,9 @@ def test_sky_lies_on_its_sphere_without_holes(scene: Scene) -> None:
 def test_what_training_begins_with_may_be_fainter_and_its_sky_blurred(scene: Scene) -> None:
     config = TrainConfig.model_validate({"initial_opacity": 0.01, "sky": {"count": 60, "size": 3.0}})
     usual, found = (
-        first_model(scene, given, np.arange(len(scene.points)), NO_POINTS, scene.train, 10**6, lambda _: None)
+        first_model(
+            scene, given, np.arange(len(scene.points)), NO_POINTS, scene.train, 10**6, lambda _: None
+        )[0]
         for given in (TrainConfig(sky=SkyConfig(count=60)), config)
     )
     at = usual.scene
@@ -178,7 +180,7 @@ def test_the_exposures_of_panoramas_are_not_in_the_sky(scene: Scene) -> None:
             exposure = exposure_affine(torch.stack([gains[row], torch.zeros(3, dtype=torch.float64)]))
             return replace(dim, image=exposed(dim.image, exposure), exposure=exposure)
 
-        return sky_gaussians(scene, SkyConfig(), 200, scene.train, view).sh0 * SH_C0
+        return sky_gaussians(scene, SkyConfig(), 200, scene.train, view)[0].sh0 * SH_C0
 
     assert torch.allclose(sky(exposures=True), sky(exposures=False), atol=0.6 / 255)
 
@@ -196,7 +198,7 @@ def test_sky_has_the_colour_of_the_sky_pixels(scene: Scene) -> None:
     blue = torch.zeros_like(view.image)
     assert view.sky is not None
     blue[view.sky] = torch.tensor([0, 0, 255], dtype=torch.uint8)
-    sky = sky_gaussians(scene, SkyConfig(views=1), 400, (row,), lambda _: replace(view, image=blue))
+    sky, seen = sky_gaussians(scene, SkyConfig(views=1), 400, (row,), lambda _: replace(view, image=blue))
     color = sky.sh0[:, 0] * SH_C0 + 0.5
     elevation = np.arcsin(
         np.clip((sky.means.numpy() / np.linalg.norm(sky.means.numpy(), axis=1)[:, None])[:, 1], -1, 1)
@@ -208,11 +210,18 @@ def test_sky_has_the_colour_of_the_sky_pixels(scene: Scene) -> None:
     assert torch.allclose(
         color[torch.from_numpy(elevation > 1.5)], torch.tensor(0.5), atol=1e-5
     )  # all masked
+    rim = SKY_ELEVATION + 3 * math.sqrt(4 * math.pi / 400)
+    assert bool(seen[above].all()) and not bool(seen[torch.from_numpy(elevation > rim + 0.1)].any())
+    assert bool(seen[torch.from_numpy(elevation < rim - 0.1)].all())
+    plain, every = sky_gaussians(
+        scene, SkyConfig(views=1), 400, (row,), lambda _: replace(view, image=blue, sky=None)
+    )
+    assert bool(every.all()) and torch.equal(plain.means, sky.means)
 
 
 def test_views_on_a_device_colour_the_sky_alike(scene: Scene) -> None:
     config = SkyConfig()
     views = {row: load_view(scene.panoramas[row], row, WIDTH) for row in scene.train}
-    here = sky_gaussians(scene, config, 500, scene.train, views.__getitem__)
-    there = sky_gaussians(scene, config, 500, scene.train, lambda row: view_on_device(views[row]))
-    assert torch.equal(here.sh0, there.sh0)
+    here, seen = sky_gaussians(scene, config, 500, scene.train, views.__getitem__)
+    there, too = sky_gaussians(scene, config, 500, scene.train, lambda row: view_on_device(views[row]))
+    assert torch.equal(here.sh0, there.sh0) and torch.equal(seen, too)

@@ -93,12 +93,12 @@ def test_a_block_may_continue_at_the_rates_at_which_stage_one_ended() -> None:
 
 
 def test_the_sky_has_bounds_where_its_scales_train() -> None:
-    sky = {"count": 100, "pixels": 8, "size": 2.0, "shrink": True}
+    sky = {"count": 100, "pixels": 8, "size": 2.0, "sharp": True}
     groups: dict[str, Any] = {"sky": sky, "optimizer": {"unit": "distance", "largest": 0.5}}
     most = 2 * math.sqrt(4 * math.pi / 64)  # of 32 x 16 pixels
     assert schedule(1_500, **groups).sizes(32) == pytest.approx((0.0, 0.5, most))
     assert schedule(1_500, refine=True, **groups).sizes(32) == (0.0, 0.5, 0.0)
-    for plain in ({**sky, "shrink": False}, {**sky, "count": 0}):
+    for plain in ({**sky, "sharp": False}, {**sky, "count": 0}):
         assert schedule(1_500, **{**groups, "sky": plain}).sizes(32) == (0.0, 0.5, 0.0)
 
 
