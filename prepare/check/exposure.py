@@ -30,7 +30,7 @@ from panolog.scene.model import Panorama, Scene
 WIDTH = 1024  # pixels of the panoramas as they are measured
 _QUICK = 512  # the same where they are likely to be alike: noise is larger there, and with it all differences
 POINTS = 4000  # of each panorama, at most
-DIFFERS = 0.08  # stops rms: from here on exposures differ by more than the measurement errs
+DIFFERS = 0.15  # stops rms: more than the measurement errs, 0.11 in a flight through haze over sunlit walls
 FEWEST = 200  # observations of points that others have seen too, of a panorama that is measured
 _DARK, _BRIGHT = 8 / 255, 247 / 255  # outside, a sample may be clipped
 _PIECE, _LEVELS = 2.0, 5  # pixels at WIDTH: the radius of a sample; radii of 1, 2, 4, … are blurred
