@@ -78,7 +78,7 @@ class SkyConfig(Group):
     )
     sharp: bool = Field(
         default=False,
-        description="whether Stage I trains scales too, from half to all of those at the start, so that"
+        description="whether Stage I trains scales too, from 0.7 to 1 of those at the start, so that"
         " clouds have edges (`optimizer.unit`), and nothing of what sky masks never show as sky: it would fit"
         " single views through what is not opaque yet; sec. 3.2.1 has colour, rotation and opacity of all",
     )

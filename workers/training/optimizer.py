@@ -14,7 +14,7 @@ from panolog.workers.training.config import TrainConfig
 MOMENT = "exp_avg."  # in `ModelState.tensors`, before the name of a parameter
 AVERAGE = "average."  # before the names of what `Average.tensors` has
 _COUNT = f"{AVERAGE}count"
-_SMALLEST = 0.5  # of the most: least scale of the sky
+_SMALLEST = 0.7  # of the most: least scale of the sky
 UNITS = "units."  # before the names of parameters whose rate has units
 
 
