@@ -64,9 +64,7 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "stage2.compare": 8,  # a block that overfits does not harm the model
         "passes.repair": 0.2,  # what is near a face learns from the panoramas of both of its blocks
         "sky.kappa": 100.0,  # infinitely far for all cameras: at 10, clouds move against the sky as one walks
-        "sky.sharp": True,  # clouds have edges
-        "sky.views": 64,  # no gap between houses is missed
-        "sky.pixels": 4,  # a sky is plain: more than a picture can show cost time and learn slowly
+        "sky.pixels": 8,  # a sky is plain: more than a picture can show cost time and learn slowly
         "exposure.learn": "auto",  # where panoramas differ in brightness, blocks would not fit each other
         "reset.recovery": 100,  # as a full run has: pruned is what stays transparent, not what is slow
     },
